@@ -1,0 +1,1 @@
+"""Episodic memory for robots: plans remembered as events, asked about as tables."""

@@ -1,0 +1,48 @@
+"""What can be set, frozen, with a unit in every name. The defaults serve one robot on one machine.
+
+>>> Settings(spool_bytes_max=2**30, on_full="fail").sync_interval_ms
+50
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+__all__ = ["Settings", "OnFull", "OnUnrecordable"]
+
+OnFull = Literal["wait", "fail", "thin_out"]
+OnUnrecordable = Literal["refuse", "record_missing"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Limits and rhythms of one memory.
+
+    Attributes:
+        sync_interval_ms: what was written is synced to the disk after at most this long.
+        segment_bytes: size of one file of the write-ahead queue, allocated ahead.
+        spool_bytes_max: what one recorder may hold on disk before `on_full` applies.
+        spool_reserve_bytes: kept free below that for ends and world observations, which never wait for room.
+        record_bytes_max: the largest single event; a larger one is refused.
+        batch_events_max, batch_bytes_max, batch_age_ms: a batch closes at whichever comes first.
+        idle_ms: a plan that has emitted nothing for so long is idle: its tables are brought up to date.
+        flush_timeout_s: `flush` and closing give up after this long; nothing is lost by it.
+        connect_timeout_s: how long a database may take to answer at the first connection.
+        on_full: wait for room, fail with `SpoolFull`, or thin out state samples.
+        on_unrecordable: refuse a perform whose parameters cannot be recorded, or record them as missing.
+    """
+
+    sync_interval_ms: int = 50
+    segment_bytes: int = 8 * 2**20
+    spool_bytes_max: int = 4 * 2**30
+    spool_reserve_bytes: int = 16 * 2**20
+    record_bytes_max: int = 2**20
+    batch_events_max: int = 10_000
+    batch_bytes_max: int = 4 * 2**20
+    batch_age_ms: int = 50
+    idle_ms: int = 200
+    flush_timeout_s: float = 300.0
+    connect_timeout_s: float = 10.0
+    on_full: OnFull = "wait"
+    on_unrecordable: OnUnrecordable = "refuse"

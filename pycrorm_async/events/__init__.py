@@ -1,0 +1,1 @@
+"""What happened: frozen values, their envelope, their ids, their bytes. Pure: no I/O, no clock, no loop."""

@@ -1,0 +1,110 @@
+"""Events to bytes and back: JSON, UTF-8, one object, the same bytes in the queue, the log and an export.
+
+`encode` is the border. What JSON cannot hold without changing its meaning is refused with the path to it: NaN and
+infinities (which the encoder alone would turn into null), lone surrogates, U+0000 (which PostgreSQL text refuses),
+and a payload above the limit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from typing import Any
+
+import msgspec
+
+from pycrorm_async.events.happenings import EVENT_TYPES, DesignatorTypeDeclared, Happening
+
+__all__ = ["NotEncodable", "encode", "decode", "fingerprint", "unwritable"]
+
+
+class NotEncodable(ValueError):
+    """`path` inside the event holds what JSON cannot; `reason` says what."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(f"{path}: {reason}" if path else reason)
+        self.path = path
+        self.reason = reason
+
+
+_encoder = msgspec.json.Encoder()
+_decoders = {name: msgspec.json.Decoder(kind) for name, kind in EVENT_TYPES.items()}
+
+
+def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
+    """The event's payload. Raises `NotEncodable`; the bytes of one event never differ between processes."""
+    try:
+        payload = _encoder.encode(event)
+    except UnicodeEncodeError:
+        raise _first_fault(event) or NotEncodable("", "holds a lone surrogate") from None
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise _first_fault(event) or NotEncodable("", str(error)) from None
+    # The encoder writes NaN as null and U+0000 as an escape: only payloads that hold one of these are looked at.
+    if b"null" in payload or b"\\u0000" in payload:
+        fault = _first_fault(event)
+        if fault is not None:
+            raise fault
+    if len(payload) > bytes_max:
+        raise NotEncodable("", f"takes {len(payload):,} bytes, {bytes_max:,} are allowed (record_bytes_max)")
+    return payload
+
+
+def decode(type_name: str, payload: bytes) -> Happening:
+    """The event that `encode` wrote. `KeyError` for an unknown type, `msgspec.DecodeError` for other bytes."""
+    event: Happening = _decoders[type_name].decode(payload)
+    return event
+
+
+def fingerprint(declaration: bytes) -> str:
+    """The name of a declaration: 128 bits of BLAKE2b over its payload, as 32 hexadecimal digits."""
+    return hashlib.blake2b(declaration, digest_size=16).hexdigest()
+
+
+def declaration_of(payload: bytes) -> DesignatorTypeDeclared:
+    """The declaration in these bytes."""
+    event = decode("DesignatorTypeDeclared", payload)
+    assert isinstance(event, DesignatorTypeDeclared)
+    return event
+
+
+def unwritable(value: Any) -> str | None:
+    """Why JSON cannot hold this scalar as it is; None if it can."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{value} is not a finite number"
+    if isinstance(value, str):
+        if "\x00" in value:
+            return "the text holds U+0000"
+        try:
+            value.encode()
+        except UnicodeEncodeError:
+            return "the text holds a lone surrogate"
+    if isinstance(value, int) and not isinstance(value, bool) and not -(2**63) <= value < 2**63:
+        return f"{value} does not fit into 64 bits"
+    return None
+
+
+def _first_fault(value: Any, path: str = "") -> NotEncodable | None:
+    reason = unwritable(value)
+    if reason is not None:
+        return NotEncodable(path, reason)
+    children: list[tuple[str, Any]]
+    if isinstance(value, msgspec.Struct):
+        children = [(name, getattr(value, name)) for name in value.__struct_fields__]
+    elif isinstance(value, dict):
+        for key in value:
+            if not isinstance(key, str):
+                return NotEncodable(path, f"has a key of type {type(key).__name__}")
+            if unwritable(key):
+                return NotEncodable(path, f"has a key of which {unwritable(key)}")
+        children = list(value.items())
+    elif isinstance(value, list | tuple):
+        children = [(str(index), child) for index, child in enumerate(value)]
+    elif value is None or isinstance(value, str | int | float):
+        return None
+    else:
+        return NotEncodable(path, f"a {type(value).__name__} is not JSON")
+    for name, child in children:
+        fault = _first_fault(child, f"{path}.{name}" if path else name)
+        if fault is not None:
+            return fault
+    return None

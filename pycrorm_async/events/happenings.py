@@ -1,0 +1,304 @@
+"""What can happen, as frozen values: the payloads of the log, version 1.
+
+Each class is one event type; its name is the type's name in the log and its `version` counts its shapes. Fields that
+are null or empty are left out of the JSON. World objects are named by the sequence of their `ObjectAdded`; nodes by the
+sequence of their `NodeStarted`; times come from the envelope.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal, TypeAlias
+
+import msgspec
+
+__all__ = [
+    "Happening",
+    "PoseValue",
+    "ObjectReference",
+    "ObjectValue",
+    "RobotValue",
+    "FailureValue",
+    "MissingValue",
+    "CandidateValue",
+    "FieldType",
+    "ItemType",
+    "FieldDeclared",
+    "NodeKind",
+    "NodeStatus",
+    "EpisodeStatus",
+    "EpisodeStarted",
+    "EpisodeEnded",
+    "DesignatorTypeDeclared",
+    "ObjectAdded",
+    "ObjectRemoved",
+    "ObjectMoved",
+    "ObjectAttached",
+    "ObjectDetached",
+    "JointsMoved",
+    "NodeStarted",
+    "NodeEnded",
+    "LocationResolved",
+    "EVENT_TYPES",
+]
+
+NodeKind: TypeAlias = Literal["root", "action", "motion", "language"]
+NodeStatus: TypeAlias = Literal[
+    "RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST"
+]
+EpisodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "INTERRUPTED", "LOST"]
+
+FieldType: TypeAlias = Literal[
+    "integer", "real", "text", "boolean", "datetime", "enum", "pose", "object", "list", "dict"
+]
+ItemType: TypeAlias = Literal["integer", "real", "text", "boolean", "datetime", "enum", "pose", "object"]
+
+
+class _Value(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A part of a payload."""
+
+
+class PoseValue(_Value):
+    """A pose as it was: metres, unit quaternion xyzw, frame name, moment it was made (UTC, ns)."""
+
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+    frame: str
+    time_ns: int
+
+
+class ObjectReference(_Value):
+    """A world object at a moment: `object` is the sequence of its ObjectAdded, `row` that of the ObjectAdded or
+    ObjectMoved in force."""
+
+    object: int
+    row: int
+
+
+class ObjectValue(_Value):
+    """An object that has no row of its own yet: a part of one, a believed one, one outside the recorded world."""
+
+    dtype: Literal["Object", "ObjectPart", "BelieveObject"]
+    name: str
+    object_type: str | None = None
+    pose: PoseValue | None = None
+    part_of: ObjectReference | None = None
+
+
+class RobotValue(_Value):
+    """The robot at the start of a node: base pose, torso joint position in metres (None without a torso)."""
+
+    pose: PoseValue
+    object_type: str
+    torso_height: float | None = None
+    object: ObjectReference | None = None
+
+
+class FailureValue(_Value):
+    """Why something failed: qualified class, message, constructor arguments as JSON where they can be recorded."""
+
+    type: str
+    message: str
+    arguments: list[Any] = []
+
+
+class MissingValue(_Value):
+    """Stands where a value could not be recorded: the reason, and a cut, cleaned repr."""
+
+    missing: str
+    repr: str = ""
+
+
+class CandidateValue(_Value):
+    """A pose that a location designator offered, with the arms that reach from there (names)."""
+
+    pose: PoseValue
+    arms: tuple[str, ...] = ()
+
+
+class FieldDeclared(_Value):
+    """One field of a designator type.
+
+    Attributes:
+        name: its key in `NodeStarted.parameters`; a nested dataclass' field is `outer_inner`.
+        column: its column in the leaf table (`<name>_id` for poses and objects; unused for list and dict).
+        type: see `FieldType`.
+        slot: 2 to 31, the same for the life of the declaration.
+        optional: whether null is a legal value.
+        enum: for an enum, the qualified name of its class (for people; members are stored by name).
+        item: for list and dict, the type of the values.
+    """
+
+    name: str
+    column: str
+    type: FieldType
+    slot: int
+    optional: bool = False
+    enum: str | None = None
+    item: ItemType | None = None
+
+
+class Happening(_Value):
+    """The root of all events."""
+
+    version: ClassVar[int] = 1
+
+
+class EpisodeStarted(Happening):
+    """The first event of an episode: who, why, with what. `world` describes it in a line; `seed` is the plan's."""
+
+    description: str
+    created_by: str
+    host: str
+    software: str
+    python: str
+    plan: str | None = None
+    world: str | None = None
+    seed: int | None = None
+
+
+class EpisodeEnded(Happening):
+    """The last event of an episode. Status LOST is written by recovery, never by a plan."""
+
+    status: EpisodeStatus
+    failure: FailureValue | None = None
+
+
+class DesignatorTypeDeclared(Happening):
+    """A designator type as it was declared in one process; named by the hash of its bytes (`fingerprint`).
+
+    Attributes:
+        kind: action, motion or language.
+        dtype: the type's name in the memory, `SayingAction` for `SayingActionPerformable`.
+        table: its leaf table, `saying_action`.
+        concept: the SOMA concept, where one is known.
+        bases: dtypes of the recorded classes it descends from, nearest first.
+        fields: in the order of declaration.
+    """
+
+    kind: NodeKind
+    dtype: str
+    table: str
+    concept: str | None = None
+    bases: tuple[str, ...] = ()
+    fields: tuple[FieldDeclared, ...] = ()
+
+
+class ObjectAdded(Happening):
+    """An object is in the world. Its sequence is the object's identity in this episode. `joints` in rad or m."""
+
+    name: str
+    object_type: str
+    pose: PoseValue
+    joints: dict[str, float] = {}
+
+
+class ObjectRemoved(Happening):
+    """An object left the world."""
+
+    object: ObjectReference
+    node: int | None = None
+
+
+class ObjectMoved(Happening):
+    """An object has a new pose, once per motion; also for every attached object that the motion carried."""
+
+    object: int
+    name: str
+    object_type: str
+    pose: PoseValue
+    node: int | None = None
+
+
+class ObjectAttached(Happening):
+    """`child` moves with `link` of `parent` from now on."""
+
+    parent: ObjectReference
+    child: ObjectReference
+    link: str | None = None
+    node: int | None = None
+
+
+class ObjectDetached(Happening):
+    """`child` no longer moves with `parent`."""
+
+    parent: ObjectReference
+    child: ObjectReference
+    link: str | None = None
+    node: int | None = None
+
+
+class JointsMoved(Happening):
+    """Joints of an object have new positions (rad or m), all those that one motion set."""
+
+    object: ObjectReference
+    joints: dict[str, float]
+    node: int | None = None
+
+
+class NodeStarted(Happening):
+    """A node of the task tree begins. Its sequence is the node's id in this episode.
+
+    Attributes:
+        kind: root, action, motion, language.
+        parent: the parent's sequence; None for the root.
+        designator: fingerprint of the `DesignatorTypeDeclared`; None for the root.
+        parameters: by `FieldDeclared.name`: scalars; enum members by name; datetimes as RFC 3339 in UTC with µs;
+            poses as `PoseValue`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of these; a
+            `MissingValue` where the caller chose to record what cannot be recorded as missing.
+        robot: at this moment; None without a robot.
+        simulated: thought through in a copy of the world.
+    """
+
+    kind: NodeKind
+    parent: int | None = None
+    designator: str | None = None
+    parameters: dict[str, Any] = {}
+    robot: RobotValue | None = None
+    simulated: bool = False
+
+
+class NodeEnded(Happening):
+    """A node of the task tree is over. `result` is JSON, or a `MissingValue`."""
+
+    node: int
+    status: NodeStatus
+    failure: FailureValue | None = None
+    result: Any = None
+
+
+class LocationResolved(Happening):
+    """A location designator was asked for a place.
+
+    Attributes:
+        location: its class, e.g. `CostmapLocation`.
+        offered: the candidates it gave, in order.
+        taken: index into `offered` of the one the plan went on with; None if it found none good.
+        considered: how many places it looked at to find them.
+        node: the node that asked.
+    """
+
+    location: str
+    offered: tuple[CandidateValue, ...] = ()
+    taken: int | None = None
+    considered: int = 0
+    node: int | None = None
+
+
+EVENT_TYPES: dict[str, type[Happening]] = {
+    kind.__name__: kind
+    for kind in (
+        EpisodeStarted,
+        EpisodeEnded,
+        DesignatorTypeDeclared,
+        ObjectAdded,
+        ObjectRemoved,
+        ObjectMoved,
+        ObjectAttached,
+        ObjectDetached,
+        JointsMoved,
+        NodeStarted,
+        NodeEnded,
+        LocationResolved,
+    )
+}
+"""The catalogue of event types by name: what a log of this version may hold."""

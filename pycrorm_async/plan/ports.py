@@ -1,0 +1,59 @@
+"""What the plan layer asks of a memory: to be told what happens. Without one a plan runs the same.
+
+`recorder` is the memory of this context. It is told in the caller's task, synchronously, and must be quick; what it
+raises from `node_started` refuses the perform before it runs, everything else it must keep to itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Pose
+
+if TYPE_CHECKING:
+    from pycrorm_async.plan.task_tree import TaskTreeNode
+
+__all__ = ["PlanObserver", "Candidate", "recorder"]
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A place a location designator offers: a pose, and the arms that reach from there."""
+
+    pose: Pose
+    arms: tuple[Arms, ...] = ()
+
+
+class PlanObserver(Protocol):
+    """Told of every node and every resolved location of the plans in its context."""
+
+    def admit(self) -> Awaitable[None] | None:
+        """None if a node may start at once; otherwise what must be awaited first (it may raise)."""
+        ...
+
+    def node_started(self, node: TaskTreeNode) -> None:
+        """Status RUNNING; `perform` has not run yet. May raise to refuse it. May set `node.record`."""
+        ...
+
+    def node_ended(self, node: TaskTreeNode) -> None:
+        """Status, failure and result are set. Called exactly once for every node that started."""
+        ...
+
+    def location_resolved(
+        self,
+        *,
+        location: str,
+        offered: tuple[Candidate, ...],
+        taken: int | None,
+        considered: int,
+        node: TaskTreeNode | None,
+    ) -> None:
+        """A location designator was asked: what it offered, which of these was taken, how many places it looked at."""
+        ...
+
+
+recorder: ContextVar[PlanObserver | None] = ContextVar("recorder", default=None)

@@ -1,0 +1,145 @@
+"""A pose is a frozen value: position in metres, unit quaternion xyzw, the frame both are in, and when it was made.
+
+>>> Pose([1.3, 0.7, 0.95]).position.z
+0.95
+>>> Pose([1, 0, 0]) @ Pose([0, 1, 0])
+Pose(position=[1.0, 1.0, 0.0], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+
+__all__ = ["Vector", "Quaternion", "Pose", "rotated", "product", "yaw_quaternion"]
+
+
+class Vector(NamedTuple):
+    """Metres."""
+
+    x: float
+    y: float
+    z: float
+
+
+class Quaternion(NamedTuple):
+    """A rotation; unit length inside a `Pose`."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+IDENTITY = Quaternion(0.0, 0.0, 0.0, 1.0)
+
+
+def product(a: Sequence[float], b: Sequence[float]) -> Quaternion:
+    """Hamilton product a ⊗ b of two xyzw quaternions: first b, then a."""
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return Quaternion(
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
+    """The vector v turned by the unit quaternion q."""
+    qx, qy, qz, qw = q
+    x, y, z = v
+    tx, ty, tz = 2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)
+    return Vector(
+        x + qw * tx + qy * tz - qz * ty,
+        y + qw * ty + qz * tx - qx * tz,
+        z + qw * tz + qx * ty - qy * tx,
+    )
+
+
+def yaw_quaternion(angle: float) -> Quaternion:
+    """A turn by `angle` rad about z."""
+    return Quaternion(0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
+
+
+@dataclass(frozen=True, slots=True, init=False, repr=False)
+class Pose:
+    """Where something is and how it is turned. Equality leaves the time out.
+
+    Args:
+        position: x, y, z in metres.
+        orientation: quaternion x, y, z, w of any length but zero; stored with length one.
+        frame: name of the frame both are given in.
+        time_ns: UTC in ns since 1970; now, if left out.
+
+    Raises:
+        ValueError: a wrong number of components, or a quaternion of length zero.
+    """
+
+    position: Vector
+    orientation: Quaternion
+    frame: str
+    time_ns: int = field(compare=False)
+
+    def __init__(
+        self,
+        position: Sequence[float] = (0.0, 0.0, 0.0),
+        orientation: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+        frame: str = "map",
+        time_ns: int | None = None,
+    ) -> None:
+        x, y, z = position
+        qx, qy, qz, qw = orientation
+        length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
+        if length == 0:
+            raise ValueError("an orientation needs a quaternion of length other than zero")
+        unit = abs(length - 1.0) < 1e-15
+        scale = 1.0 if unit else 1.0 / length
+        put = object.__setattr__
+        put(self, "position", Vector(float(x), float(y), float(z)))
+        put(
+            self,
+            "orientation",
+            Quaternion(float(qx * scale), float(qy * scale), float(qz * scale), float(qw * scale)),
+        )
+        put(self, "frame", frame)
+        put(self, "time_ns", SYSTEM_CLOCK.wall_ns() if time_ns is None else time_ns)
+
+    def __repr__(self) -> str:
+        return (
+            f"Pose(position={list(self.position)}, orientation={list(self.orientation)}, frame={self.frame!r})"
+        )
+
+    def __matmul__(self, inner: Pose) -> Pose:
+        """The pose that `inner`, given relative to this one, has in this one's frame."""
+        moved = rotated(self.orientation, inner.position)
+        x, y, z = self.position
+        return Pose(
+            (x + moved.x, y + moved.y, z + moved.z), product(self.orientation, inner.orientation), self.frame
+        )
+
+    def inverse(self) -> Pose:
+        """The pose P for which `self @ P` is the identity."""
+        x, y, z, w = self.orientation
+        back = Quaternion(-x, -y, -z, w)
+        moved = rotated(back, self.position)
+        return Pose((-moved.x, -moved.y, -moved.z), back, self.frame)
+
+    def relative_to(self, other: Pose) -> Pose:
+        """This pose as seen from `other`; both in the same frame."""
+        return other.inverse() @ self
+
+    def distance(self, other: Pose) -> float:
+        """Metres between the two positions."""
+        return math.dist(self.position, other.position)
+
+    @property
+    def yaw(self) -> float:
+        """Heading in the plane, rad in (-π, π]."""
+        x, y, z, w = self.orientation
+        return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))

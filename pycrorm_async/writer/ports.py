@@ -1,0 +1,47 @@
+"""What the writer needs of its two ends: a source of synced records, and a log that takes and folds them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from pycrorm_async.events.envelope import Record
+
+__all__ = ["Source", "Destination"]
+
+
+class Source(Protocol):
+    """The consumer's side of a queue, live or recovered."""
+
+    @property
+    def name(self) -> str:
+        """The recorder's name, for status and messages."""
+        ...
+
+    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+        """The next synced records in order, at least one, at most the limits (a single larger record comes alone).
+
+        Waits until one is there, then at most `age_s_max` for more. Empty once the queue is closed and drained.
+        What was given is not given again by this source; what was not acknowledged is given again by the next.
+        """
+        ...
+
+    async def acknowledge(self, position: int) -> None:
+        """Everything up to this position is stored for good: its segments may be deleted."""
+        ...
+
+
+class Destination(Protocol):
+    """The log in a database, and the tables behind it."""
+
+    async def append(self, records: Sequence[Record]) -> None:
+        """Durable when it returns. What is stored already with the same bytes is stored once.
+
+        A record the database refuses parks its episode with the reason and the others go on. Raises
+        `DatabaseUnavailable` when the database is away: the same call may be made again.
+        """
+        ...
+
+    async def fold(self) -> int:
+        """Brings the tables up to date with the log; the number of events folded. An episode it cannot fold is parked."""
+        ...
