@@ -64,6 +64,4 @@ class Catalogue(Mapping[str, DesignatorTypeDeclared]):
 
     def descendants_of(self, dtype: str) -> tuple[str, ...]:
         """The dtypes whose classes descend from that of `dtype`."""
-        return tuple(
-            dict.fromkeys(each.dtype for each in self._declarations.values() if dtype in each.bases)
-        )
+        return tuple(dict.fromkeys(each.dtype for each in self._declarations.values() if dtype in each.bases))

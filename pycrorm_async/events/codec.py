@@ -78,8 +78,6 @@ def unwritable(value: Any) -> str | None:
             value.encode()
         except UnicodeEncodeError:
             return "the text holds a lone surrogate"
-    if isinstance(value, int) and not isinstance(value, bool) and not -(2**63) <= value < 2**63:
-        return f"{value} does not fit into 64 bits"
     return None
 
 

@@ -42,9 +42,7 @@ __all__ = [
 ]
 
 NodeKind: TypeAlias = Literal["root", "action", "motion", "language"]
-NodeStatus: TypeAlias = Literal[
-    "RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST"
-]
+NodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST"]
 EpisodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "INTERRUPTED", "LOST"]
 
 FieldType: TypeAlias = Literal[
@@ -57,7 +55,7 @@ class _Value(msgspec.Struct, frozen=True, omit_defaults=True):
     """A part of a payload."""
 
 
-class PoseValue(_Value):
+class PoseValue(_Value, frozen=True):
     """A pose as it was: metres, unit quaternion xyzw, frame name, moment it was made (UTC, ns)."""
 
     position: tuple[float, float, float]
@@ -66,7 +64,7 @@ class PoseValue(_Value):
     time_ns: int
 
 
-class ObjectReference(_Value):
+class ObjectReference(_Value, frozen=True):
     """A world object at a moment: `object` is the sequence of its ObjectAdded, `row` that of the ObjectAdded or
     ObjectMoved in force."""
 
@@ -74,7 +72,7 @@ class ObjectReference(_Value):
     row: int
 
 
-class ObjectValue(_Value):
+class ObjectValue(_Value, frozen=True):
     """An object that has no row of its own yet: a part of one, a believed one, one outside the recorded world."""
 
     dtype: Literal["Object", "ObjectPart", "BelieveObject"]
@@ -84,7 +82,7 @@ class ObjectValue(_Value):
     part_of: ObjectReference | None = None
 
 
-class RobotValue(_Value):
+class RobotValue(_Value, frozen=True):
     """The robot at the start of a node: base pose, torso joint position in metres (None without a torso)."""
 
     pose: PoseValue
@@ -93,7 +91,7 @@ class RobotValue(_Value):
     object: ObjectReference | None = None
 
 
-class FailureValue(_Value):
+class FailureValue(_Value, frozen=True):
     """Why something failed: qualified class, message, constructor arguments as JSON where they can be recorded."""
 
     type: str
@@ -101,21 +99,21 @@ class FailureValue(_Value):
     arguments: list[Any] = []
 
 
-class MissingValue(_Value):
+class MissingValue(_Value, frozen=True):
     """Stands where a value could not be recorded: the reason, and a cut, cleaned repr."""
 
     missing: str
     repr: str = ""
 
 
-class CandidateValue(_Value):
+class CandidateValue(_Value, frozen=True):
     """A pose that a location designator offered, with the arms that reach from there (names)."""
 
     pose: PoseValue
     arms: tuple[str, ...] = ()
 
 
-class FieldDeclared(_Value):
+class FieldDeclared(_Value, frozen=True):
     """One field of a designator type.
 
     Attributes:
@@ -137,13 +135,13 @@ class FieldDeclared(_Value):
     item: ItemType | None = None
 
 
-class Happening(_Value):
+class Happening(_Value, frozen=True):
     """The root of all events."""
 
     version: ClassVar[int] = 1
 
 
-class EpisodeStarted(Happening):
+class EpisodeStarted(Happening, frozen=True):
     """The first event of an episode: who, why, with what. `world` describes it in a line; `seed` is the plan's."""
 
     description: str
@@ -156,14 +154,14 @@ class EpisodeStarted(Happening):
     seed: int | None = None
 
 
-class EpisodeEnded(Happening):
+class EpisodeEnded(Happening, frozen=True):
     """The last event of an episode. Status LOST is written by recovery, never by a plan."""
 
     status: EpisodeStatus
     failure: FailureValue | None = None
 
 
-class DesignatorTypeDeclared(Happening):
+class DesignatorTypeDeclared(Happening, frozen=True):
     """A designator type as it was declared in one process; named by the hash of its bytes (`fingerprint`).
 
     Attributes:
@@ -183,7 +181,7 @@ class DesignatorTypeDeclared(Happening):
     fields: tuple[FieldDeclared, ...] = ()
 
 
-class ObjectAdded(Happening):
+class ObjectAdded(Happening, frozen=True):
     """An object is in the world. Its sequence is the object's identity in this episode. `joints` in rad or m."""
 
     name: str
@@ -192,14 +190,14 @@ class ObjectAdded(Happening):
     joints: dict[str, float] = {}
 
 
-class ObjectRemoved(Happening):
+class ObjectRemoved(Happening, frozen=True):
     """An object left the world."""
 
     object: ObjectReference
     node: int | None = None
 
 
-class ObjectMoved(Happening):
+class ObjectMoved(Happening, frozen=True):
     """An object has a new pose, once per motion; also for every attached object that the motion carried."""
 
     object: int
@@ -209,7 +207,7 @@ class ObjectMoved(Happening):
     node: int | None = None
 
 
-class ObjectAttached(Happening):
+class ObjectAttached(Happening, frozen=True):
     """`child` moves with `link` of `parent` from now on."""
 
     parent: ObjectReference
@@ -218,7 +216,7 @@ class ObjectAttached(Happening):
     node: int | None = None
 
 
-class ObjectDetached(Happening):
+class ObjectDetached(Happening, frozen=True):
     """`child` no longer moves with `parent`."""
 
     parent: ObjectReference
@@ -227,7 +225,7 @@ class ObjectDetached(Happening):
     node: int | None = None
 
 
-class JointsMoved(Happening):
+class JointsMoved(Happening, frozen=True):
     """Joints of an object have new positions (rad or m), all those that one motion set."""
 
     object: ObjectReference
@@ -235,7 +233,7 @@ class JointsMoved(Happening):
     node: int | None = None
 
 
-class NodeStarted(Happening):
+class NodeStarted(Happening, frozen=True):
     """A node of the task tree begins. Its sequence is the node's id in this episode.
 
     Attributes:
@@ -257,7 +255,7 @@ class NodeStarted(Happening):
     simulated: bool = False
 
 
-class NodeEnded(Happening):
+class NodeEnded(Happening, frozen=True):
     """A node of the task tree is over. `result` is JSON, or a `MissingValue`."""
 
     node: int
@@ -266,7 +264,7 @@ class NodeEnded(Happening):
     result: Any = None
 
 
-class LocationResolved(Happening):
+class LocationResolved(Happening, frozen=True):
     """A location designator was asked for a place.
 
     Attributes:

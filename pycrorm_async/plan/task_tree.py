@@ -1,12 +1,14 @@
 """A node of the task tree: one `perform`, from its start to its end, with the node it ran inside.
 
-Nodes know their parent and not their children, so a plan of any length keeps only the path it is on in memory. The
-parent of a new node is the current node of the same context: asyncio tasks inherit it, concurrent plans never mix.
-To see a whole tree without a memory, collect it: `with collected_tree() as tree: await plan(); print(tree)`.
+Nodes know their parent and not their children, so a plan of any length keeps only the path it is on in memory.
+The parent of a new node is the current node of the same context: asyncio tasks inherit it, concurrent plans never
+mix. To see a whole tree without a memory, collect it: `with collected_tree() as tree: await plan(); print(tree)`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,7 +16,15 @@ from typing import TYPE_CHECKING, Any, Literal
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import Designator
 
-__all__ = ["NodeKind", "TaskStatus", "TaskTreeNode", "current_node"]
+__all__ = [
+    "NodeKind",
+    "TaskStatus",
+    "TaskTreeNode",
+    "CollectedTree",
+    "collected_tree",
+    "collecting",
+    "current_node",
+]
 
 NodeKind = Literal["root", "action", "motion", "language"]
 
@@ -49,8 +59,16 @@ class TaskTreeNode:
     """
 
     __slots__ = (
-        "designator", "kind", "parent", "status", "failure", "result", "started_ns", "ended_ns", "record",
-    )  # fmt: skip
+        "designator",
+        "ended_ns",
+        "failure",
+        "kind",
+        "parent",
+        "record",
+        "result",
+        "started_ns",
+        "status",
+    )
 
     def __init__(
         self,
@@ -75,3 +93,74 @@ class TaskTreeNode:
 
 
 current_node: ContextVar[TaskTreeNode | None] = ContextVar("current_node", default=None)
+
+
+class CollectedTree:
+    """The nodes that started while it was collecting, in order; `print(tree)` draws them.
+
+    Attributes:
+        roots: the nodes whose parent is not in the tree.
+    """
+
+    def __init__(self) -> None:
+        self.roots: list[TaskTreeNode] = []
+        self._children: dict[TaskTreeNode, list[TaskTreeNode]] = {}
+
+    def add(self, node: TaskTreeNode) -> None:
+        """A node started."""
+        siblings = self.roots if node.parent is None else self._children.get(node.parent, self.roots)
+        siblings.append(node)
+        self._children[node] = []
+
+    def children(self, node: TaskTreeNode) -> tuple[TaskTreeNode, ...]:
+        """What started inside this node, in order."""
+        return tuple(self._children[node])
+
+    def __len__(self) -> int:
+        return len(self._children)
+
+    def __iter__(self) -> Iterator[TaskTreeNode]:
+        """Every node, a parent before its children, siblings in the order they started."""
+        ahead = self.roots[::-1]
+        while ahead:
+            node = ahead.pop()
+            yield node
+            ahead.extend(reversed(self._children[node]))
+
+    def __str__(self) -> str:
+        lines = []
+        ahead = [(node, "", "", "") for node in reversed(self.roots)]
+        while ahead:
+            node, indent, branch, below = ahead.pop()
+            lines.append(f"{indent}{branch}{_line(node)}")
+            children = self._children[node]
+            forks = [("├── ", "│   ")] * (len(children) - 1) + [("└── ", "    ")]
+            inner = [(child, indent + below, *fork) for child, fork in zip(children, forks, strict=False)]
+            ahead.extend(reversed(inner))
+        return "\n".join(lines)
+
+
+def _line(node: TaskTreeNode) -> str:
+    name = type(node.designator).__name__ if node.designator is not None else "root"
+    if node.ended_ns is None:
+        return f"{name} {node.status.name}"
+    failure = f" ({type(node.failure).__name__})" if node.failure is not None else ""
+    return f"{name} {node.status.name}{failure} {(node.ended_ns - node.started_ns) / 1e6:.1f} ms"
+
+
+collecting: ContextVar[tuple[CollectedTree, ...]] = ContextVar("collecting", default=())
+"""The trees that collect in this context."""
+
+
+@contextmanager
+def collected_tree() -> Iterator[CollectedTree]:
+    """Collect the nodes of this context, and of the tasks it starts, into a tree; with or without a memory.
+
+    Unlike a plan without it, the tree keeps every node, and with it its designator, failure and result.
+    """
+    tree = CollectedTree()
+    token = collecting.set((*collecting.get(), tree))
+    try:
+        yield tree
+    finally:
+        collecting.reset(token)

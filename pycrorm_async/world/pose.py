@@ -111,17 +111,13 @@ class Pose:
         put(self, "time_ns", SYSTEM_CLOCK.wall_ns() if time_ns is None else time_ns)
 
     def __repr__(self) -> str:
-        return (
-            f"Pose(position={list(self.position)}, orientation={list(self.orientation)}, frame={self.frame!r})"
-        )
+        return f"Pose(position={list(self.position)}, orientation={list(self.orientation)}, frame={self.frame!r})"
 
     def __matmul__(self, inner: Pose) -> Pose:
         """The pose that `inner`, given relative to this one, has in this one's frame."""
         moved = rotated(self.orientation, inner.position)
         x, y, z = self.position
-        return Pose(
-            (x + moved.x, y + moved.y, z + moved.z), product(self.orientation, inner.orientation), self.frame
-        )
+        return Pose((x + moved.x, y + moved.y, z + moved.z), product(self.orientation, inner.orientation), self.frame)
 
     def inverse(self) -> Pose:
         """The pose P for which `self @ P` is the identity."""

@@ -1,0 +1,243 @@
+"""From a designator class to its declaration: which fields it has, of which type, in which slot and column.
+
+A field is every dataclass field that its constructor takes and whose name has no leading underscore. What cannot be a
+column is refused here, by name, the first time the class is performed with a memory open.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+import typing
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from enum import Enum
+from typing import Any, NamedTuple
+
+from pycrorm_async.errors import DeclarationRefused
+from pycrorm_async.events.codec import encode, fingerprint
+from pycrorm_async.events.fields import column_name, fault_in_fields, fault_in_table, table_name
+from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared, FieldType, ItemType
+from pycrorm_async.events.ids import SLOT_FIRST_FIELD
+from pycrorm_async.hooks.values import OBJECT_TYPES
+from pycrorm_async.plan.designator import Designator
+from pycrorm_async.world.pose import Pose
+
+__all__ = ["DeclaredType", "Field", "Declarations", "declared_type"]
+
+
+class Field(NamedTuple):
+    """A declared field, the attribute path that leads to its value, and the enum class if it is one."""
+
+    declared: FieldDeclared
+    path: tuple[str, ...]
+    enum: type[Enum] | None
+
+
+class DeclaredType(NamedTuple):
+    """A designator class as the memory knows it."""
+
+    declaration: DesignatorTypeDeclared
+    payload: bytes
+    fingerprint: str
+    fields: tuple[Field, ...]
+
+
+class _Shape(NamedTuple):
+    type: FieldType
+    optional: bool = False
+    item: ItemType | None = None
+    enum: type[Enum] | None = None
+    nested: type | None = None
+
+
+class Declarations:
+    """The live designator classes of one memory. Two classes of one dtype are refused, with both paths."""
+
+    def __init__(self) -> None:
+        self._declared: weakref.WeakKeyDictionary[type, DeclaredType] = weakref.WeakKeyDictionary()
+        self._classes: dict[str, weakref.ref[type]] = {}
+
+    def of(self, designator: type[Designator], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
+        """The declaration of this class; `on_new` is called before the first time it is given out."""
+        known = self._declared.get(designator)
+        if known is not None:
+            return known
+        declared = declared_type(designator)
+        for name in {declared.declaration.dtype, declared.declaration.table}:
+            reference = self._classes.get(name)
+            other = reference() if reference is not None else None
+            if other is not None and _path(other) != _path(designator):
+                raise DeclarationRefused(
+                    _path(designator),
+                    f"{_path(other)} is {name!r} already (set a class attribute `dtype` on one of them)",
+                )
+        on_new(declared)
+        for name in {declared.declaration.dtype, declared.declaration.table}:
+            self._classes[name] = weakref.ref(designator)
+        self._declared[designator] = declared
+        return declared
+
+
+def declared_type(designator: type[Designator]) -> DeclaredType:
+    """The declaration of one class. Raises `DeclarationRefused` naming class and field."""
+    fields = tuple(_fields(designator))
+    orm_class = designator.orm_class
+    table = getattr(orm_class, "__tablename__", None) or table_name(designator.dtype)
+    fault = fault_in_table(table) or fault_in_fields([field.declared for field in fields])
+    if fault is not None:
+        raise DeclarationRefused(_path(designator), fault)
+    declaration = DesignatorTypeDeclared(
+        kind=designator.kind,
+        dtype=designator.dtype,
+        table=table,
+        concept=designator.concept,
+        bases=_bases(designator),
+        fields=tuple(field.declared for field in fields),
+    )
+    payload = encode(declaration)
+    return DeclaredType(declaration, payload, fingerprint(payload), fields)
+
+
+def _bases(designator: type[Designator]) -> tuple[str, ...]:
+    """dtypes of the recorded ancestors; the abstract roots of the plan layer are none."""
+    return tuple(
+        base.dtype
+        for base in designator.__mro__[1:]
+        if issubclass(base, Designator) and not getattr(base, "__abstractmethods__", None)
+    )
+
+
+def _fields(designator: type) -> typing.Iterator[Field]:
+    if "__dataclass_fields__" not in vars(designator) and vars(designator).get("__annotations__"):
+        own = [name for name, kind in vars(designator)["__annotations__"].items() if "ClassVar" not in str(kind)]
+        if own:
+            raise DeclarationRefused(
+                _path(designator), f"it has the field {own[0]!r} but is no dataclass (add @dataclass)"
+            )
+    slot = SLOT_FIRST_FIELD
+    for name, path, shape in _flat(designator, designator, (), optional=False):
+        yield Field(
+            FieldDeclared(
+                name=name,
+                column=column_name(name, shape.type),
+                type=shape.type,
+                slot=slot,
+                optional=shape.optional,
+                enum=_path(shape.enum) if shape.enum is not None else None,
+                item=shape.item,
+            ),
+            path,
+            shape.enum,
+        )
+        slot += 1
+
+
+def _flat(
+    designator: type, owner: type, prefix: tuple[str, ...], *, optional: bool
+) -> typing.Iterator[tuple[str, tuple[str, ...], _Shape]]:
+    try:
+        hints = typing.get_type_hints(owner, include_extras=False)
+    except (NameError, TypeError, AttributeError) as error:
+        raise DeclarationRefused(_path(designator), f"its field types cannot be read: {error}") from None
+    for field in dataclasses.fields(owner):
+        if not field.init or field.name.startswith("_"):
+            continue
+        path = (*prefix, field.name)
+        name = "_".join(path)
+        shape = _shape(hints[field.name])
+        if shape is None:
+            raise DeclarationRefused(
+                _path(designator),
+                f"field {name!r} has the type {_text(hints[field.name])}, which has no column: use int, float, str, bool,"
+                " an Enum, an aware datetime, a Pose, an object designator, a dataclass of these,"
+                " or a list or dict of these",
+            )
+        if shape.nested is not None:
+            if len(path) > 8:
+                raise DeclarationRefused(_path(designator), f"field {name!r} is nested more than 8 deep")
+            yield from _flat(designator, shape.nested, path, optional=optional or shape.optional)
+        else:
+            yield name, path, shape._replace(optional=optional or shape.optional)
+
+
+def _shape(hint: Any) -> _Shape | None:
+    """What kind of field a type hint makes; None if none."""
+    origin = typing.get_origin(hint)
+    if isinstance(hint, typing.NewType):
+        return _shape(hint.__supertype__)
+    if origin in (typing.Union, types.UnionType):
+        return _union(hint)
+    if origin is typing.Literal:
+        return _Shape("text") if all(isinstance(each, str) for each in typing.get_args(hint)) else None
+    if origin is not None and isinstance(origin, type):
+        return _container(origin, typing.get_args(hint))
+    if isinstance(hint, type):
+        return _plain(hint)
+    return None
+
+
+def _plain(kind: type) -> _Shape | None:
+    if issubclass(kind, Enum):
+        return _Shape("enum", enum=kind)
+    for python, name in _SCALARS:
+        if issubclass(kind, python):
+            return _Shape(name)
+    if issubclass(kind, OBJECT_TYPES):
+        return _Shape("object")
+    if dataclasses.is_dataclass(kind):
+        return _Shape("text", nested=kind)
+    return None
+
+
+_SCALARS: tuple[tuple[type, FieldType], ...] = (
+    (bool, "boolean"),
+    (int, "integer"),
+    (float, "real"),
+    (str, "text"),
+    (datetime, "datetime"),
+    (Pose, "pose"),
+)
+
+
+def _union(hint: Any) -> _Shape | None:
+    members = [each for each in typing.get_args(hint) if each is not type(None)]
+    optional = len(members) < len(typing.get_args(hint))
+    shapes = {shape._replace(optional=False) if shape else None for shape in map(_shape, members)}
+    optional = optional or any(shape is not None and shape.optional for shape in map(_shape, members))
+    if shapes == {_Shape("integer"), _Shape("real")}:
+        shapes = {_Shape("real")}
+    if len(shapes) != 1:
+        return None
+    shape = shapes.pop()
+    return shape._replace(optional=optional) if shape is not None else None
+
+
+def _container(origin: type, arguments: tuple[Any, ...]) -> _Shape | None:
+    kind: FieldType
+    if issubclass(origin, Mapping) and len(arguments) == 2:
+        key = _shape(arguments[0])
+        if key is None or key.type not in ("text", "enum") or key.optional:
+            return None
+        kind, value = "dict", arguments[1]
+    elif (
+        (issubclass(origin, tuple) and len(arguments) == 2 and arguments[1] is Ellipsis)
+        or (issubclass(origin, tuple) and arguments and len(set(arguments)) == 1)
+        or (issubclass(origin, Sequence) and not issubclass(origin, tuple) and len(arguments) == 1)
+    ):
+        kind, value = "list", arguments[0]
+    else:
+        return None
+    item = _shape(value)
+    if item is None or item.nested is not None or item.type in ("list", "dict"):
+        return None
+    return _Shape(kind, item=typing.cast("ItemType", item.type), enum=item.enum)
+
+
+def _path(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def _text(hint: Any) -> str:
+    return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)

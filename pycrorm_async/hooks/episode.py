@@ -1,0 +1,282 @@
+"""One open episode: numbers its nodes, watches its world, and writes down how it ended."""
+
+from __future__ import annotations
+
+import asyncio
+import getpass
+import platform
+from typing import Any, Final, NamedTuple
+
+from pycrorm_async.errors import EpisodeRefused, Unrecordable
+from pycrorm_async.events.codec import NotEncodable
+from pycrorm_async.events.happenings import (
+    CandidateValue,
+    EpisodeEnded,
+    EpisodeStarted,
+    EpisodeStatus,
+    FailureValue,
+    LocationResolved,
+    MissingValue,
+    NodeEnded,
+    NodeStarted,
+    NodeStatus,
+    ObjectReference,
+    RobotValue,
+)
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.hooks.declaration import DeclaredType
+from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.values import (
+    Unwritable,
+    clean,
+    failure_value,
+    pose_value,
+    written,
+    written_or_missing,
+)
+from pycrorm_async.hooks.world import WorldRecorder
+from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.plan.ports import Candidate
+from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.world.bullet import BulletWorld
+from pycrorm_async.world.objects import Object
+
+__all__ = ["Episode", "NodeRecord", "EpisodeOpening", "current_task"]
+
+
+class EpisodeOpening(NamedTuple):
+    """What an episode begins with."""
+
+    description: str
+    software: str
+    plan: str | None = None
+    seed: int | None = None
+
+
+class NodeRecord(NamedTuple):
+    """What the memory keeps at a running node."""
+
+    episode: Episode
+    sequence: int
+    implicit: bool
+    """Whether the episode was opened for this node and ends with it."""
+
+
+class Episode:
+    """An episode that is open, or was.
+
+    Attributes:
+        id: 16 bytes of a UUIDv7; `str(episode)` is its text.
+        task: the asyncio task that opened it; None outside any.
+    """
+
+    def __init__(self, emitter: Emitter, episode: EpisodeId, opening: EpisodeOpening) -> None:
+        self.id: Final = episode
+        self.task = current_task()
+        self.closed = False
+        self._emitter = emitter
+        self._world: WorldRecorder | None = None
+        self._open_nodes: set[int] = set()
+        emitter.put(
+            episode,
+            EpisodeStarted(
+                description=clean(opening.description),
+                created_by=clean(_user()),
+                host=clean(platform.node()),
+                software=opening.software,
+                python=platform.python_version(),
+                plan=clean(opening.plan) if opening.plan is not None else None,
+                seed=opening.seed,
+            ),
+            reserved=False,
+        )
+        self._root = emitter.put(episode, NodeStarted("root"))
+
+    def __str__(self) -> str:
+        return episode_text(self.id)
+
+    def __repr__(self) -> str:
+        return f"<Episode {self}{' closed' if self.closed else ''}>"
+
+    # --- world ------------------------------------------------------------------------------------------------
+
+    def enter_world(self, world: BulletWorld) -> None:
+        """This world belongs to the episode from now on. A second one at the same time is refused."""
+        if self._world is not None:
+            raise EpisodeRefused(
+                "this episode has a world already: leave it first, or open an episode of its own for the second world"
+                " in a task of its own"
+            )
+        self._world = WorldRecorder(self._emitter, self.id, world)
+
+    def leave_world(self, world: BulletWorld) -> None:
+        if self._world is not None and self._world.world is world:
+            self._world.stop()
+            self._world = None
+
+    def reference(self, world_object: Object) -> ObjectReference | None:
+        """The row in force of this object in this episode."""
+        return self._world.reference(world_object) if self._world is not None else None
+
+    # --- nodes ------------------------------------------------------------------------------------------------
+
+    def start_node(self, node: TaskTreeNode, declared: DeclaredType, *, implicit: bool) -> None:
+        """Write down that the node starts. Raises `Unrecordable` for a parameter, if so chosen, and `SpoolFull`."""
+        parent = self._parent_of(node)
+        event = NodeStarted(
+            kind=node.kind,
+            parent=parent,
+            designator=declared.fingerprint,
+            parameters=self._parameters(node, declared),
+            robot=self._robot(),
+        )
+        try:
+            sequence = self._emitter.put(self.id, event, reserved=False)
+        except NotEncodable as error:
+            sequence = self._start_incomplete(event, declared, error)
+        self._open_nodes.add(sequence)
+        node.record = NodeRecord(self, sequence, implicit)
+
+    def end_node(self, node: TaskTreeNode) -> None:
+        """Write down how the node ended."""
+        record: NodeRecord = node.record
+        if record.sequence not in self._open_nodes:
+            return
+        self._open_nodes.discard(record.sequence)
+        failure = failure_value(node.failure, self) if node.failure is not None else None
+        result = written_or_missing(node.result, self) if node.result is not None else None
+        status: NodeStatus = node.status.value
+        self._put_end(NodeEnded(record.sequence, status, failure, result))
+
+    def locate(
+        self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
+        node: TaskTreeNode | None,
+    ) -> None:  # fmt: skip
+        """Write down what a location designator offered and which was taken."""
+        self._emitter.put(
+            self.id,
+            LocationResolved(
+                location=clean(location),
+                offered=tuple(
+                    CandidateValue(pose_value(each.pose), tuple(arm.name for arm in each.arms)) for each in offered
+                ),
+                taken=taken,
+                considered=considered,
+                node=self._sequence_of(node),
+            ),
+        )
+
+    def end(self, failure: BaseException | None) -> None:
+        """The last event. Nodes that outlive the episode are out of its sight: LOST."""
+        if self.closed:
+            return
+        self.closed = True
+        if self._world is not None:
+            self.leave_world(self._world.world)
+        for sequence in sorted(self._open_nodes, reverse=True):
+            self._put_end(NodeEnded(sequence, "LOST"))
+        self._open_nodes.clear()
+        status, root_status = _outcome(failure)
+        value = failure_value(failure, self) if failure is not None else None
+        self._put_end(NodeEnded(self._root, root_status, value))
+        try:
+            self._emitter.put(self.id, EpisodeEnded(status, value))
+        except NotEncodable:
+            self._emitter.put(self.id, EpisodeEnded(status, _short(value)))
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _parent_of(self, node: TaskTreeNode) -> int:
+        return self._sequence_of(node.parent) or self._root
+
+    def _sequence_of(self, node: TaskTreeNode | None) -> int | None:
+        """The nearest recorded node of this episode, from this one upwards."""
+        while node is not None:
+            record: NodeRecord | None = node.record
+            if record is not None and record.episode is self:
+                return record.sequence
+            node = node.parent
+        return None
+
+    def _parameters(self, node: TaskTreeNode, declared: DeclaredType) -> dict[str, Any]:
+        parameters: dict[str, Any] = {}
+        for field, path, enum in declared.fields:
+            value: Any = node.designator
+            for name in path:
+                value = getattr(value, name, None)
+            if value is None:
+                continue
+            try:
+                parameters[field.name] = written(field, enum, value, self)
+            except Unwritable as reason:
+                parameters[field.name] = self._missing(declared, field.name, str(reason), value)
+        return parameters
+
+    def _missing(self, declared: DeclaredType, name: str, reason: str, value: object) -> MissingValue:
+        if self._emitter.settings.on_unrecordable == "refuse":
+            raise Unrecordable(declared.declaration.dtype, name, reason)
+        missing = written_or_missing(value, self)
+        return missing if isinstance(missing, MissingValue) else MissingValue(reason, clean(repr(value))[:200])
+
+    def _start_incomplete(self, event: NodeStarted, declared: DeclaredType, error: NotEncodable) -> int:
+        """A start that is too large, or whose world value cannot be written: without that part, if so chosen."""
+        part, _, rest = error.path.partition(".")
+        if part == "robot":
+            self._emitter.note_fault("robot state", error)
+            event = NodeStarted(event.kind, event.parent, event.designator, event.parameters)
+            return self._emitter.put(self.id, event, reserved=False)
+        names = [rest.partition(".")[0]] if rest else list(event.parameters)
+        if self._emitter.settings.on_unrecordable == "refuse":
+            raise Unrecordable(declared.declaration.dtype, " and ".join(names) or "it", error.reason) from None
+        kept = event.parameters | {name: MissingValue(error.reason) for name in names}
+        return self._emitter.put(
+            self.id,
+            NodeStarted(event.kind, event.parent, event.designator, kept, event.robot),
+            reserved=False,
+        )
+
+    def _robot(self) -> RobotValue | None:
+        if self._world is None:
+            return None
+        try:
+            return self._world.robot()
+        except Exception as error:  # noqa: BLE001  the action itself is recorded all the same
+            self._emitter.note_fault("robot state", error)
+            return None
+
+    def _put_end(self, event: NodeEnded) -> None:
+        try:
+            self._emitter.put(self.id, event)
+        except NotEncodable as error:
+            shorter = NodeEnded(event.node, event.status, _short(event.failure), MissingValue(error.reason))
+            self._emitter.put(self.id, shorter)
+
+
+def _outcome(failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+    """How an exception that leaves the episode is written: its status, and that of the root node."""
+    if failure is None:
+        return "SUCCEEDED", "SUCCEEDED"
+    if isinstance(failure, PlanFailure):
+        return "FAILED", "FAILED"
+    if isinstance(failure, asyncio.CancelledError | KeyboardInterrupt):
+        return "INTERRUPTED", "CANCELLED"
+    return "ERROR", "ERROR"
+
+
+def _short(failure: FailureValue | None) -> FailureValue | None:
+    return FailureValue(failure.type, failure.message) if failure is not None else None
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):  # no entry for this uid, as in many containers
+        return "unknown"
+
+
+def current_task() -> asyncio.Task[Any] | None:
+    """The running task; None outside any loop."""
+    try:
+        return asyncio.current_task()
+    except RuntimeError:
+        return None

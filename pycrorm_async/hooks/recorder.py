@@ -1,0 +1,146 @@
+"""The memory as plans and worlds meet it: finds the episode an observation belongs to and hands it on.
+
+Three things may reach a plan, all by the caller's choice or fault: `SpoolFull` (`on_full="fail"`), `Unrecordable` and
+`DeclarationRefused` (before `perform` runs), `EpisodeRefused`. Every fault of ours is counted and stays here.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Awaitable, Callable
+from contextvars import ContextVar
+
+from pycrorm_async.clock import Clock
+from pycrorm_async.errors import CallerError, EpisodeRefused, SpoolFull
+from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.hooks.declaration import Declarations, DeclaredType
+from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.episode import Episode, EpisodeOpening, NodeRecord, current_task
+from pycrorm_async.plan.ports import Candidate
+from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.world.bullet import BulletWorld
+from pycrorm_async.world.watch import current_world
+
+__all__ = ["Recorder", "current_episode"]
+
+current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
+
+
+class Recorder:
+    """Implements the plan layer's `PlanObserver` and the world's `WorldWatcher` for one memory."""
+
+    def __init__(
+        self,
+        emitter: Emitter,
+        *,
+        clock: Clock,
+        software: str,
+        randomness: Callable[[int], bytes] = os.urandom,
+    ) -> None:
+        self._emitter = emitter
+        self._clock = clock
+        self._software = software
+        self._randomness = randomness
+        self._declarations = Declarations()
+        self._owned: set[EpisodeId] = set()
+
+    # --- episodes ---------------------------------------------------------------------------------------------
+
+    def open_episode(self, *, description: str, plan: str | None = None, seed: int | None = None) -> Episode:
+        """Begin an episode in this context; `close_episode` ends it. Refused if this task has one open already."""
+        open_here = self._open_here()
+        if open_here is not None and open_here.task is current_task():
+            raise EpisodeRefused(
+                f"episode {open_here} is open in this task already: end it first, or open the second in a task of its own"
+            )
+        name = episode_id(self._clock.wall_ns(), self._randomness(10))
+        episode = Episode(self._emitter, name, EpisodeOpening(description, self._software, plan, seed))
+        self._owned.add(name)
+        world = current_world.get()
+        if world is not None:
+            episode.enter_world(world)
+        return episode
+
+    def close_episode(self, episode: Episode, failure: BaseException | None) -> None:
+        """Its last event. A fault of ours is counted, not raised."""
+        self._owned.discard(episode.id)
+        try:
+            episode.end(failure)
+        except Exception as error:  # noqa: BLE001  the plan's own outcome matters more
+            self._emitter.note_fault("EpisodeEnded", error)
+
+    def _open_here(self) -> Episode | None:
+        """The open episode of this memory in this context."""
+        episode = current_episode.get()
+        return episode if episode is not None and not episode.closed and episode.id in self._owned else None
+
+    # --- the plan layer's port ----------------------------------------------------------------------------------
+
+    def admit(self) -> Awaitable[None] | None:
+        if not self._emitter.sink.full:
+            return None
+        if self._emitter.settings.on_full == "fail":
+            raise SpoolFull(
+                "the spool is full (spool_bytes_max) and on_full is 'fail': start a writer, or make room in the database"
+            )
+        return self._emitter.sink.room()
+
+    def node_started(self, node: TaskTreeNode) -> None:
+        assert node.designator is not None
+        implicit: Episode | None = None
+        try:
+            declared = self._declarations.of(type(node.designator), self._declare)
+            episode = self._open_here()
+            if episode is None:
+                name = declared.declaration.dtype
+                episode = implicit = self.open_episode(description=name, plan=name)
+            episode.start_node(node, declared, implicit=implicit is not None)
+            if implicit is not None:
+                current_episode.set(implicit)
+        except (CallerError, SpoolFull) as refused:
+            if implicit is not None:
+                self.close_episode(implicit, refused)
+            raise
+        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            self._emitter.note_fault("NodeStarted", error)
+
+    def node_ended(self, node: TaskTreeNode) -> None:
+        record: NodeRecord | None = node.record
+        if record is None:
+            return
+        try:
+            record.episode.end_node(node)
+        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            self._emitter.note_fault("NodeEnded", error)
+        if record.implicit:
+            self.close_episode(record.episode, node.failure)
+            current_episode.set(None)
+
+    def location_resolved(
+        self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
+        node: TaskTreeNode | None,
+    ) -> None:  # fmt: skip
+        episode = self._open_here()
+        if episode is None:
+            return
+        try:
+            episode.locate(location=location, offered=offered, taken=taken, considered=considered, node=node)
+        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            self._emitter.note_fault("LocationResolved", error)
+
+    def _declare(self, declared: DeclaredType) -> None:
+        self._emitter.put_payload(
+            None, type(declared.declaration).__name__, declared.declaration.version, declared.payload
+        )
+
+    # --- the world's port ---------------------------------------------------------------------------------------
+
+    def world_entered(self, world: BulletWorld) -> None:
+        episode = self._open_here()
+        if episode is not None:
+            episode.enter_world(world)
+
+    def world_left(self, world: BulletWorld) -> None:
+        episode = self._open_here()
+        if episode is not None:
+            episode.leave_world(world)

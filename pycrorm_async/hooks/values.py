@@ -1,0 +1,275 @@
+"""The border: live values become frozen ones, copied at the moment they are seen.
+
+A parameter that cannot be written down without changing its meaning raises `Unwritable` with the reason. Results,
+arguments of failures and texts of the world never raise: what cannot be recorded becomes a `MissingValue`.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from enum import Enum
+from typing import Any, Protocol
+
+import numpy as np
+
+from pycrorm_async.events.codec import unwritable
+from pycrorm_async.events.happenings import (
+    FailureValue,
+    FieldDeclared,
+    MissingValue,
+    ObjectReference,
+    ObjectValue,
+    PoseValue,
+)
+from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator, ObjectPart
+from pycrorm_async.world.objects import Object
+from pycrorm_async.world.pose import Pose
+
+__all__ = [
+    "OBJECT_TYPES",
+    "Unwritable",
+    "References",
+    "pose_value",
+    "written",
+    "written_or_missing",
+    "failure_value",
+]
+
+OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
+"""Field types that mean an object; parts and believed objects are object designators too."""
+
+_TEXT_MAX = 2_000
+_REPR_MAX = 200
+_DEPTH_MAX = 8
+
+
+class Unwritable(ValueError):
+    """A value that JSON or its column cannot hold as it is."""
+
+
+class References(Protocol):
+    """What the episode knows of the objects in its world."""
+
+    def reference(self, world_object: Object) -> ObjectReference | None:
+        """The row in force of this object; None if the episode never saw it."""
+        ...
+
+
+def pose_value(pose: Pose) -> PoseValue:
+    """The pose as it is now."""
+    return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
+
+
+def written(field: FieldDeclared, enum: type[Enum] | None, value: Any, references: References) -> Any:
+    """A parameter as JSON, by the type its field was declared with. Raises `Unwritable`."""
+    if field.type == "list":
+        if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
+            raise Unwritable(f"{_a(value)} stands where a list was declared")
+        scalar = _WRITERS[field.item or "text"]
+        return [scalar(each, enum, references) for each in value]
+    if field.type == "dict":
+        if not isinstance(value, Mapping):
+            raise Unwritable(f"{_a(value)} stands where a dict was declared")
+        scalar = _WRITERS[field.item or "text"]
+        return {_key(key): scalar(each, enum, references) for key, each in value.items()}
+    return _WRITERS[field.type](value, enum, references)
+
+
+def written_or_missing(value: Any, references: References) -> Any:
+    """Any value as JSON, as far as it can be; a `MissingValue` where it cannot. Never raises."""
+    try:
+        return _any(value, references, 0)
+    except Unwritable as reason:
+        return MissingValue(str(reason), clean_repr(value))
+    except Exception as error:  # noqa: BLE001  a user's __repr__, __iter__ or property may raise anything
+        return MissingValue(f"reading it raised {type(error).__name__}", clean_repr(value))
+
+
+def failure_value(failure: BaseException, references: References) -> FailureValue:
+    """Class, message and arguments of an exception. Never raises."""
+    try:
+        message = str(failure)
+    except Exception as error:  # noqa: BLE001  a user's __str__ may raise anything
+        message = f"<its message could not be made: {type(error).__name__}>"
+    kind = type(failure)
+    return FailureValue(
+        type=f"{kind.__module__}.{kind.__qualname__}",
+        message=clean(message)[:_TEXT_MAX],
+        arguments=[written_or_missing(each, references) for each in failure.args],
+    )
+
+
+def clean(text: str) -> str:
+    """The text without what the log cannot hold: U+0000 and lone surrogates become escapes."""
+    return text.replace("\x00", "\\x00").encode("utf-8", "backslashreplace").decode()
+
+
+def clean_repr(value: Any) -> str:
+    """A cut repr for people."""
+    try:
+        return clean(repr(value))[:_REPR_MAX]
+    except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything
+        return f"<a {type(value).__name__} whose repr raised {type(error).__name__}>"
+
+
+# --- one writer per declared type ---------------------------------------------------------------------------------
+
+
+def _integer(value: Any, _enum: type[Enum] | None, _references: References) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise Unwritable(f"{_a(value)} stands where an int was declared") from None
+    if not -(2**63) <= number < 2**63:
+        raise Unwritable("the integer does not fit into 64 bits")
+    return int(number)
+
+
+def _real(value: Any, _enum: type[Enum] | None, _references: References) -> float:
+    if type(value) is not float:
+        if isinstance(value, str | bytes) or not hasattr(value, "__float__"):
+            raise Unwritable(f"{_a(value)} stands where a float was declared")
+        try:
+            value = float(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise Unwritable(f"{_a(value)} stands where a float was declared: {error}") from None
+    if not math.isfinite(value):
+        raise Unwritable(f"{value} is not a finite number")
+    return float(value)
+
+
+def _text(value: Any, _enum: type[Enum] | None, _references: References) -> str:
+    if not isinstance(value, str):
+        raise Unwritable(f"{_a(value)} stands where a str was declared")
+    return str(_checked(str(value)))
+
+
+def _boolean(value: Any, _enum: type[Enum] | None, _references: References) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise Unwritable(f"{_a(value)} stands where a bool was declared")
+    return bool(value)
+
+
+def _datetime(value: Any, _enum: type[Enum] | None, _references: References) -> str:
+    if not isinstance(value, datetime):
+        raise Unwritable(f"{_a(value)} stands where a datetime was declared")
+    if value.tzinfo is None:
+        raise Unwritable("the datetime has no time zone")
+    return value.astimezone(UTC).isoformat(timespec="microseconds")
+
+
+def _member(value: Any, enum: type[Enum] | None, _references: References) -> str:
+    if enum is not None and not isinstance(value, enum):
+        raise Unwritable(f"{clean_repr(value)} is no member of {enum.__name__}")
+    name = value.name
+    if not isinstance(name, str):
+        raise Unwritable(f"{clean_repr(value)} has no name in {type(value).__name__}")
+    return name
+
+
+def _pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
+    if not isinstance(value, Pose):
+        raise Unwritable(f"{_a(value)} stands where a Pose was declared")
+    if not math.isfinite(sum(value.position) + sum(value.orientation)):
+        raise Unwritable(f"the pose holds a number that is not finite: {value}")
+    if unwritable(value.frame):
+        raise Unwritable(f"the pose's frame: {unwritable(value.frame)}")
+    return pose_value(value)
+
+
+def _object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
+    if isinstance(value, Object):
+        return references.reference(value) or _outside(value, references)
+    if isinstance(value, ObjectPart):
+        return ObjectValue(
+            "ObjectPart", clean(value.name), _type_name(value), _maybe_pose(value), _whole(value, references)
+        )
+    if isinstance(value, BelieveObject):
+        return ObjectValue("BelieveObject", clean(value.name), _type_name(value), _maybe_pose(value))
+    if isinstance(value, ObjectDesignator):
+        known = references.reference(value.world_object) if value.world_object is not None else None
+        return known or _outside(value, references)
+    raise Unwritable(f"{_a(value)} stands where an object designator was declared")
+
+
+def _outside(value: Any, references: References) -> ObjectValue:
+    return ObjectValue("Object", clean(value.name), _type_name(value), _maybe_pose(value))
+
+
+def _whole(part: ObjectPart, references: References) -> ObjectReference | None:
+    whole = part.part_of
+    world_object = whole if isinstance(whole, Object) else whole.world_object
+    return references.reference(world_object) if world_object is not None else None
+
+
+def _maybe_pose(value: Any) -> PoseValue | None:
+    pose = value.pose
+    return _pose(pose, None, _NOBODY) if pose is not None else None
+
+
+def _type_name(value: Any) -> str | None:
+    kind = value.object_type
+    return kind.name if isinstance(kind, Enum) else clean(str(kind)) if kind is not None else None
+
+
+_WRITERS: dict[str, Callable[[Any, type[Enum] | None, References], Any]] = {
+    "integer": _integer,
+    "real": _real,
+    "text": _text,
+    "boolean": _boolean,
+    "datetime": _datetime,
+    "enum": _member,
+    "pose": _pose,
+    "object": _object,
+}
+
+
+class _Nobody:
+    def reference(self, world_object: Object) -> ObjectReference | None:  # noqa: ARG002  the port's signature
+        return None
+
+
+_NOBODY = _Nobody()
+
+
+def _key(key: Any) -> str:
+    if isinstance(key, Enum):
+        return str(key.name)
+    if not isinstance(key, str):
+        raise Unwritable(f"{_a(key)} stands where a dict's key must be a str")
+    return str(_checked(key))
+
+
+def _checked(value: Any) -> Any:
+    reason = unwritable(value)
+    if reason is not None:
+        raise Unwritable(reason)
+    return value
+
+
+def _any(value: Any, references: References, depth: int) -> Any:
+    if depth > _DEPTH_MAX:
+        raise Unwritable(f"it is nested more than {_DEPTH_MAX} deep")
+    if isinstance(value, Enum):
+        return value.name
+    if value is None or isinstance(value, bool | np.bool_):
+        return None if value is None else bool(value)
+    if isinstance(value, str | int | float):
+        return _checked(value)
+    if isinstance(value, np.generic):
+        return _any(value.item(), references, depth + 1)
+    for kind, writer in ((Pose, _pose), (datetime, _datetime), (OBJECT_TYPES, _object)):
+        if isinstance(value, kind):  # type: ignore[arg-type]  # mypy joins the tuple and the classes
+            return writer(value, None, references)
+    if isinstance(value, Mapping):
+        return {_key(key): _any(each, references, depth + 1) for key, each in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [_any(each, references, depth + 1) for each in value]
+    raise Unwritable(f"{_a(value)} has no form in JSON")
+
+
+def _a(value: Any) -> str:
+    return f"a {type(value).__name__}"

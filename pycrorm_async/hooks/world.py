@@ -1,0 +1,144 @@
+"""Turns the changes of one world into events of one episode, and knows which row of each object is in force.
+
+An object's identity is the sequence of its `ObjectAdded`; its row in force that of its latest `ObjectAdded` or
+`ObjectMoved`. Nothing here raises: the world's setters never fail because of a memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from pycrorm_async.events.happenings import (
+    Happening,
+    JointsMoved,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.values import clean, pose_value
+from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.world.bullet import BulletWorld
+from pycrorm_async.world.objects import Object
+from pycrorm_async.world.pose import Pose
+
+__all__ = ["WorldRecorder"]
+
+
+class WorldRecorder:
+    """The observer of one world for one episode; begins with `ObjectAdded` for all that is there."""
+
+    def __init__(self, emitter: Emitter, episode: EpisodeId, world: BulletWorld) -> None:
+        self.world = world
+        self._emitter = emitter
+        self._episode = episode
+        self._references: dict[Object, ObjectReference] = {}
+        self._robot_pose: tuple[Pose, PoseValue] | None = None
+        for each in world.objects:
+            self.object_added(each)
+        for each in world.objects:
+            for child, link in each.attachments.items():
+                self.object_attached(each, child, link)
+        world.observe(self)
+
+    def stop(self) -> None:
+        """Look no longer; references stay readable."""
+        self.world.unobserve(self)
+
+    def reference(self, world_object: Object) -> ObjectReference | None:
+        """The row in force of this object; None if it is not of this world."""
+        return self._references.get(world_object)
+
+    def robot(self) -> RobotValue | None:
+        """Base pose and torso height of the robot now; None without a robot."""
+        robot = self.world.robot
+        if robot is None:
+            return None
+        pose = robot.pose
+        if self._robot_pose is None or self._robot_pose[0] is not pose:
+            self._robot_pose = (pose, pose_value(pose))
+        description = robot.robot_description
+        torso = description.torso_joint if description is not None else None
+        return RobotValue(
+            self._robot_pose[1],
+            robot.object_type.name,
+            robot.joint_position(torso) if torso is not None else None,
+            self._references.get(robot),
+        )
+
+    # --- the world's observer ---------------------------------------------------------------------------------
+
+    def object_added(self, added: Object) -> None:
+        sequence = self._put(
+            ObjectAdded(
+                clean(added.name),
+                added.object_type.name,
+                pose_value(added.pose),
+                dict(added.joint_positions()),
+            )
+        )
+        if sequence is not None:
+            self._references[added] = ObjectReference(sequence, sequence)
+
+    def object_removed(self, removed: Object) -> None:
+        reference = self._references.pop(removed, None)
+        if reference is not None:
+            self._put(ObjectRemoved(reference, self._node()))
+
+    def object_moved(self, moved: Object) -> None:
+        reference = self._references.get(moved)
+        if reference is None:
+            return
+        sequence = self._put(
+            ObjectMoved(
+                reference.object,
+                clean(moved.name),
+                moved.object_type.name,
+                pose_value(moved.pose),
+                self._node(),
+            )
+        )
+        if sequence is not None:
+            self._references[moved] = ObjectReference(reference.object, sequence)
+
+    def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
+        reference = self._references.get(moved)
+        if reference is not None:
+            self._put(JointsMoved(reference, dict(positions), self._node()))
+
+    def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
+        pair = self._pair(parent, child)
+        if pair is not None:
+            self._put(ObjectAttached(*pair, link, self._node()))
+
+    def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
+        pair = self._pair(parent, child)
+        if pair is not None:
+            self._put(ObjectDetached(*pair, link, self._node()))
+
+    def _pair(self, parent: Object, child: Object) -> tuple[ObjectReference, ObjectReference] | None:
+        first, second = self._references.get(parent), self._references.get(child)
+        return (first, second) if first is not None and second is not None else None
+
+    def _node(self) -> int | None:
+        """The node that caused the change: the innermost recorded one of this context, if it is of this episode."""
+        node = current_node.get()
+        while node is not None and node.record is None:
+            node = node.parent
+        if node is not None and node.record.episode.id == self._episode:
+            sequence: int = node.record.sequence
+            return sequence
+        return None
+
+    def _put(self, event: Happening) -> int | None:
+        try:
+            return self._emitter.put(self._episode, event)
+        except Exception as error:  # noqa: BLE001  a world's setter never fails because of a memory
+            self._emitter.note_fault(type(event).__name__, error)
+            return None

@@ -1,0 +1,64 @@
+"""Names of tables and columns, and the clashes that are refused."""
+
+import pytest
+
+from pycrorm_async.events.fields import column_name, fault_in_fields, fault_in_table, table_name
+from pycrorm_async.events.happenings import FieldDeclared, FieldType
+
+
+@pytest.mark.parametrize(
+    ("dtype", "table"),
+    [
+        ("SayingAction", "saying_action"),
+        ("MoveTCPMotion", "move_tcp_motion"),
+        ("PickUpAction", "pick_up_action"),
+        ("Pour2CupsAction", "pour2_cups_action"),
+    ],
+)
+def test_a_table_is_named_as_people_would(dtype: str, table: str) -> None:
+    assert table_name(dtype) == table
+
+
+def declared(name: str, kind: FieldType = "text") -> FieldDeclared:
+    return FieldDeclared(name, column_name(name, kind), kind, 2)
+
+
+@pytest.mark.parametrize("name", ["id", "dtype", "robot_state", "process_metadata_id", "parameters", "ID"])
+def test_a_reserved_field_name_is_refused_by_name(name: str) -> None:
+    fault = fault_in_fields([declared(name)])
+    assert fault is not None
+    assert repr(name) in fault
+    assert "reserved" in fault
+
+
+def test_two_fields_that_share_a_column_are_refused_with_both_names() -> None:
+    assert fault_in_fields([declared("target", "pose"), declared("target_id", "integer")]) == (
+        "fields 'target' and 'target_id' would share the name 'target_id'"
+    )
+    assert fault_in_fields([declared("a"), declared("A")]) == "fields 'a' and 'A' would share the name 'a'"
+
+
+def test_the_names_pose_and_object_are_kept_for_the_first_of_their_type() -> None:
+    assert fault_in_fields([declared("pose", "pose"), declared("other", "pose")]) is None
+    assert fault_in_fields([declared("other", "pose"), declared("pose", "pose")]) == (
+        "field 'pose': the name 'pose' is kept for the first pose field"
+    )
+    assert fault_in_fields([declared("object", "text")]) == (
+        "field 'object': the name 'object' is kept for the first object field"
+    )
+
+
+def test_more_fields_than_slots_are_refused() -> None:
+    assert fault_in_fields([declared(f"f{n}") for n in range(30)]) is None
+    assert fault_in_fields([declared(f"f{n}") for n in range(31)]) == "it has 31 fields, 30 are the most"
+
+
+@pytest.mark.parametrize("table", ["action", "pose", "event", "pycrorm_log", "sqlite_master", "Object"])
+def test_a_table_of_the_memory_itself_is_refused(table: str) -> None:
+    fault = fault_in_table(table)
+    assert fault is not None
+    assert table in fault
+
+
+def test_an_ordinary_table_is_free() -> None:
+    assert fault_in_table("saying_action") is None

@@ -1,0 +1,75 @@
+"""The bytes of every released event shape are frozen: a log written today is read for ever."""
+
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.events.codec import decode, encode
+from pycrorm_async.events.happenings import (
+    EVENT_TYPES,
+    DesignatorTypeDeclared,
+    EpisodeEnded,
+    FailureValue,
+    FieldDeclared,
+    Happening,
+    MissingValue,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
+)
+
+LINES = (Path(__file__).parent.parent / "golden" / "events_v1.jsonl").read_text().splitlines()
+GOLDEN = [(kind, payload.encode()) for kind, _, payload in (line.partition(" ") for line in LINES)]
+
+
+@pytest.mark.parametrize(("kind", "payload"), GOLDEN)
+def test_a_golden_event_is_read_and_written_back_byte_for_byte(kind: str, payload: bytes) -> None:
+    assert EVENT_TYPES[kind].version == 1
+    assert encode(decode(kind, payload)) == payload
+
+
+def test_every_event_type_has_a_golden_line() -> None:
+    assert {kind for kind, _ in GOLDEN} == set(EVENT_TYPES)
+
+
+def test_the_golden_bytes_mean_what_they_say() -> None:
+    """Values written out by hand, for the shapes that carry the most."""
+    expected: dict[int, Happening] = {
+        2: EpisodeEnded("LOST"),
+        3: EpisodeEnded(
+            "FAILED",
+            FailureValue("plans.Spilled", "milk", ["milk", {"missing": "a Tap has no form in JSON", "repr": "<Tap>"}]),
+        ),
+        4: DesignatorTypeDeclared(
+            "action", "SayingAction", "saying_action", fields=(FieldDeclared("text", "text", "text", 2),)
+        ),
+        6: ObjectAdded(
+            "milk", "MILK", PoseValue((1.3, 1.0, 0.9), (0.0, 0.0, 0.0, 1.0), "map", 1_700_000_000_000_000_001)
+        ),
+        13: NodeStarted("root"),
+        14: NodeStarted(
+            "action",
+            2,
+            "00112233445566778899aabbccddeeff",
+            {"object_designator": {"object": 3, "row": 7}, "arm": "LEFT", "grasp": "FRONT"},
+            RobotValue(
+                PoseValue((0.6, 0.4, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 3),
+                "ROBOT",
+                0.3,
+                ObjectReference(4, 8),
+            ),
+            simulated=True,
+        ),
+        17: NodeEnded(9, "SUCCEEDED", result={"seen": ["milk", 1, True]}),
+    }
+    for line, event in expected.items():
+        kind, payload = GOLDEN[line]
+        assert decode(kind, payload) == event, line
+
+
+def test_a_missing_value_is_written_as_its_reason() -> None:
+    event = NodeEnded(9, "SUCCEEDED", result=MissingValue("why", "<it>"))
+    assert encode(event) == b'{"node":9,"status":"SUCCEEDED","result":{"missing":"why","repr":"<it>"}}'
