@@ -1,0 +1,126 @@
+"""Where a database is: an ordinary URL, read once, that never shows a password again.
+
+    sqlite:///memory.db                 a file, relative to the working directory at that moment
+    sqlite:////data/memory.db           a file by its absolute path
+    sqlite://                           private to this process, in memory, gone when it is closed
+    postgresql://user@host/database     a server
+
+The driver is ours to choose, so it is not part of the URL.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sqlalchemy import URL, make_url
+from sqlalchemy.exc import ArgumentError
+from sqlalchemy.ext.asyncio import AsyncEngine
+
+from pycrorm_async.errors import DatabaseUnavailable, UnknownUrl
+from pycrorm_async.store.private import private_folder, usual_place
+from pycrorm_async.store.sqlite.engine import make_engine
+
+__all__ = ["DatabaseAddress", "BUSY_TIMEOUT_S"]
+
+BUSY_TIMEOUT_S = 5.0
+"""How long a statement waits for another writer before the database counts as away."""
+
+_WHAT_WORKS = (
+    "what works: sqlite:///memory.db (a file here), sqlite:////data/memory.db (a file by its absolute path),"
+    " sqlite:// (private, gone when closed), postgresql://user@host/database"
+)
+
+
+@dataclass(frozen=True, repr=False)
+class DatabaseAddress:
+    """A database's address. Its text is the URL without its password.
+
+    >>> str(DatabaseAddress.parse("postgresql://robot:secret@lab/memory"))
+    'postgresql://robot:***@lab/memory'
+    """
+
+    _url: URL
+    _path: Path | None
+
+    @classmethod
+    def parse(cls, url: str) -> DatabaseAddress:
+        """Reads a URL. Raises `UnknownUrl`, with what works, for a scheme or a form that is not ours."""
+        try:
+            parsed = make_url(url)
+        except (ArgumentError, ValueError):  # neither message repeats the URL, which may hold a password
+            raise UnknownUrl(f"this is not a database URL; {_WHAT_WORKS}") from None
+        match parsed.drivername:
+            case "sqlite":
+                return cls(parsed, _sqlite_path(parsed))
+            case "postgresql":
+                if not parsed.database:
+                    raise UnknownUrl(f"a PostgreSQL URL names its database; {_WHAT_WORKS}")
+                return cls(parsed, None)
+            case other:
+                raise UnknownUrl(f"{other}:// is not a database we know; {_WHAT_WORKS}")
+
+    @property
+    def is_sqlite(self) -> bool:
+        return self._url.drivername == "sqlite"
+
+    @property
+    def is_private(self) -> bool:
+        """Whether this is `sqlite://`."""
+        return self.is_sqlite and self._url.database is None
+
+    @property
+    def path(self) -> Path:
+        """The absolute path of a SQLite file; a private one has it inside `located()`."""
+        assert self._path is not None, f"{self} has no path"
+        return self._path
+
+    @property
+    def default_spool(self) -> Path:
+        """Where the queue's files go if nobody says otherwise: `x.db.spool` beside `x.db`, `database.spool` here."""
+        if self.is_sqlite:
+            return self.path.with_name(f"{self.path.name}.spool")
+        return Path(f"{self._url.database}.spool").absolute()
+
+    @contextmanager
+    def located(self) -> Iterator[DatabaseAddress]:
+        """This address with a path, while the context lasts: a private database's folder is made here and removed.
+
+        >>> with DatabaseAddress.parse("sqlite://").located() as address:
+        ...     address.path.name
+        'memory.db'
+        """
+        if not self.is_private or self._path is not None:
+            yield self
+            return
+        with private_folder(usual_place()) as folder:
+            yield replace(self, _path=folder / "memory.db")
+
+    def engine(self, *, read_only: bool = False, busy_timeout_s: float = BUSY_TIMEOUT_S) -> AsyncEngine:
+        """An engine with the right driver and settings, to be used and disposed of in one loop.
+
+        It never makes a file that is missing. A transaction takes the write lock at its start; of a `read_only` engine
+        it is a snapshot. Raises `DatabaseUnavailable` for what this version cannot open.
+        """
+        if not self.is_sqlite:
+            raise DatabaseUnavailable(f"{self}: PostgreSQL is not supported yet by this version")
+        return make_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)
+
+    def __str__(self) -> str:
+        # Without the query as well: drivers take passwords there.
+        return self._url.set(query={}).render_as_string(hide_password=True)
+
+    def __repr__(self) -> str:
+        return f"DatabaseAddress({str(self)!r})"
+
+
+def _sqlite_path(url: URL) -> Path | None:
+    if url.host or url.username or url.query:
+        raise UnknownUrl(f"a SQLite URL has three slashes, a path and nothing else; {_WHAT_WORKS}")
+    if url.database is None:
+        return None
+    if url.database in ("", ":memory:") or url.database.startswith("file:"):
+        raise UnknownUrl(f"{url.database!r} is not a path; {_WHAT_WORKS}")
+    return Path(url.database).absolute()

@@ -1,0 +1,151 @@
+"""The event log of one database: append to it, read it.
+
+log = await EventLog.open(DatabaseAddress.parse("sqlite:///memory.db"), create=True)
+await log.append(records)
+for episode in await log.episodes(): ...
+await log.close()
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.ext.asyncio import AsyncEngine
+
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
+from pycrorm_async.store.append import append_batch
+from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
+from pycrorm_async.store.sqlite import statements as sql
+from pycrorm_async.store.sqlite.engine import BEGIN
+from pycrorm_async.store.sqlite.faults import ours
+
+__all__ = ["EventLog"]
+
+
+class EventLog:
+    """An open log; it belongs to the loop it was opened in. Every method raises `DatabaseUnavailable` when the database
+    is away, after waiting `busy_timeout_s` for another writer, and may then be called again."""
+
+    def __init__(self, *, address: DatabaseAddress, engine: AsyncEngine, log_id: str) -> None:
+        self.address = address
+        self.engine = engine
+        self.log_id = log_id
+        self._reads = engine.execution_options(**{BEGIN: "BEGIN"})
+        self._file = _identity(address.path)
+
+    @classmethod
+    async def open(
+        cls,
+        address: DatabaseAddress,
+        *,
+        create: bool,
+        busy_timeout_s: float = BUSY_TIMEOUT_S,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> EventLog:
+        """Opens the log at a located address.
+
+        With `create` it can be appended to, and is made or brought up to date if need be. Without, it can only be read
+        and nothing is written. Raises `DatabaseUnavailable` (no such database, no way to it) or `DatabaseForeign`
+        (another program's, a newer version's).
+        """
+        engine = address.engine(read_only=not create, busy_timeout_s=busy_timeout_s)
+        name = str(address)
+        try:
+            with _translated(name):
+                if create:
+                    make_file(address.path, name)
+                    birth = Birth(str(uuid.uuid4()), clock.wall_ns())
+                    log_id = await make_or_migrate(engine, name, birth=birth)
+                else:
+                    must_exist(address.path, name)
+                    async with engine.connect() as connection:
+                        log_id = await recognise(connection, name)
+            return cls(address=address, engine=engine, log_id=log_id)
+        except BaseException:
+            await engine.dispose()
+            raise
+
+    async def close(self) -> None:
+        """Closes every connection."""
+        await self.engine.dispose()
+
+    # --- append -----------------------------------------------------------------------------------------------
+
+    async def append(self, records: Sequence[Record]) -> dict[EpisodeId, str]:
+        """Stores a batch, whole or not at all, durable when it returns. Gives why episodes refused records.
+
+        What is stored already with the same bytes is stored once. Of an episode with a gap, or a record no database can
+        hold, what comes before that is stored; the rest must be kept elsewhere and given again. Raises `LogDamaged`,
+        and stores nothing, when a record's key holds another event.
+        """
+        if not records:
+            return {}
+        with _translated(str(self.address)):
+            async with self.engine.begin() as connection:
+                refusals = await append_batch(connection, records)
+        # SQLite goes on writing into a file that was removed or replaced, where nobody will find it.
+        if _identity(self.address.path) != self._file:
+            raise DatabaseUnavailable(f"{self.address}: the file was removed or replaced while it was open")
+        return refusals
+
+    # --- read -------------------------------------------------------------------------------------------------
+
+    async def episodes(self) -> list[EpisodeRow]:
+        """Every episode, by number."""
+        return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_EPISODES)]
+
+    async def episode_number(self, episode: EpisodeId) -> int | None:
+        """The number of an episode here; None if nothing of it is stored."""
+        rows = await self._rows(sql.SELECT_EPISODES_BY_ID, f'["{episode_text(episode)}"]')
+        return int(rows[0].number) if rows else None
+
+    async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[StoredEvent]:
+        """The events of an episode that follow sequence `after`, at most `limit`."""
+        return [StoredEvent._make(row) for row in await self._rows(sql.SELECT_EVENTS, number, after, limit)]
+
+    async def unfolded(self, limit: int = 10_000) -> list[StoredEvent]:
+        """What the tables do not show yet, by episode and sequence, at most `limit`; nothing of parked episodes."""
+        return [StoredEvent._make(row) for row in await self._rows(sql.SELECT_UNFOLDED, limit)]
+
+    async def behind(self) -> list[EpisodeRow]:
+        """The episodes of which the tables do not show all; without the parked ones."""
+        return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_BEHIND)]
+
+    async def stopped(self) -> list[EpisodeRow]:
+        """The episodes that the log refused something of, or that are parked."""
+        return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_STOPPED)]
+
+    async def declarations(self) -> list[bytes]:
+        """The payloads of all DesignatorTypeDeclared, in the order of their first arrival."""
+        return [bytes(row[0]) for row in await self._rows(sql.SELECT_DECLARATIONS)]
+
+    async def _rows(self, statement: str, *parameters: Any) -> Sequence[Any]:
+        with _translated(str(self.address)):
+            async with self._reads.connect() as connection:
+                return (await connection.exec_driver_sql(statement, parameters)).all()
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+@contextmanager
+def _translated(name: str) -> Iterator[None]:
+    try:
+        yield
+    except DBAPIError as error:
+        raise ours(error, name) from error

@@ -1,0 +1,55 @@
+"""An engine for a SQLite file: durable at COMMIT, one writer at a time, readers that cannot write.
+
+The driver's own BEGIN is switched off (it begins too late, and never for a SELECT or a CREATE) and ours is sent: a
+writing transaction takes the write lock at once, so it waits at the start or not at all; a reading one is a snapshot.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import URL, Connection, event
+from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
+
+__all__ = ["make_engine", "BEGIN"]
+
+BEGIN = "sqlite_begin"
+"""Execution option: the statement that begins a transaction, None for none at all."""
+
+_WRITE_PRAGMAS = (
+    "PRAGMA synchronous = FULL",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
+    "PRAGMA wal_autocheckpoint = 4000",  # 16 MB: about every fourth full batch instead of every one
+)
+
+
+def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncEngine:
+    """An engine for the file at this absolute path, which must exist: connecting never makes one."""
+    url = URL.create(
+        "sqlite+aiosqlite",
+        database=path.as_uri(),
+        query={"mode": "ro" if read_only else "rw", "uri": "true"},
+    )
+    engine = create_async_engine(
+        url,
+        connect_args={"timeout": busy_timeout_s, "isolation_level": None},
+        execution_options={BEGIN: "BEGIN" if read_only else "BEGIN IMMEDIATE"},
+        hide_parameters=True,
+    )
+    event.listen(engine.sync_engine, "begin", _begin)
+    if not read_only:
+        event.listen(engine.sync_engine, "connect", _set_write_pragmas)
+    return engine
+
+
+def _begin(connection: Connection) -> None:
+    statement = connection.get_execution_options()[BEGIN]
+    if statement is not None:
+        connection.exec_driver_sql(statement)
+
+
+def _set_write_pragmas(connection: Any, _record: Any) -> None:
+    cursor = connection.cursor()
+    for pragma in _WRITE_PRAGMAS:
+        cursor.execute(pragma)
+    cursor.close()

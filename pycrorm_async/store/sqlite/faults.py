@@ -1,0 +1,48 @@
+"""Which of our errors a fault of SQLite is: the way to the file, the wrong file, a damaged one, or us."""
+
+from __future__ import annotations
+
+import sqlite3
+
+from sqlalchemy.exc import DBAPIError
+
+from pycrorm_async.errors import (
+    DamageError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    InternalError,
+    PycrormError,
+)
+
+__all__ = ["ours"]
+
+_AWAY = {
+    sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_INTERRUPT,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PROTOCOL,
+    sqlite3.SQLITE_SCHEMA,
+    sqlite3.SQLITE_AUTH,
+}
+
+
+def ours(error: DBAPIError, database: str) -> PycrormError:
+    """The error to raise in its place."""
+    fault = error.orig
+    code = getattr(fault, "sqlite_errorcode", None)
+    if code is None:  # raised by the driver between us and SQLite: a connection that is gone
+        return DatabaseUnavailable(f"{database}: {fault}")
+    primary = code & 0xFF
+    if primary == sqlite3.SQLITE_NOTADB:
+        return DatabaseForeign(f"{database} is not a database: SQLite cannot read it")
+    if primary == sqlite3.SQLITE_CORRUPT:
+        return DamageError(f"{database} is damaged: {fault}")
+    if primary in _AWAY:
+        return DatabaseUnavailable(f"{database}: {fault}")
+    return InternalError(f"{database}: {fault}")

@@ -1,0 +1,88 @@
+"""The log's tables on SQLite, as numbered migrations: format N is what the first N of them make."""
+
+from __future__ import annotations
+
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
+
+__all__ = ["MIGRATIONS", "USE_WAL", "TABLE_NAMES", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
+
+
+def _refuse(name: str, change: str, table: str) -> str:
+    return (
+        f"CREATE TRIGGER {name} BEFORE {change} ON {table} BEGIN"
+        f" SELECT RAISE(ABORT, 'the event log is append-only: {table} refuses {change.split()[0]}'); END"
+    )
+
+
+_LOG = """
+CREATE TABLE pycrorm_log (
+    one INTEGER PRIMARY KEY CHECK (one = 1),
+    id TEXT NOT NULL,
+    format INTEGER NOT NULL,
+    created_wall_ns INTEGER NOT NULL
+) STRICT"""
+
+_DECLARATION = """
+CREATE TABLE pycrorm_declaration (
+    ordinal INTEGER PRIMARY KEY,
+    fingerprint TEXT NOT NULL UNIQUE,
+    payload TEXT NOT NULL
+) STRICT"""
+
+_EPISODE = f"""
+CREATE TABLE episode (
+    number INTEGER PRIMARY KEY CHECK (number BETWEEN 1 AND {EPISODE_NUMBER_MAX}),
+    id TEXT NOT NULL UNIQUE,
+    head INTEGER NOT NULL CHECK (head BETWEEN 0 AND {SEQUENCE_MAX}),
+    folded INTEGER NOT NULL DEFAULT 0 CHECK (folded BETWEEN 0 AND head),
+    started_wall_ns INTEGER NOT NULL,
+    ended_wall_ns INTEGER,
+    refused TEXT,
+    parked TEXT
+) STRICT"""
+
+# What is asked at every poll: a few rows, however many episodes there are.
+_BEHIND = "CREATE INDEX episode_behind ON episode (number) WHERE folded < head AND parked IS NULL"
+_STOPPED = "CREATE INDEX episode_stopped ON episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
+
+# With a rowid: these rows are longer than what a WITHOUT ROWID table is good at; it appended a third slower.
+_EVENT = """
+CREATE TABLE event (
+    episode INTEGER NOT NULL,
+    sequence INTEGER NOT NULL,
+    type TEXT NOT NULL,
+    version INTEGER NOT NULL,
+    wall_ns INTEGER NOT NULL,
+    monotonic_ns INTEGER NOT NULL,
+    payload TEXT NOT NULL,
+    PRIMARY KEY (episode, sequence)
+) STRICT"""
+
+_FIRST = (
+    _LOG,
+    _DECLARATION,
+    _EPISODE,
+    _BEHIND,
+    _STOPPED,
+    _EVENT,
+    _refuse("event_is_not_updated", "UPDATE", "event"),
+    _refuse("event_is_not_deleted", "DELETE", "event"),
+    _refuse("declaration_is_not_updated", "UPDATE", "pycrorm_declaration"),
+    _refuse("declaration_is_not_deleted", "DELETE", "pycrorm_declaration"),
+    _refuse("episode_is_not_renamed", "UPDATE OF number, id", "episode"),
+    _refuse("episode_is_not_deleted", "DELETE", "episode"),
+    _refuse("log_is_not_renamed", "UPDATE OF id", "pycrorm_log"),
+    _refuse("log_is_not_deleted", "DELETE", "pycrorm_log"),
+)
+
+MIGRATIONS: tuple[tuple[str, ...], ...] = (_FIRST,)
+
+USE_WAL = "PRAGMA journal_mode = WAL"
+"""Kept in the file, so it is set once; outside a transaction, and never on a database that is not ours."""
+
+TABLE_NAMES = (
+    "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
+)
+READ_LOG = "SELECT id, format FROM pycrorm_log"
+INSERT_LOG = "INSERT INTO pycrorm_log (one, id, format, created_wall_ns) VALUES (1, ?, ?, ?)"
+SET_FORMAT = "UPDATE pycrorm_log SET format = ?"
