@@ -1,7 +1,8 @@
 """What the plan layer asks of a memory: to be told what happens. Without one a plan runs the same.
 
-`recorder` is the memory of this context. It is told in the caller's task, synchronously, and must be quick; what
-it raises from `node_started` refuses the perform before it runs, everything else it must keep to itself.
+`recorder` is the memory of this context. It is told in the caller's task, synchronously, and must be quick;
+what it raises from `node_started` refuses the perform before it runs, everything else it must keep to
+itself.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ class PlanObserver(Protocol):
     ) -> None:
         """A location designator was asked: what it offered, which was taken, how many places it looked at.
 
-        Called once for each time it is asked, perhaps in another context (a loop over places that is dropped).
+        Called once for each time it is asked, perhaps in another context (a loop over places that is
+        dropped).
         """
         ...
 

@@ -1,8 +1,9 @@
 """A node of the task tree: one `perform`, from its start to its end, with the node it ran inside.
 
-Nodes know their parent and not their children, so a plan of any length keeps only the path it is on in memory.
-The parent of a new node is the current node of the same context: asyncio tasks inherit it, concurrent plans never
-mix. To see a whole tree without a memory, collect it: `with collected_tree() as tree: await plan(); print(tree)`.
+Nodes know their parent and not their children, so a plan of any length keeps only the path it is on in
+memory. The parent of a new node is the current node of the same context: asyncio tasks inherit it,
+concurrent plans never mix. To see a whole tree without a memory, collect it: `with collected_tree() as tree:
+await plan(); print(tree)`.
 """
 
 from __future__ import annotations
@@ -115,6 +116,14 @@ class CollectedTree:
     def children(self, node: TaskTreeNode) -> tuple[TaskTreeNode, ...]:
         """What started inside this node, in order."""
         return tuple(self._children[node])
+
+    def depth(self, node: TaskTreeNode) -> int:
+        """How many nodes of the tree are above this one."""
+        above = 0
+        while node.parent in self._children:
+            node = node.parent
+            above += 1
+        return above
 
     def __len__(self) -> int:
         return len(self._children)

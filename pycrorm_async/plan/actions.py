@@ -1,0 +1,198 @@
+"""The actions that are there from the start: what a robot can be asked to do, and by which motions it does
+it.
+
+Each is recorded with its fields; concepts are those of SOMA. Positions are in metres in the map, angles in
+rad. Descriptions with alternatives for each of them are in `pycrorm_async.plan.descriptions`.
+
+>>> await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.failures import ObjectLost
+from pycrorm_async.plan.grasping import pick_up_poses, place_pose, retracted
+from pycrorm_async.plan.here import robot_here
+from pycrorm_async.plan.motions import (
+    LookingMotion,
+    MoveArmJointsMotion,
+    MoveGripperMotion,
+    MoveJointsMotion,
+    MoveMotion,
+    MoveTCPMotion,
+)
+from pycrorm_async.plan.objects import ObjectDesignator, in_world
+from pycrorm_async.world.enums import Arms, Grasp, GripperState
+from pycrorm_async.world.objects import Object
+from pycrorm_async.world.pose import Pose, yaw_quaternion
+
+__all__ = [
+    "FaceAtPerformable",
+    "LookAtActionPerformable",
+    "MoveAndPickUpPerformable",
+    "MoveTorsoActionPerformable",
+    "NavigateActionPerformable",
+    "ParkArmsActionPerformable",
+    "PickUpActionPerformable",
+    "PlaceActionPerformable",
+    "SetGripperActionPerformable",
+]
+
+
+@dataclass
+class MoveTorsoActionPerformable(ActionAbstract):
+    """Lift or lower the torso to `position` (m). Raises `TorsoGoalUnreachable`."""
+
+    concept: ClassVar[str | None] = "MoveTorso"
+
+    position: float
+
+    async def perform(self) -> None:
+        await MoveJointsMotion([robot_here().description.torso_joint], [self.position]).perform()
+
+
+@dataclass
+class SetGripperActionPerformable(ActionAbstract):
+    """Open or close a gripper."""
+
+    concept: ClassVar[str | None] = "SettingGripper"
+
+    gripper: Arms
+    motion: GripperState
+
+    async def perform(self) -> None:
+        await MoveGripperMotion(self.motion, self.gripper).perform()
+
+
+@dataclass
+class ParkArmsActionPerformable(ActionAbstract):
+    """Fold an arm, or both, out of the way."""
+
+    concept: ClassVar[str | None] = "ParkingArms"
+
+    arm: Arms
+
+    async def perform(self) -> None:
+        arms = robot_here().description.arms
+        left = dict(arms[Arms.LEFT].park) if self.arm is not Arms.RIGHT else None
+        right = dict(arms[Arms.RIGHT].park) if self.arm is not Arms.LEFT else None
+        await MoveArmJointsMotion(left, right).perform()
+
+
+@dataclass
+class NavigateActionPerformable(ActionAbstract):
+    """Drive to a place."""
+
+    concept: ClassVar[str | None] = "Navigating"
+
+    target_location: Pose
+
+    async def perform(self) -> None:
+        await MoveMotion(self.target_location).perform()
+
+
+@dataclass
+class LookAtActionPerformable(ActionAbstract):
+    """Turn the head to a point."""
+
+    concept: ClassVar[str | None] = "LookingAt"
+
+    target: Pose
+
+    async def perform(self) -> None:
+        await LookingMotion(self.target).perform()
+
+
+@dataclass
+class PickUpActionPerformable(ActionAbstract):
+    """Take an object with one arm and lift it by 3 cm; the object is attached to the gripper afterwards.
+
+    The gripper is turned as `grasp` says in the object's own axes. It opens 0.1 m before the object, seen
+    along the direction it points to when the action begins.
+
+    Raises:
+        IKError: one of the three goals of the arm is out of reach.
+        PerceptionObjectNotInWorld: there is no such object.
+    """
+
+    concept: ClassVar[str | None] = "PickingUp"
+
+    object_designator: ObjectDesignator | Object
+    arm: Arms
+    grasp: Grasp
+
+    async def perform(self) -> None:
+        robot = robot_here()
+        wanted = in_world(self.object_designator)
+        tool_frame = robot.description.arms[self.arm].tool_frame
+        before, at, above = pick_up_poses(wanted.pose, self.grasp, robot.body.link_pose(tool_frame))
+        await MoveTCPMotion(before, self.arm, allow_gripper_collision=True).perform()
+        await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
+        await MoveTCPMotion(at, self.arm, allow_gripper_collision=True).perform()
+        await MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
+        if wanted.attached_to is not None:
+            wanted.attached_to.detach(wanted)
+        robot.body.attach(wanted, tool_frame)
+        await MoveTCPMotion(above, self.arm, allow_gripper_collision=True).perform()
+
+
+@dataclass
+class PlaceActionPerformable(ActionAbstract):
+    """Put the held object down: it ends at `target_location`, the gripper 7 cm behind.
+
+    Raises:
+        IKError: the arm does not reach.
+        ObjectLost: the arm does not hold it.
+        PerceptionObjectNotInWorld: there is no such object.
+    """
+
+    concept: ClassVar[str | None] = "Placing"
+
+    object_designator: ObjectDesignator | Object
+    arm: Arms
+    target_location: Pose
+
+    async def perform(self) -> None:
+        body, description = robot_here()
+        held = in_world(self.object_designator)
+        tool_frame = description.arms[self.arm].tool_frame
+        if body.attachments.get(held) != tool_frame:
+            raise ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
+        goal = place_pose(self.target_location, held.pose, body.link_pose(tool_frame))
+        await MoveTCPMotion(goal, self.arm).perform()
+        await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
+        body.detach(held)
+        await MoveTCPMotion(retracted(goal), self.arm).perform()
+
+
+@dataclass
+class FaceAtPerformable(ActionAbstract):
+    """Turn on the spot to face a point, and look at it."""
+
+    pose: Pose
+
+    async def perform(self) -> None:
+        here = robot_here().body.pose
+        dx, dy = self.pose.position.x - here.position.x, self.pose.position.y - here.position.y
+        heading = yaw_quaternion(math.atan2(dy, dx))
+        await NavigateActionPerformable(Pose(here.position, heading, here.frame)).perform()
+        await LookAtActionPerformable(self.pose).perform()
+
+
+@dataclass
+class MoveAndPickUpPerformable(ActionAbstract):
+    """Drive to a place, face the object there, and pick it up."""
+
+    standing_position: Pose
+    object_designator: ObjectDesignator | Object
+    arm: Arms
+    grasp: Grasp
+
+    async def perform(self) -> None:
+        await NavigateActionPerformable(self.standing_position).perform()
+        await FaceAtPerformable(self.object_designator.pose).perform()
+        await PickUpActionPerformable(self.object_designator, self.arm, self.grasp).perform()

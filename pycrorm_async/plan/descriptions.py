@@ -1,0 +1,143 @@
+"""A description of an action holds alternatives for each property; `resolve()` takes the first of each.
+
+Iterating it gives every combination, the last property varying fastest:
+
+>>> [each.motion.name for each in SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])]
+['OPEN', 'CLOSE']
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Generic, TypeAlias, TypeVar
+
+from pycrorm_async.plan.actions import (
+    LookAtActionPerformable,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    ParkArmsActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    SetGripperActionPerformable,
+)
+from pycrorm_async.plan.failures import IllPosedGoalFailure
+from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike
+from pycrorm_async.world.enums import Arms, Grasp, GripperState
+from pycrorm_async.world.pose import Pose
+
+__all__ = [
+    "ActionDescription",
+    "LookAtAction",
+    "MoveTorsoAction",
+    "NavigateAction",
+    "ParkArmsAction",
+    "PickUpAction",
+    "PlaceAction",
+    "SetGripperAction",
+]
+
+P = TypeVar("P")
+
+Objects: TypeAlias = ObjectDesignatorDescription | ObjectLike | Sequence[ObjectLike]
+
+
+class ActionDescription(Generic[P]):
+    """What every description does; alternatives are given by name, in the order of the performable's fields.
+
+    Objects that are described are looked for in the world each time it is asked.
+    """
+
+    def __init__(self, performable: Callable[..., P], **alternatives: Iterable[Any]) -> None:
+        self._performable = performable
+        self._alternatives = {
+            name: each if isinstance(each, ObjectDesignatorDescription) else tuple(each)
+            for name, each in alternatives.items()
+        }
+
+    def resolve(self) -> P:
+        """The performable with the first alternative of each property.
+
+        Raises:
+            IllPosedGoalFailure: a property has no alternative.
+            ObjectNotFound: no object in the world is as described.
+        """
+        return next(iter(self))
+
+    def __iter__(self) -> Iterator[P]:
+        """Every combination, the last property varying fastest. Raises as `resolve` does."""
+        choices = [self._choices(name, among) for name, among in self._alternatives.items()]
+        for combination in itertools.product(*choices):
+            yield self._performable(**dict(zip(self._alternatives, combination, strict=True)))
+
+    def _choices(self, name: str, among: ObjectDesignatorDescription | tuple[Any, ...]) -> tuple[Any, ...]:
+        if isinstance(among, ObjectDesignatorDescription):
+            return tuple(among) or (among.resolve(),)
+        if not among:
+            raise IllPosedGoalFailure(f"{type(self).__name__} has no alternative for {name}", name)
+        return among
+
+
+def _objects(meant: Objects) -> Iterable[ObjectLike]:
+    return meant if isinstance(meant, ObjectDesignatorDescription | Sequence) else (meant,)
+
+
+class MoveTorsoAction(ActionDescription[MoveTorsoActionPerformable]):
+    """Lift or lower the torso to one of these positions (m)."""
+
+    def __init__(self, positions: Iterable[float]) -> None:
+        super().__init__(MoveTorsoActionPerformable, position=positions)
+
+
+class SetGripperAction(ActionDescription[SetGripperActionPerformable]):
+    """Open or close a gripper."""
+
+    def __init__(self, grippers: Iterable[Arms], motions: Iterable[GripperState]) -> None:
+        super().__init__(SetGripperActionPerformable, gripper=grippers, motion=motions)
+
+
+class ParkArmsAction(ActionDescription[ParkArmsActionPerformable]):
+    """Fold one of these arms, or both, out of the way."""
+
+    def __init__(self, arms: Iterable[Arms]) -> None:
+        super().__init__(ParkArmsActionPerformable, arm=arms)
+
+
+class NavigateAction(ActionDescription[NavigateActionPerformable]):
+    """Drive to one of these places."""
+
+    def __init__(self, target_locations: Iterable[Pose]) -> None:
+        super().__init__(NavigateActionPerformable, target_location=target_locations)
+
+
+class LookAtAction(ActionDescription[LookAtActionPerformable]):
+    """Turn the head to one of these points."""
+
+    def __init__(self, targets: Iterable[Pose]) -> None:
+        super().__init__(LookAtActionPerformable, target=targets)
+
+
+class PickUpAction(ActionDescription[PickUpActionPerformable]):
+    """Take an object: one, some, or whatever is as described."""
+
+    def __init__(self, object_designator_description: Objects, arms: Iterable[Arms], grasps: Iterable[Grasp]) -> None:
+        super().__init__(
+            PickUpActionPerformable,
+            object_designator=_objects(object_designator_description),
+            arm=arms,
+            grasp=grasps,
+        )
+
+
+class PlaceAction(ActionDescription[PlaceActionPerformable]):
+    """Put the held object down at one of these poses."""
+
+    def __init__(
+        self, object_designator_description: Objects, target_locations: Iterable[Pose], arms: Iterable[Arms]
+    ) -> None:
+        super().__init__(
+            PlaceActionPerformable,
+            object_designator=_objects(object_designator_description),
+            arm=arms,
+            target_location=target_locations,
+        )

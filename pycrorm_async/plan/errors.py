@@ -1,0 +1,50 @@
+"""What a plan's author did wrong; what goes wrong in a plan is in `pycrorm_async.plan.failures`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pycrorm_async.errors import CallerError
+
+__all__ = ["PerformNotAsync", "ResolutionError", "NoRobotChosen", "NoWorldHere"]
+
+
+class PerformNotAsync(CallerError, TypeError):
+    """A designator class declares another `perform` than `async def perform(self)`."""
+
+    def __init__(self, designator: str) -> None:
+        super().__init__(f"{designator}.perform must be declared as `async def perform(self)`")
+        self.designator = designator
+
+
+class ResolutionError(CallerError):
+    """A designator was built from values that cannot be its properties.
+
+    Attributes:
+        designator: the class' name.
+        missing: properties that are None and may not be.
+        wrong: properties of another type than declared, each as "name: expected …, got …".
+    """
+
+    def __init__(self, designator: str, *, missing: Sequence[str] = (), wrong: Sequence[str] = ()) -> None:
+        parts = []
+        if missing:
+            parts.append(f"missing: {', '.join(missing)}")
+        if wrong:
+            parts.append(f"wrong: {'; '.join(wrong)}")
+        super().__init__(f"{designator} cannot be built; {'. '.join(parts)}")
+        self.designator = designator
+        self.missing = tuple(missing)
+        self.wrong = tuple(wrong)
+
+
+class NoRobotChosen(CallerError):
+    """A motion was performed and nothing says which robot moves."""
+
+    def __init__(self, motion: str) -> None:
+        super().__init__(f"{motion} moves a robot: perform it inside `with simulated_robot:`")
+        self.motion = motion
+
+
+class NoWorldHere(CallerError):
+    """The call needs a world, or a robot in it, and this context has none."""

@@ -1,0 +1,41 @@
+"""Which world a plan acts in, and which robot: those of its context. Without one the caller is told what to do."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from pycrorm_async.plan.errors import NoWorldHere
+from pycrorm_async.world.robot import RobotDescription
+from pycrorm_async.world.watch import current_world
+
+if TYPE_CHECKING:
+    from pycrorm_async.world.bullet import BulletWorld
+    from pycrorm_async.world.objects import Object
+
+__all__ = ["RobotHere", "world_here", "robot_here"]
+
+
+class RobotHere(NamedTuple):
+    """The robot of this context: the object in the world, and what is known of its kind."""
+
+    body: Object
+    description: RobotDescription
+
+
+def world_here() -> BulletWorld:
+    """The world of the innermost `with BulletWorld()` of this context. Raises `NoWorldHere`."""
+    world = current_world.get()
+    if world is None:
+        raise NoWorldHere("no world to act in: run the plan inside `with BulletWorld() as world:`")
+    return world
+
+
+def robot_here() -> RobotHere:
+    """The robot in that world. Raises `NoWorldHere`."""
+    body = world_here().robot
+    if body is None:
+        raise NoWorldHere('no robot in the world: add one, e.g. Object("pr2", ObjectType.ROBOT)')
+    description = body.robot_description
+    if description is None:
+        raise NoWorldHere(f"the robot {body.name!r} is not of a kind that is known here")
+    return RobotHere(body, description)

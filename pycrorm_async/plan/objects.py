@@ -1,0 +1,169 @@
+"""How a plan names objects: a description finds them in the world, a designator stands for one of them.
+
+Wherever a designator is wanted, the world's own `Object` will do as well. Four classes tell apart what is
+meant: `Object` and `ObjectDesignator` one of the world, `ObjectPart` a link of one, `BelieveObject` one that
+nobody has seen.
+
+>>> ObjectDesignatorDescription(names=["milk"]).resolve().pose
+Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from pycrorm_async.plan.errors import ResolutionError
+from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWorld
+from pycrorm_async.plan.here import world_here
+from pycrorm_async.world.enums import ObjectType
+from pycrorm_async.world.objects import Object
+from pycrorm_async.world.pose import Pose
+
+__all__ = [
+    "ObjectDesignator",
+    "ObjectPart",
+    "BelieveObject",
+    "ObjectDesignatorDescription",
+    "ObjectLike",
+    "designator_of",
+    "in_world",
+]
+
+
+@dataclass(frozen=True)
+class ObjectDesignator:
+    """An object of the world, as a plan means it.
+
+    Attributes:
+        world_object: the object itself; None in a copy of how it was.
+        frozen_pose: where it was, in such a copy.
+    """
+
+    name: str
+    object_type: ObjectType
+    world_object: Object | None = field(default=None, repr=False)
+    frozen_pose: Pose | None = None
+
+    def __post_init__(self) -> None:
+        if self.world_object is None and self.frozen_pose is None:
+            raise ResolutionError(type(self).__name__, missing=["world_object or frozen_pose"])
+
+    @property
+    def pose(self) -> Pose:
+        """Where it is now; in a frozen copy, where it was."""
+        if self.frozen_pose is not None:
+            return self.frozen_pose
+        assert self.world_object is not None
+        return self.world_object.pose
+
+    def frozen_copy(self) -> ObjectDesignator:
+        """The object as it is now, whatever becomes of it."""
+        return ObjectDesignator(self.name, self.object_type, None, self.pose)
+
+
+class BelieveObject(ObjectDesignator):
+    """An object that is believed to be somewhere and is not in the world."""
+
+    def __init__(self, name: str, object_type: ObjectType, pose: Pose) -> None:
+        super().__init__(name, object_type, None, pose)
+
+    def frozen_copy(self) -> BelieveObject:
+        return self
+
+
+@dataclass(frozen=True, init=False)
+class ObjectPart(ObjectDesignator):
+    """A link of an object, for example a handle; its pose is the link's.
+
+    Attributes:
+        name: the link's name.
+        part_of: the whole.
+    """
+
+    part_of: ObjectDesignator = field(kw_only=True)
+
+    def __init__(
+        self,
+        name: str,
+        part_of: ObjectLike,
+        object_type: ObjectType = ObjectType.GENERIC_OBJECT,
+        frozen_pose: Pose | None = None,
+    ) -> None:
+        put = object.__setattr__
+        put(self, "name", name)
+        put(self, "object_type", object_type)
+        put(self, "world_object", None)
+        put(self, "frozen_pose", frozen_pose)
+        put(self, "part_of", designator_of(part_of))
+
+    @property
+    def pose(self) -> Pose:
+        """Where the link is now; in a frozen copy, where it was. Raises `UnknownLink`."""
+        if self.frozen_pose is not None:
+            return self.frozen_pose
+        return in_world(self.part_of).link_pose(self.name)
+
+    def frozen_copy(self) -> ObjectPart:
+        return ObjectPart(self.name, self.part_of.frozen_copy(), self.object_type, self.pose)
+
+
+class ObjectDesignatorDescription:
+    """Describes objects by name or type; iterating it gives a designator for each that is in the world now.
+
+    Args:
+        names: any of these names; the order is one of preference.
+        types: any of these types.
+
+    With names the order is theirs, without that of the world.
+    """
+
+    def __init__(self, names: Iterable[str] | None = None, types: Iterable[ObjectType] | None = None) -> None:
+        self.names = tuple(names) if names is not None else None
+        self.types = tuple(types) if types is not None else None
+
+    def __iter__(self) -> Iterator[ObjectDesignator]:
+        there = [each for each in world_here().objects if self.types is None or each.object_type in self.types]
+        if self.names is not None:
+            by_name = {each.name: each for each in there}
+            there = [by_name[name] for name in dict.fromkeys(self.names) if name in by_name]
+        for each in there:
+            yield designator_of(each)
+
+    def resolve(self) -> ObjectDesignator:
+        """The first that fits. Raises `ObjectNotFound`."""
+        for designator in self:
+            return designator
+        there = ", ".join(each.name for each in world_here().objects) or "nothing"
+        raise ObjectNotFound(f"no object is {self}; in the world: {there}", self.names, self._type_names())
+
+    def __str__(self) -> str:
+        parts = []
+        if self.names is not None:
+            parts.append(f"named {' or '.join(self.names)}")
+        if self.types is not None:
+            parts.append(f"of type {' or '.join(self._type_names() or ())}")
+        return " and ".join(parts) or "there"
+
+    def _type_names(self) -> tuple[str, ...] | None:
+        return tuple(each.name for each in self.types) if self.types is not None else None
+
+
+ObjectLike: TypeAlias = Object | ObjectDesignator
+"""What stands for an object."""
+
+
+def designator_of(meant: ObjectLike) -> ObjectDesignator:
+    """The designator of a world object; a designator is its own."""
+    if isinstance(meant, ObjectDesignator):
+        return meant
+    return ObjectDesignator(meant.name, meant.object_type, meant)
+
+
+def in_world(meant: ObjectLike) -> Object:
+    """The world object that is meant. Raises `PerceptionObjectNotInWorld` if there is none, or it was removed."""
+    found = meant.world_object if isinstance(meant, ObjectDesignator) else meant
+    if found is None or all(each is not found for each in found.world.objects):
+        raise PerceptionObjectNotInWorld(f"{meant.name} is not an object of the world", meant.name)
+    return found

@@ -1,0 +1,96 @@
+"""What happens around a `perform`: a node starts before it, ends after it, and whoever records is told both.
+
+The order is always the same: give the loop a turn if one is due, wait for room if the recorder asks for it,
+tell it that the node starts (it may refuse; then nothing has happened), perform, set status, failure, result
+and end, make the parent current again, tell the recorder that it met at the start. This runs for every node
+of every plan: it costs a few µs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from collections.abc import Callable, Coroutine
+from contextvars import ContextVar, Token
+from typing import TYPE_CHECKING, Any
+
+from pycrorm_async.clock import monotonic_ns
+from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.plan.ports import recorder
+from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collecting, current_node
+
+if TYPE_CHECKING:
+    from pycrorm_async.plan.designator import Designator
+
+__all__ = ["as_node", "is_node"]
+
+TURN_NS_MAX = 20_000_000
+"""A plan that never suspends would hear neither Ctrl-C nor a cancellation: this often it lets the loop turn."""
+
+_last_turn_ns: ContextVar[int] = ContextVar("_last_turn_ns", default=0)
+_MARK = "__makes_node__"
+
+
+def is_node(perform: Any) -> bool:
+    """Whether this `perform` makes a node already."""
+    return hasattr(perform, _MARK)
+
+
+def as_node(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable[[Any], Coroutine[Any, Any, Any]]:
+    """The same `perform`, each call a node; `super().perform()` inside belongs to the node of the outer call."""
+
+    @functools.wraps(perform)
+    async def performed(self: Designator) -> Any:
+        parent = current_node.get()
+        if parent is not None and parent.designator is self and type(self).perform is not performed:
+            return await perform(self)
+        now_ns = monotonic_ns()
+        if now_ns - _last_turn_ns.get() > TURN_NS_MAX:
+            await asyncio.sleep(0)
+            now_ns = monotonic_ns()
+            _last_turn_ns.set(now_ns)
+        observer = recorder.get()
+        if observer is not None and (admission := observer.admit()) is not None:
+            await admission
+            now_ns = monotonic_ns()
+
+        node = TaskTreeNode(self, self.kind, parent, now_ns)
+        if observer is not None:
+            observer.node_started(node)
+        for tree in collecting.get():
+            tree.add(node)
+        token = current_node.set(node)
+        try:
+            node.result = result = await perform(self)
+            node.status = TaskStatus.SUCCEEDED
+        except PlanFailure as failure:
+            node.status, node.failure = TaskStatus.FAILED, failure
+            raise
+        except asyncio.CancelledError as cancelled:
+            node.status, node.failure = TaskStatus.CANCELLED, cancelled
+            raise
+        except BaseException as error:
+            node.status, node.failure = TaskStatus.ERROR, error
+            raise
+        finally:
+            node.ended_ns = monotonic_ns()
+            _leave(token)
+            if observer is not None:
+                observer.node_ended(node)
+            # The traceback of a failure holds this frame, and the node holds the failure: no cycle for the
+            # collector.
+            del node, parent, token
+        return result
+
+    setattr(performed, _MARK, True)
+    return performed
+
+
+def _leave(token: Token[TaskTreeNode | None]) -> None:
+    """Make the parent current again."""
+    try:
+        current_node.reset(token)
+    except ValueError:
+        # A suspended plan that nobody awaits any more is closed by whoever drops it, in another context,
+        # whose current node is not ours to change.
+        return

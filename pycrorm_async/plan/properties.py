@@ -1,0 +1,79 @@
+"""Are the fields of a designator of the types it declares? Checked when a motion is built, and said by name.
+
+A field may hold what its annotation names: classes, unions, None where it is in the union; of a list or dict
+also the items. Whole numbers are fine where a float is declared; an annotation that cannot be read (a class
+that is local to a function) is not checked.
+"""
+
+from __future__ import annotations
+
+import functools
+import numbers
+import types
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Any
+
+from pycrorm_async.plan.errors import ResolutionError
+
+__all__ = ["check_properties"]
+
+Check = Callable[[Any], bool]
+
+
+def check_properties(designator: object) -> None:
+    """Raise `ResolutionError` naming what is missing and what is wrong."""
+    missing: list[str] = []
+    wrong: list[str] = []
+    kind: Any = type(designator)  # mypy takes a bare type for unhashable
+    for name, expected, optional, fits in _checks(kind):
+        value = getattr(designator, name)
+        if value is None:
+            if not optional:
+                missing.append(name)
+        elif not fits(value):
+            wrong.append(f"{name}: expected {expected}, got {_short(value)}")
+    if missing or wrong:
+        raise ResolutionError(kind.__name__, missing=missing, wrong=wrong)
+
+
+@functools.lru_cache(maxsize=1024)
+def _checks(designator: type) -> tuple[tuple[str, str, bool, Check], ...]:
+    """For each field its name, its type in words, whether None will do, and the check."""
+    try:
+        hints = typing.get_type_hints(designator)
+    except NameError:
+        return ()
+    checks = []
+    for field in fields(designator):
+        hint = hints[field.name]
+        optional = hint is Any or type(None) in (hint, *typing.get_args(hint))
+        checks.append((field.name, _in_words(hint), optional, _check(hint)))
+    return tuple(checks)
+
+
+def _check(hint: Any) -> Check:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        checks = [_check(argument) for argument in arguments]
+        return lambda value: any(check(value) for check in checks)
+    if origin in (list, tuple, set, frozenset) and arguments:
+        item = _check(arguments[0])
+        return lambda value: isinstance(value, origin) and all(map(item, value))
+    if isinstance(origin, type) and issubclass(origin, Mapping) and arguments:
+        key, item = map(_check, arguments)
+        return lambda value: isinstance(value, origin) and all(map(key, value)) and all(map(item, value.values()))
+    if hint is float:
+        return lambda value: isinstance(value, numbers.Real) and not isinstance(value, bool)
+    kind = origin or hint
+    return (lambda value: isinstance(value, kind)) if isinstance(kind, type) else (lambda _: True)
+
+
+def _in_words(hint: Any) -> str:
+    return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return f"{type(value).__name__} {text if len(text) <= 60 else text[:57] + '...'}"

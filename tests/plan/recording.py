@@ -1,0 +1,75 @@
+"""A small recorder: it keeps what it is told and refuses, loudly, what may not happen."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Iterator
+from contextlib import contextmanager
+
+from pycrorm_async.plan.ports import Candidate, recorder
+from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, current_node
+
+
+class OrderBroken(AssertionError):
+    """The plan layer told something in an order that cannot be."""
+
+
+class Recording:
+    """Implements `PlanObserver`. `told` holds "start X", "end X STATUS" and "place X" in order."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+        self.places: list[tuple[str, tuple[Candidate, ...], int | None, int, TaskTreeNode | None]] = []
+        self.open: list[TaskTreeNode] = []
+        self.ended: list[TaskTreeNode] = []
+
+    async def heard(self, count: int) -> None:
+        """Until it was told so much."""
+        async with asyncio.timeout(10):
+            while len(self.told) < count:  # noqa: ASYNC110  whoever tells does not know of this test
+                await asyncio.sleep(0)
+
+    def admit(self) -> Awaitable[None] | None:
+        return None
+
+    def node_started(self, node: TaskTreeNode) -> None:
+        if node.status is not TaskStatus.RUNNING or node.ended_ns is not None or node.record is not None:
+            raise OrderBroken(f"{node} starts, and is not new")
+        if current_node.get() is not node.parent:
+            raise OrderBroken(f"{node} starts outside its parent")
+        if node.parent is not None and node.parent.record is self and node.parent not in self.open:
+            raise OrderBroken(f"{node} starts inside {node.parent}, which is over")
+        node.record = self
+        self.open.append(node)
+        self.told.append(f"start {type(node.designator).__name__}")
+
+    def node_ended(self, node: TaskTreeNode) -> None:
+        if node not in self.open:
+            raise OrderBroken(f"{node} ends, and is not open")
+        if node.status is TaskStatus.RUNNING or node.ended_ns is None or node.ended_ns < node.started_ns:
+            raise OrderBroken(f"{node} ends without an end")
+        if any(each.parent is node for each in self.open):
+            raise OrderBroken(f"{node} ends before its children")
+        self.open.remove(node)
+        self.ended.append(node)
+        self.told.append(f"end {type(node.designator).__name__} {node.status.name}")
+
+    def location_resolved(
+        self,
+        *,
+        location: str,
+        offered: tuple[Candidate, ...],
+        taken: int | None,
+        considered: int,
+        node: TaskTreeNode | None,
+    ) -> None:
+        self.places.append((location, offered, taken, considered, node))
+        self.told.append(f"place {location}")
+
+    @contextmanager
+    def listening(self) -> Iterator[Recording]:
+        token = recorder.set(self)
+        try:
+            yield self
+        finally:
+            recorder.reset(token)

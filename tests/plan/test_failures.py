@@ -1,0 +1,125 @@
+"""Plan failures: the tree of them, what they carry, that they survive a pickle."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from pycrorm_async.errors import PycrormError
+from pycrorm_async.plan import failures
+from pycrorm_async.plan.failures import IKError, PlanFailure
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Pose
+
+TREE = """
+PlanFailure
+  NotALanguageExpression
+  FailureDiagnosis
+    LowLevelFailure
+      ActionlibActionTimeout
+      ManipulationLowLevelFailure
+        EnvironmentManipulationGoalNotReached
+        ManipulationGoalNotReached
+        ManipulationPoseUnreachable
+      GripperLowLevelFailure
+        GripperClosedCompletely
+        GripperGoalNotReached
+      NavigationLowLevelFailure
+        NavigationGoalNotReached
+        NavigationPoseUnreachable
+      PerceptionLowLevelFailure
+        PerceptionObjectNotFound
+        PerceptionObjectNotInWorld
+      TorsoLowLevelFailure
+        TorsoGoalNotReached
+        TorsoGoalUnreachable
+    HighLevelFailure
+      DeliveringFailed
+      EnvironmentManipulationImpossible
+      EnvironmentUnreachable
+      FetchingFailed
+      LookingHighLevelFailure
+      ManipulationGoalInCollision
+      NavigationHighLevelFailure
+        NavigationGoalInCollision
+      ObjectNowhereToBeFound
+      ObjectUndeliverable
+      ObjectUnfetchable
+      ObjectUnreachable
+      SearchingFailed
+  IKError
+  Task
+    Grasping
+    Looking
+  ObjectPoseMisestimation
+  SuccessfulCompletion
+  ObjectNotFound
+  LocomotorFailure
+  ArmFailure
+  ObjectLost
+  SensorFailure
+  IllPosedGoalFailure
+  CapabilityAbsenceFailure
+  ReachabilityFailure
+  TorsoFailure
+  ConfigurationNotReached
+  Timeout
+  EndEffectorFailure
+  ObjectUnavailable
+  SustainedFailure
+  ReasoningError
+  CollisionError
+"""
+
+
+def parents() -> dict[str, str]:
+    """Class name → name of its base, read off the indentation above."""
+    above: list[str] = ["Exception"]
+    found = {}
+    for line in TREE.strip().splitlines():
+        depth = (len(line) - len(line.lstrip())) // 2
+        del above[depth + 1 :]
+        found[line.strip()] = above[-1]
+        above.append(line.strip())
+    return found
+
+
+def test_the_tree_is_the_one_that_plans_know() -> None:
+    found = {
+        name: kind.__bases__[0].__name__
+        for name, kind in vars(failures).items()
+        if isinstance(kind, type) and issubclass(kind, PlanFailure)
+    }
+    assert found == parents()
+    assert sorted(failures.__all__) == sorted(found)
+
+
+@pytest.mark.parametrize("name", sorted(set(parents()) - {"IKError"}))
+def test_every_failure_takes_a_message_and_data(name: str) -> None:
+    kind: type[PlanFailure] = getattr(failures, name)
+    failure = kind("the drawer is stuck", "drawer", 0.3)
+    assert (str(failure), failure.message, failure.data) == (
+        "the drawer is stuck",
+        "the drawer is stuck",
+        ("drawer", 0.3),
+    )
+    assert failure.args == ("the drawer is stuck", "drawer", 0.3)
+    again = pickle.loads(pickle.dumps(failure))
+    assert (type(again), again.args, str(again)) == (kind, failure.args, str(failure))
+    assert (str(kind()), kind().data) == ("", ())
+    assert kind.__doc__
+
+
+def test_an_ik_error_says_who_should_have_got_where() -> None:
+    failure = IKError(Pose([1, 2, 3]), Arms.LEFT, "l_gripper_tool_frame", "too far")
+    assert str(failure) == "l_gripper_tool_frame cannot reach (1.000, 2.000, 3.000) with the LEFT arm: too far"
+    assert (failure.pose, failure.arm, failure.tip_frame) == (Pose([1, 2, 3]), Arms.LEFT, "l_gripper_tool_frame")
+    assert failure.args == (Pose([1, 2, 3]), Arms.LEFT, "l_gripper_tool_frame", "too far")
+    again = pickle.loads(pickle.dumps(failure))
+    assert (again.args, str(again)) == (failure.args, str(failure))
+
+
+def test_a_plan_failure_is_an_outcome_and_no_fault_of_the_package() -> None:
+    assert not issubclass(PlanFailure, PycrormError)
+    assert issubclass(PlanFailure, Exception)
