@@ -1,0 +1,1 @@
+"""The command `pycrorm`: one file a verb. Answers on stdout, everything else on stderr."""

@@ -1,7 +1,8 @@
 """Which designator types an episode's log refers to: a fold gets this as an argument and needs no user code.
 
 Declarations are named by fingerprint. One dtype may have several (a field was added, two processes differ): its columns
-unite, first declared first; a column declared with two types is a contradiction, which parks the episode that brought it.
+unite, first declared first; a column declared with two types is a contradiction, which parks the episode that
+brought it.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ RESERVED_TABLES = frozenset(
     " quaternion object object_part believe_object parameter_item attachment joint_change location_resolution"
     " location_candidate detection pick_up_with_context_view".split()
 )
-"""Tables and views of the memory itself; every name that begins with `pycrorm_`, `sqlite_` or `pg_` is taken as well."""
+"""Tables and views of the memory itself; names that begin with `pycrorm_`, `sqlite_` or `pg_` are taken as well."""
 
 _NAME_LENGTH_MAX = 60
 _WORD_START = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")

@@ -10,9 +10,9 @@
 | LocationResolved | open; the node it names, if any, started | |
 | EpisodeEnded | open | the episode is closed: nothing follows |
 
-A structural break (a gap, an end without a start, an unknown parent) is *damage*; an order that is unusual but happens in
-honest plans (a child that ends after its cancelled parent, a child started by an ended node, nodes open at the end) is a
-*remark*. The hooks never enforce this: they write down what happened.
+A structural break (a gap, an end without a start, an unknown parent) is *damage*; an order that is unusual but happens
+in honest plans (a child that ends after its cancelled parent, a child started by an ended node, nodes open at the end)
+is a *remark*. The hooks never enforce this: they write down what happened.
 """
 
 from __future__ import annotations

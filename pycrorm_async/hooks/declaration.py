@@ -141,7 +141,7 @@ def _flat(
         hints = typing.get_type_hints(owner, include_extras=False)
     except (NameError, TypeError, AttributeError) as error:
         raise DeclarationRefused(_path(designator), f"its field types cannot be read: {error}") from None
-    for field in dataclasses.fields(owner):
+    for field in dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ():
         if not field.init or field.name.startswith("_"):
             continue
         path = (*prefix, field.name)
@@ -150,9 +150,9 @@ def _flat(
         if shape is None:
             raise DeclarationRefused(
                 _path(designator),
-                f"field {name!r} has the type {_text(hints[field.name])}, which has no column: use int, float, str, bool,"
-                " an Enum, an aware datetime, a Pose, an object designator, a dataclass of these,"
-                " or a list or dict of these",
+                f"field {name!r} has the type {_text(hints[field.name])}, which has no column: use int, float, str,"
+                " bool, an Enum, an aware datetime, a Pose, an object designator, a dataclass of these, or a list or"
+                " dict of these",
             )
         if shape.nested is not None:
             if len(path) > 8:
@@ -221,11 +221,7 @@ def _container(origin: type, arguments: tuple[Any, ...]) -> _Shape | None:
         if key is None or key.type not in ("text", "enum") or key.optional:
             return None
         kind, value = "dict", arguments[1]
-    elif (
-        (issubclass(origin, tuple) and len(arguments) == 2 and arguments[1] is Ellipsis)
-        or (issubclass(origin, tuple) and arguments and len(set(arguments)) == 1)
-        or (issubclass(origin, Sequence) and not issubclass(origin, tuple) and len(arguments) == 1)
-    ):
+    elif issubclass(origin, Sequence) and len({each for each in arguments if each is not Ellipsis}) == 1:
         kind, value = "list", arguments[0]
     else:
         return None

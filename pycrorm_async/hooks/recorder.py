@@ -51,7 +51,7 @@ class Recorder:
         open_here = self._open_here()
         if open_here is not None and open_here.task is current_task():
             raise EpisodeRefused(
-                f"episode {open_here} is open in this task already: end it first, or open the second in a task of its own"
+                f"episode {open_here} is open in this task already: end it first, or open the second in its own task"
             )
         name = episode_id(self._clock.wall_ns(), self._randomness(10))
         episode = Episode(self._emitter, name, EpisodeOpening(description, self._software, plan, seed))
@@ -80,9 +80,7 @@ class Recorder:
         if not self._emitter.sink.full:
             return None
         if self._emitter.settings.on_full == "fail":
-            raise SpoolFull(
-                "the spool is full (spool_bytes_max) and on_full is 'fail': start a writer, or make room in the database"
-            )
+            raise SpoolFull("the spool is full (spool_bytes_max) and on_full is 'fail': start a writer or make room")
         return self._emitter.sink.room()
 
     def node_started(self, node: TaskTreeNode) -> None:

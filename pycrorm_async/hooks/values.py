@@ -182,7 +182,7 @@ def _pose(value: Any, _enum: type[Enum] | None, _references: References) -> Pose
 
 def _object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
     if isinstance(value, Object):
-        return references.reference(value) or _outside(value, references)
+        return references.reference(value) or _outside(value)
     if isinstance(value, ObjectPart):
         return ObjectValue(
             "ObjectPart", clean(value.name), _type_name(value), _maybe_pose(value), _whole(value, references)
@@ -191,11 +191,11 @@ def _object(value: Any, _enum: type[Enum] | None, references: References) -> Obj
         return ObjectValue("BelieveObject", clean(value.name), _type_name(value), _maybe_pose(value))
     if isinstance(value, ObjectDesignator):
         known = references.reference(value.world_object) if value.world_object is not None else None
-        return known or _outside(value, references)
+        return known or _outside(value)
     raise Unwritable(f"{_a(value)} stands where an object designator was declared")
 
 
-def _outside(value: Any, references: References) -> ObjectValue:
+def _outside(value: Any) -> ObjectValue:
     return ObjectValue("Object", clean(value.name), _type_name(value), _maybe_pose(value))
 
 

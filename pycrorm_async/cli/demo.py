@@ -1,0 +1,189 @@
+"""`pycrorm demo`: the demonstration of the thesis (5.1): a plan in a kitchen, remembered and asked about.
+
+The robot parks its arms, raises its torso, finds a place to stand, picks up the cereal, finds a place on the kitchen
+island and puts the cereal there. Then five questions are asked of the memory in plain Python.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import select
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, print_table, stdout
+from pycrorm_async.cli.tree import print_tree, tree_rows
+from pycrorm_async.memory import Memory
+from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, ProcessMetaData
+from pycrorm_async.orm import Pose as PoseRow
+from pycrorm_async.plan import (
+    ActionAbstract,
+    CostmapLocation,
+    MoveTorsoAction,
+    ObjectDesignatorDescription,
+    ParkArmsAction,
+    ParkArmsActionPerformable,
+    SemanticCostmapLocation,
+    simulated_robot,
+)
+from pycrorm_async.plan import (
+    NavigateAction as Navigate,
+)
+from pycrorm_async.plan import (
+    PickUpAction as PickUp,
+)
+from pycrorm_async.plan import (
+    PlaceAction as Place,
+)
+from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
+from pycrorm_async.world import Object as WorldObject
+
+__all__ = ["demo", "kitchen_world", "breakfast"]
+
+
+def kitchen_world() -> None:
+    """The scene of the thesis: kitchen, robot, milk and cereal, in the world of this context."""
+    WorldObject("kitchen", ObjectType.ENVIRONMENT)
+    WorldObject("pr2", ObjectType.ROBOT)
+    WorldObject("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))
+    WorldObject("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
+
+
+async def breakfast() -> None:
+    """Brings the cereal from the counter to the kitchen island."""
+    cereal = ObjectDesignatorDescription(names=["cereal"])
+    kitchen = ObjectDesignatorDescription(names=["kitchen"]).resolve()
+    robot = ObjectDesignatorDescription(names=["pr2"]).resolve()
+    with simulated_robot:
+        await ParkArmsActionPerformable(Arms.BOTH).perform()
+        await MoveTorsoAction([0.3]).resolve().perform()
+
+        stand = CostmapLocation(target=cereal.resolve(), reachable_for=robot).resolve()
+        arm = stand.reachable_arms[0]
+        await Navigate([stand.pose]).resolve().perform()
+        await PickUp(cereal, [arm], [Grasp.FRONT]).resolve().perform()
+        await ParkArmsAction([Arms.BOTH]).resolve().perform()
+
+        place = SemanticCostmapLocation("kitchen_island_surface", kitchen, cereal.resolve()).resolve()
+        stand = CostmapLocation(place.pose, reachable_for=robot, reachable_arm=arm).resolve()
+        await Navigate([stand.pose]).resolve().perform()
+        await Place(cereal, [place.pose], [arm]).resolve().perform()
+        await ParkArmsActionPerformable(Arms.BOTH).perform()
+
+
+def demo(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> None:
+    """The thesis' plan, remembered and asked about."""
+    answers = asyncio.run(_remembered(url, spool))
+    if as_json:
+        print_json(answers.document())
+        return
+    answers.print()
+    where = "" if url == DEFAULT_URL else f" --url {url}"
+    note(f"The database is {url}. Look further with: pycrorm episodes{where} | pycrorm show {answers.episode}{where}")
+
+
+@dataclass
+class Answers:
+    """What the demo asked, and what it was told."""
+
+    episode: int
+    tree: list[dict[str, Any]]
+    questions: list[tuple[str, Sequence[str], list[tuple[Any, ...]]]]
+
+    def print(self) -> None:
+        stdout.print("[bold]The task tree, as it was remembered[/]")
+        print_tree(self.tree)
+        for title, columns, rows in self.questions:
+            stdout.print()
+            print_table(title, columns, rows)
+
+    def document(self) -> dict[str, Any]:
+        return {
+            "episode": self.episode,
+            "tree": self.tree,
+            "answers": {
+                title: [dict(zip(columns, row, strict=True)) for row in rows] for title, columns, rows in self.questions
+            },
+        }
+
+
+async def _remembered(url: str, spool: Path | None) -> Answers:
+    async with Memory.open(url, spool=spool) as memory:
+        async with memory.episode(description="Tutorial for getting familiar with the memory", plan="demo") as episode:
+            with BulletWorld():
+                kitchen_world()
+                await breakfast()
+
+        # A new action is a dataclass and nothing else.
+        @dataclass
+        class SayingActionPerformable(ActionAbstract):
+            text: str
+
+            async def perform(self) -> None:
+                """Says it (to the log alone: a robot would use its voice)."""
+
+        await SayingActionPerformable("Patchie, Patchie; Where is my Patchie?").perform()
+
+        await memory.flush()
+        number = await memory.number_of(episode)
+        tree = await tree_rows(memory.reading, number)
+        return Answers(number, tree, await _asked(memory, number, memory.mapped(SayingActionPerformable)))
+
+
+async def _asked(memory: Memory, number: int, saying: type[Action]) -> list[tuple[str, Sequence[str], list[Any]]]:
+    """The thesis' five questions, about this episode."""
+    mine = number
+    async with memory.session() as session:
+        metadata = (await session.scalars(select(ProcessMetaData).where(ProcessMetaData.id == mine))).all()
+        navigations = (
+            await session.scalars(select(NavigateAction).where(NavigateAction.process_metadata_id == mine))
+        ).all()
+        actions = (await session.scalars(select(Action).where(Action.process_metadata_id == mine))).all()
+        picked = (
+            await session.scalars(
+                select(PoseRow)
+                .join(PickUpAction.object)
+                .join(Object.pose)
+                .where(PickUpAction.process_metadata_id == mine)
+            )
+        ).all()
+        sayings = (await session.scalars(select(saying).order_by(saying.id.desc()).limit(1))).all()
+    return [
+        (
+            "What was done, by whom, with which version?  select(ProcessMetaData)",
+            ("id", "created_at", "created_by", "description", "version", "status"),
+            [(m.id, m.created_at, m.created_by, m.description, m.version, m.status) for m in metadata],
+        ),
+        (
+            "Where did the robot navigate, and from where?  select(NavigateAction)",
+            ("id", "to x", "to y", "from x", "from y", "torso"),
+            [
+                (n.id, n.pose.position.x, n.pose.position.y, s.pose.position.x, s.pose.position.y, s.torso_height)
+                for n, s in ((n, n.robot_state) for n in navigations)
+                if s is not None
+            ],
+        ),
+        (
+            "Which actions were there, of whatever kind?  select(Action)",
+            ("id", "dtype", "robot x", "robot y", "torso"),
+            [
+                (a.id, a.dtype, s.pose.position.x, s.pose.position.y, s.torso_height)
+                for a, s in ((a, a.robot_state) for a in actions)
+                if s is not None
+            ],
+        ),
+        (
+            "Where were the objects that were picked up?  select(Pose).join(PickUpAction.object).join(Object.pose)",
+            ("id", "x", "y", "z", "frame"),
+            [(p.id, p.position.x, p.position.y, p.position.z, p.frame) for p in picked],
+        ),
+        (
+            "What did the robot say?  select(memory.mapped(SayingActionPerformable))",
+            ("id", "dtype", "text"),
+            [(s.id, s.dtype, s.text) for s in sayings],
+        ),
+    ]

@@ -1,0 +1,81 @@
+"""Loads the plan of `PLAN.py[:function]`, or says in one line why it cannot."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+import traceback
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pycrorm_async.errors import CallerError
+
+__all__ = ["PlanNotLoadable", "LoadedPlan", "load_plan"]
+
+
+class PlanNotLoadable(CallerError):
+    """The plan file or its function cannot be used."""
+
+
+class LoadedPlan(NamedTuple):
+    """An async function to run; it takes the memory, or nothing."""
+
+    name: str
+    function: Callable[..., Awaitable[Any]]
+    takes_memory: bool
+
+    @property
+    def description(self) -> str:
+        """The first line of the function's docstring, or the plan's name."""
+        documentation = inspect.getdoc(self.function)
+        return documentation.splitlines()[0] if documentation else self.name
+
+
+def load_plan(reference: str) -> LoadedPlan:
+    """The plan of `path.py` or `path.py:function`; without a function, `plan`. Raises `PlanNotLoadable`."""
+    path_text, _, function_name = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
+    function_name = function_name or "plan"
+    path = Path(path_text)
+    if not path.is_file():
+        raise PlanNotLoadable(f"no plan file {path_text!r}")
+    module = _imported(path)
+    function = getattr(module, function_name, None)
+    if function is None:
+        offered = [name for name, each in vars(module).items() if inspect.iscoroutinefunction(each)]
+        hint = f"; it has {', '.join(offered)}" if offered else "; it has no async function"
+        raise PlanNotLoadable(f"{path} has no function {function_name!r}{hint}")
+    if not inspect.iscoroutinefunction(function):
+        raise PlanNotLoadable(f"{path}:{function_name} is not an async function: write `async def {function_name}()`")
+    required = [
+        each
+        for each in inspect.signature(function).parameters.values()
+        if each.default is each.empty and each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+    ]
+    if len(required) > 1:
+        names = ", ".join(each.name for each in required)
+        raise PlanNotLoadable(f"{path}:{function_name} takes {names}: a plan takes the memory, or nothing")
+    return LoadedPlan(f"{path.name}:{function_name}", function, bool(required))
+
+
+def _imported(path: Path) -> Any:
+    name = path.stem
+    specification = importlib.util.spec_from_file_location(name, path.resolve())
+    if specification is None or specification.loader is None:
+        raise PlanNotLoadable(f"{path} is no Python file")
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module
+    sys.path.insert(0, str(path.resolve().parent))
+    try:
+        specification.loader.exec_module(module)
+    except SystemExit as error:
+        raise PlanNotLoadable(f"{path} leaves the program when it is imported (exit {error.code})") from error
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        line = getattr(error, "lineno", None) or next(
+            (frame.lineno for frame in reversed(frames) if frame.filename == str(path.resolve())), None
+        )
+        where = f"{path}:{line}" if line else str(path)
+        raise PlanNotLoadable(f"{where} does not import: {type(error).__name__}: {error}") from error
+    return module

@@ -1,0 +1,68 @@
+"""How a verb speaks: tables and trees on stdout, or one JSON document; problems as one line on stderr."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import msgspec
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+__all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "duration"]
+
+stdout = Console(highlight=False, soft_wrap=True)
+stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def problem(line: str) -> None:
+    """One line that says what is wrong and what to do."""
+    stderr.print(f"[bold red]pycrorm:[/] {escape(' '.join(line.split()))}")
+
+
+def note(line: str) -> None:
+    """One line worth knowing, beside the answer."""
+    stderr.print(f"[dim]{escape(line)}[/]")
+
+
+def print_json(document: Any) -> None:
+    """The one document of a `--json` call."""
+    encoded = msgspec.json.encode(document, enc_hook=str)
+    sys.stdout.write(msgspec.json.format(encoded, indent=2).decode() + "\n")
+
+
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """A table; numbers to the right."""
+    rows = [tuple(row) for row in rows]
+    table = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
+    for index, name in enumerate(columns):
+        numeric = bool(rows) and all(isinstance(row[index], int | float) for row in rows)
+        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(_cell(value) for value in row))
+    stdout.print(table)
+
+
+def duration(nanoseconds: int | None) -> str:
+    """As people read it: 12 µs, 3.4 ms, 1.20 s.
+
+    >>> duration(1_204_000_000), duration(3_400_000), duration(12_000), duration(None)
+    ('1.20 s', '3.4 ms', '12 µs', '')
+    """
+    if nanoseconds is None:
+        return ""
+    if nanoseconds >= 10**9:
+        return f"{nanoseconds / 1e9:.2f} s"
+    if nanoseconds >= 10**6:
+        return f"{nanoseconds / 1e6:.1f} ms"
+    return f"{nanoseconds / 1e3:.0f} µs"
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    return escape(str(value))

@@ -1,0 +1,88 @@
+"""`pycrorm run PLAN.py[:function]`: any plan, remembered."""
+
+from __future__ import annotations
+
+import asyncio
+import traceback
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.loading import LoadedPlan, load_plan
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
+from pycrorm_async.errors import EpisodeParked, PycrormError
+from pycrorm_async.memory import Memory
+from pycrorm_async.query.questions import EpisodeSummary
+
+__all__ = ["run"]
+
+
+def run(
+    plan: Annotated[
+        str, typer.Argument(metavar="PLAN.py[:function]", help="An async function; without a name, `plan`.")
+    ],
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    description: Annotated[
+        str | None, typer.Option(help="Why; default: the function's docstring, or its name.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Recorded with the episode; the plan itself must use it.")] = None,
+    show_traceback: Annotated[bool, typer.Option("--traceback", help="Of a plan that raises, on stderr.")] = False,
+    as_json: JsonOption = False,
+) -> int:
+    """Run a plan and remember it.
+
+    The function takes nothing, and is one episode; or it takes the memory, and opens its own.
+    Exit code 1 if the plan failed: everything up to there is remembered.
+    """
+    loaded = load_plan(plan)
+    failure, episodes = asyncio.run(_remembered(loaded, url, spool, description or loaded.description, seed))
+    if as_json:
+        print_json({"plan": loaded.name, "failure": _one_line(failure), "episodes": episodes})
+    else:
+        print_table(
+            loaded.name,
+            ("episode", "description", "status", "nodes"),
+            [(each.number, each.description, each.status, each.nodes) for each in episodes],
+        )
+    if failure is None:
+        return 0
+    if show_traceback:
+        stderr.print("".join(traceback.format_exception(failure)), markup=False)
+    problem(f"the plan {loaded.name} failed: {_one_line(failure)}")
+    return 1
+
+
+async def _remembered(
+    loaded: LoadedPlan, url: str, spool: Path | None, description: str, seed: int | None
+) -> tuple[Exception | None, list[EpisodeSummary]]:
+    failure: Exception | None = None
+    async with Memory.open(url, spool=spool) as memory:
+        try:
+            if loaded.takes_memory:
+                await loaded.function(memory)
+            else:
+                async with memory.episode(description=description, plan=loaded.name, seed=seed):
+                    await loaded.function()
+        except PycrormError:
+            raise
+        except Exception as error:
+            failure = error
+        try:
+            await memory.flush()
+        except EpisodeParked as parked:
+            note(str(parked))
+        opened = memory.opened_episodes
+        return failure, [each for each in await memory.reading.episodes() if each.id in opened]
+
+
+def _one_line(failure: Exception | None) -> str | None:
+    if failure is None:
+        return None
+    frames = traceback.extract_tb(failure.__traceback__)
+    own = [frame for frame in frames if "pycrorm_async" not in Path(frame.filename).parts]
+    where = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+    message = " ".join(str(failure).split())
+    return f"{type(failure).__name__}: {message}{where}" if message else f"{type(failure).__name__}{where}"

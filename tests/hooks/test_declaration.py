@@ -1,0 +1,186 @@
+"""A designator class becomes a declaration by its fields; what cannot be a column is refused by name."""
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal, NewType
+
+import numpy as np
+import pytest
+
+from pycrorm_async.errors import DeclarationRefused
+from pycrorm_async.events.happenings import FieldDeclared
+from pycrorm_async.hooks.declaration import Declarations, DeclaredType, declared_type
+from pycrorm_async.plan.actions import PickUpActionPerformable
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Pose
+
+
+class Colour(enum.Enum):
+    RED = 1
+
+
+@dataclass
+class Inner:
+    depth: float
+    side: Colour | None = None
+
+
+Weight = NewType("Weight", float)
+
+
+@dataclass
+class EverythingActionPerformable(ActionAbstract):
+    """One field of every kind."""
+
+    count: int
+    weight: Weight
+    text: str
+    flag: bool
+    when: datetime
+    colour: Colour
+    where: Pose
+    what: ObjectDesignator
+    names: list[str]
+    scores: dict[str, float]
+    inner: Inner
+    mode: Literal["fast", "slow"]
+    number: int | float
+    maybe: Arms | None = None
+    poses: Sequence[Pose] = ()
+    triple: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    _private: int = 0
+    made: int = field(init=False, default=3)
+
+    async def perform(self) -> None:
+        """Nothing."""
+
+
+def test_every_kind_of_field_has_its_column() -> None:
+    declaration = declared_type(EverythingActionPerformable).declaration
+    module = __name__
+    assert declaration.fields == (
+        FieldDeclared("count", "count", "integer", 2),
+        FieldDeclared("weight", "weight", "real", 3),
+        FieldDeclared("text", "text", "text", 4),
+        FieldDeclared("flag", "flag", "boolean", 5),
+        FieldDeclared("when", "when", "datetime", 6),
+        FieldDeclared("colour", "colour", "enum", 7, enum=f"{module}.Colour"),
+        FieldDeclared("where", "where_id", "pose", 8),
+        FieldDeclared("what", "what_id", "object", 9),
+        FieldDeclared("names", "names", "list", 10, item="text"),
+        FieldDeclared("scores", "scores", "dict", 11, item="real"),
+        FieldDeclared("inner_depth", "inner_depth", "real", 12),
+        FieldDeclared("inner_side", "inner_side", "enum", 13, optional=True, enum=f"{module}.Colour"),
+        FieldDeclared("mode", "mode", "text", 14),
+        FieldDeclared("number", "number", "real", 15),
+        FieldDeclared("maybe", "maybe", "enum", 16, optional=True, enum="pycrorm_async.world.enums.Arms"),
+        FieldDeclared("poses", "poses", "list", 17, item="pose"),
+        FieldDeclared("triple", "triple", "list", 18, item="real"),
+    )
+    assert (declaration.kind, declaration.dtype, declaration.table) == (
+        "action",
+        "EverythingAction",
+        "everything_action",
+    )
+
+
+def test_a_subclass_of_an_action_names_its_ancestors() -> None:
+    @dataclass
+    class GentlePickUpActionPerformable(PickUpActionPerformable):
+        force: float = 1.0
+
+    declaration = declared_type(GentlePickUpActionPerformable).declaration
+    assert declaration.bases == ("PickUpAction",)
+    assert [each.name for each in declaration.fields] == ["object_designator", "arm", "grasp", "force"]
+
+
+@pytest.mark.parametrize(
+    "kind", [set[str], list, dict, dict[int, str], Any, bytes, list[list[int]], int | str, np.ndarray]
+)
+def test_a_field_without_a_column_is_refused_by_name_and_type(kind: Any) -> None:
+    namespace = {"__annotations__": {"odd": kind}, "perform": EverythingActionPerformable.perform.__wrapped__}  # type: ignore[attr-defined]
+    made = dataclass(type("OddActionPerformable", (ActionAbstract,), namespace))
+    with pytest.raises(DeclarationRefused, match="field 'odd' has the type"):
+        declared_type(made)
+
+
+def test_a_reserved_name_is_refused() -> None:
+    @dataclass
+    class ReservedActionPerformable(ActionAbstract):
+        robot_state: str
+
+        async def perform(self) -> None:
+            """Nothing."""
+
+    with pytest.raises(DeclarationRefused, match=r"ReservedActionPerformable cannot be declared: field 'robot_state'"):
+        declared_type(ReservedActionPerformable)
+
+
+def test_a_class_with_fields_that_is_no_dataclass_is_refused() -> None:
+    class BareActionPerformable(ActionAbstract):
+        text: str
+
+        async def perform(self) -> None:
+            """Nothing."""
+
+    with pytest.raises(DeclarationRefused, match="add @dataclass"):
+        declared_type(BareActionPerformable)
+
+
+def test_a_dtype_that_would_take_a_table_of_ours_is_refused() -> None:
+    class Odd(ActionAbstract):
+        dtype = "Pose"
+
+        async def perform(self) -> None:
+            """Nothing."""
+
+    with pytest.raises(DeclarationRefused, match="'pose', which the memory itself uses"):
+        declared_type(Odd)
+
+
+def saying(place: int) -> type[ActionAbstract]:
+    if place == 0:
+
+        @dataclass
+        class SayingActionPerformable(ActionAbstract):
+            text: str
+
+            async def perform(self) -> None:
+                """Nothing."""
+
+        return SayingActionPerformable
+
+    @dataclass
+    class SayingAction(ActionAbstract):
+        text: str
+
+        async def perform(self) -> None:
+            """Nothing."""
+
+    return SayingAction
+
+
+def test_two_live_classes_of_one_dtype_are_refused_with_both_paths() -> None:
+    first, second = saying(0), saying(1)
+    declarations = Declarations()
+    seen: list[DeclaredType] = []
+    declarations.of(first, seen.append)
+    with pytest.raises(DeclarationRefused) as refused:
+        declarations.of(second, seen.append)
+    assert "saying.<locals>.SayingActionPerformable" in str(refused.value)
+    assert "saying.<locals>.SayingAction " in str(refused.value)
+    assert len(seen) == 1
+
+
+def test_a_class_defined_again_at_the_same_place_takes_over() -> None:
+    first, again = saying(0), saying(0)
+    declarations = Declarations()
+    seen: list[DeclaredType] = []
+    one = declarations.of(first, seen.append)
+    assert declarations.of(first, seen.append) is one
+    declarations.of(again, seen.append)
+    assert [each.fingerprint for each in seen] == [one.fingerprint, one.fingerprint]

@@ -1,0 +1,159 @@
+"""Live values become frozen ones, exactly, or are refused with the reason."""
+
+import enum
+import math
+from datetime import UTC, datetime, timedelta, timezone
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pycrorm_async.events.happenings import (
+    FieldDeclared,
+    FieldType,
+    MissingValue,
+    ObjectReference,
+    ObjectValue,
+    PoseValue,
+)
+from pycrorm_async.hooks.values import Unwritable, failure_value, written, written_or_missing
+from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator
+from pycrorm_async.world.enums import Arms, ObjectType
+from pycrorm_async.world.pose import Pose
+
+
+class Nobody:
+    def reference(self, world_object: object) -> ObjectReference | None:
+        return None
+
+
+NOBODY = Nobody()
+POSE = Pose([1, 2, 3], [0, 0, 0, 2], "map", 7)
+
+
+class Broken:
+    def __repr__(self) -> str:
+        raise RuntimeError("no repr")
+
+    def __str__(self) -> str:
+        raise RuntimeError("no str")
+
+
+def write(kind: FieldType, value: Any, enum_class: type[enum.Enum] | None = None, item: Any = None) -> Any:
+    return written(FieldDeclared("f", "f", kind, 2, item=item), enum_class, value, NOBODY)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "expected"),
+    [
+        ("integer", np.int64(3), 3),
+        ("integer", True, 1),
+        ("real", np.float32(0.5), 0.5),
+        ("real", 2, 2.0),
+        ("text", "µ", "µ"),
+        ("boolean", np.bool_(True), True),
+        (
+            "datetime",
+            datetime(2024, 7, 1, 13, 35, 44, 64330, timezone(timedelta(hours=2))),
+            "2024-07-01T11:35:44.064330+00:00",
+        ),
+        ("pose", POSE, PoseValue((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), "map", 7)),
+    ],
+)
+def test_a_value_is_written_by_its_declared_type(kind: FieldType, value: Any, expected: Any) -> None:
+    result = write(kind, value)
+    assert result == expected
+    assert type(result) is type(expected)
+
+
+def test_an_enum_member_is_written_by_name() -> None:
+    assert write("enum", Arms.LEFT, Arms) == "LEFT"
+
+
+def test_lists_and_dicts_are_written_item_by_item() -> None:
+    assert write("list", np.array([0.5, 1.5]), item="real") == [0.5, 1.5]
+    assert write("dict", {"a": np.float64(1)}, item="real") == {"a": 1.0}
+    assert write("dict", {Arms.LEFT: "x"}, item="text") == {"LEFT": "x"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "reason"),
+    [
+        ("real", math.nan, "nan is not a finite number"),
+        ("real", "1.0", "a str stands where a float was declared"),
+        ("real", None, "a NoneType stands where a float was declared"),
+        ("integer", 1.5, "a float stands where an int was declared"),
+        ("integer", 2**63, "the integer does not fit into 64 bits"),
+        ("text", b"x", "a bytes stands where a str was declared"),
+        ("text", "a\x00", "the text holds U+0000"),
+        ("boolean", 1, "a int stands where a bool was declared"),
+        ("datetime", datetime(2024, 1, 1), "the datetime has no time zone"),  # noqa: DTZ001
+        ("pose", (1, 2, 3), "a tuple stands where a Pose was declared"),
+        ("pose", Pose([math.inf, 0, 0]), "the pose holds a number that is not finite"),
+        ("object", "milk", "a str stands where an object designator was declared"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_with_the_reason(kind: FieldType, value: Any, reason: str) -> None:
+    with pytest.raises(Unwritable) as refused:
+        write(kind, value)
+    assert reason in str(refused.value)
+
+
+def test_a_member_of_another_enum_is_refused() -> None:
+    with pytest.raises(Unwritable, match="is no member of Arms"):
+        write("enum", ObjectType.MILK, Arms)
+
+
+def test_an_object_outside_the_recorded_world_brings_its_own_value() -> None:
+    pose = PoseValue((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), "map", 7)
+    assert write("object", BelieveObject("cup", ObjectType.JEROEN_CUP, POSE)) == ObjectValue(
+        "BelieveObject", "cup", "JEROEN_CUP", pose
+    )
+    assert write("object", ObjectDesignator("milk", ObjectType.MILK, None, POSE)) == ObjectValue(
+        "Object", "milk", "MILK", pose
+    )
+
+
+def test_a_result_is_written_as_far_as_it_can_be() -> None:
+    moment = datetime(2024, 7, 1, tzinfo=UTC)
+    result = {"arm": Arms.LEFT, "n": [np.int8(1), 2.5, None], "when": moment}
+    assert written_or_missing(result, NOBODY) == {
+        "arm": "LEFT",
+        "n": [1, 2.5, None],
+        "when": "2024-07-01T00:00:00.000000+00:00",
+    }
+
+
+def test_a_result_without_a_form_is_missing_with_reason_and_repr() -> None:
+    assert written_or_missing({1, 2}, NOBODY) == MissingValue("a set has no form in JSON", "{1, 2}")
+    assert written_or_missing(math.nan, NOBODY) == MissingValue("nan is not a finite number", "nan")
+    assert written_or_missing(Broken(), NOBODY) == MissingValue(
+        "a Broken has no form in JSON", "<a Broken whose repr raised RuntimeError>"
+    )
+
+
+def test_a_circle_is_missing_and_no_recursion_error() -> None:
+    circle: list[Any] = []
+    circle.append(circle)
+    missing = written_or_missing(circle, NOBODY)
+    assert isinstance(missing, MissingValue)
+    assert missing.missing == "it is nested more than 8 deep"
+
+
+def test_a_failure_keeps_class_message_and_arguments() -> None:
+    failure = failure_value(ValueError("spilled \ud800", 3, {1}), NOBODY)
+    assert failure.type == "builtins.ValueError"
+    assert failure.message == "('spilled \\ud800', 3, {1})"
+    assert failure.arguments == [
+        MissingValue("the text holds a lone surrogate", "'spilled \\ud800'"),
+        3,
+        MissingValue("a set has no form in JSON", "{1}"),
+    ]
+
+
+def test_a_failure_whose_message_cannot_be_made_is_kept_all_the_same() -> None:
+    class Mute(Exception):
+        def __str__(self) -> str:
+            raise RuntimeError
+
+    assert failure_value(Mute(), NOBODY).message == "<its message could not be made: RuntimeError>"
