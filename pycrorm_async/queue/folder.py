@@ -1,0 +1,74 @@
+"""One recorder's folder: how it comes to be, what is in it, how it goes.
+
+It gets its name when its `alive` is locked already, so nobody can take it for dead while it is being made. It loses
+`alive` last, so a deletion that was cut short is recovered like any other dead folder.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.segment import segment_numbers, segment_path, sync_folder
+
+__all__ = ["ALIVE", "DRAIN", "STORED", "MAKING", "TAIL", "available", "make_folder", "remove_folder", "write_safely"]
+
+ALIVE: Final = "alive"
+DRAIN: Final = "drain"
+STORED: Final = "stored"
+MAKING: Final = ".making"
+TAIL: Final = ".tail"
+
+
+@contextmanager
+def available(path: Path) -> Iterator[None]:
+    """What the operating system refuses inside becomes a `SpoolUnavailable` that names its own path."""
+    try:
+        yield
+    except OSError as error:
+        where = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else path
+        raise SpoolUnavailable(where, error.strerror or str(error)) from error
+
+
+def make_folder(spool: Path, name: str) -> tuple[Path, FileLock]:
+    """A new folder below the spool, which is made if need be, and its `alive`. Raises `SpoolUnavailable`."""
+    unfinished, folder = spool / f"{name}{MAKING}", spool / name
+    with available(spool):
+        spool.mkdir(parents=True, exist_ok=True)
+        unfinished.mkdir()
+        alive = FileLock.take(unfinished / ALIVE)
+        if alive is None:
+            raise SpoolUnavailable(unfinished, "was taken away while it was being made")
+        unfinished.rename(folder)
+        sync_folder(spool)
+        sync_folder(spool.parent)
+    return folder, alive
+
+
+def remove_folder(folder: Path) -> None:
+    """Deletes what is ours in it, and the folder unless somebody else left something there. Raises `OSError`."""
+    for number in segment_numbers(folder):
+        segment_path(folder, number).unlink()
+    for path in list(folder.iterdir()):
+        if path.suffix in {MAKING, TAIL}:
+            path.unlink()
+    for name in (STORED, DRAIN, ALIVE):
+        (folder / name).unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def write_safely(path: Path, content: bytes) -> None:
+    """The file holds this, all of it or what it held before, also after a power cut. Raises `OSError`."""
+    unfinished = path.with_name(f"{path.name}{MAKING}")
+    with unfinished.open("wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    unfinished.replace(path)
+    sync_folder(path.parent)

@@ -1,0 +1,97 @@
+"""Who is alive and who drains, told by `flock`: the kernel lets go when the holder dies, and not before.
+
+A lock belongs to the open file, which a forked child shares. So a child closes its copy the moment it is forked, and
+letting go is said aloud (`LOCK_UN`) rather than left to the last copy being closed.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+__all__ = ["FileLock", "is_locked", "in_forked_child"]
+
+_TRIES = 5
+_TRY_AGAIN_S = 0.001
+
+
+def in_forked_child(method: Callable[[], None]) -> None:
+    """Calls this bound method in every forked child, as long as its object lives."""
+    reference = weakref.WeakMethod(method)
+
+    def call() -> None:
+        alive = reference()
+        if alive is not None:
+            alive()
+
+    os.register_at_fork(after_in_child=call)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether somebody holds this lock now. Raises `OSError`; no such file is not locked."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    else:
+        return False
+    finally:
+        os.close(descriptor)
+
+
+class FileLock:
+    """An exclusive lock, held until `release` or the death of this process."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        in_forked_child(self._close)
+
+    @classmethod
+    def take(cls, path: Path, *, create: bool = True) -> FileLock | None:
+        """The lock, or None if somebody else holds it or its folder is gone. Raises other `OSError`.
+
+        Tried a few times within milliseconds: `is_locked` holds a lock for the moment it looks.
+        """
+        flags = os.O_RDWR | os.O_CLOEXEC | (os.O_CREAT if create else 0)
+        try:
+            descriptor = os.open(path, flags, 0o644)
+        except FileNotFoundError:
+            return None
+        for _ in range(_TRIES):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(_TRY_AGAIN_S)
+            else:
+                break
+        else:
+            os.close(descriptor)
+            return None
+        # The holder before may have deleted the file while this one was being opened: then this locks nothing.
+        try:
+            named = path.stat()
+        except FileNotFoundError:
+            named = None
+        if named is None or named.st_ino != os.fstat(descriptor).st_ino:
+            os.close(descriptor)
+            return None
+        return cls(descriptor)
+
+    def release(self) -> None:
+        """Lets go, also of what a child that was not told still shares. Twice is once."""
+        if self._descriptor >= 0:
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+            self._close()
+
+    def _close(self) -> None:
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1

@@ -1,0 +1,132 @@
+"""Reads records back from segments, in order, payloads untouched: the same way live and after a crash.
+
+A hole is an error here: whoever calls knows up to which position the records are there.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from pycrorm_async.errors import SpoolDamaged
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.frame import COMMIT, EVENT, Buffer, decode
+from pycrorm_async.queue.segment import SegmentHeader, decode_header, header_bytes, salt_of
+
+__all__ = ["Cursor", "Batch", "Opened", "Reader", "map_segment"]
+
+
+class Cursor(NamedTuple):
+    """A place between two records: the next frame to look at, and the position of the record before it."""
+
+    number: int
+    offset: int
+    position: int
+
+
+class Batch(NamedTuple):
+    """Records, their payloads' size, and where the next ones begin. `complete`: one more would pass a limit."""
+
+    records: list[Record]
+    payload_bytes: int
+    after: Cursor
+    complete: bool
+
+
+class Opened(NamedTuple):
+    """A segment with its header understood."""
+
+    path: Path
+    header: SegmentHeader
+    buffer: Buffer
+
+    @property
+    def first_frame(self) -> int:
+        return header_bytes(len(self.header.open))
+
+
+def map_segment(path: Path) -> mmap.mmap:
+    """The file's bytes, shared with whoever writes them. Raises `OSError`."""
+    with path.open("rb") as file:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+class Reader:
+    """Reads one recorder's segments. `load` gives the bytes of the segment of a number."""
+
+    def __init__(self, *, recorder: bytes, start: Cursor, load: Callable[[int], tuple[Path, Buffer]]) -> None:
+        self.cursor = start
+        self._recorder = recorder
+        self._load = load
+        self._number = 0
+        self._path = Path()
+        self._buffer: Buffer = b""
+        self._types: dict[bytes, str] = {}
+
+    def read(self, *, last: int, events_max: int, bytes_max: int, begun: Batch | None = None) -> Batch:
+        """The records after `begun` (or after the cursor) up to position `last`, those of `begun` before them.
+
+        At most `events_max`, and payloads of at most `bytes_max` together unless the first alone is larger. The
+        cursor stays: set it to `after` when the batch was given away. Raises `SpoolDamaged`.
+        """
+        records, total, (number, offset, position), _ = begun or Batch([], 0, self.cursor, complete=False)
+        types = self._types
+        complete = False
+        if number != self._number:
+            self._turn_to(number)
+        salt = salt_of(self._recorder, number)
+        while position < last:
+            if len(records) >= events_max:
+                complete = True
+                break
+            frame = decode(self._buffer, offset, salt)
+            if frame is None:
+                number, offset = number + 1, self._next_segment(number + 1, offset, position)
+                salt = salt_of(self._recorder, number)
+                if not records:  # the segment that ended may be deleted before the next read
+                    self.cursor = Cursor(number, offset, position)
+                continue
+            kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, _, size = frame
+            if kind != COMMIT:
+                total += len(payload)
+                if total > bytes_max and records:
+                    total -= len(payload)
+                    complete = True
+                    break
+                if at != position + 1:
+                    raise SpoolDamaged(self._path, offset, f"holds position {at} where {position + 1} belongs")
+                position = at
+                type_name = types.get(name)
+                if type_name is None:
+                    type_name = types[name] = name.decode()
+                owner = EpisodeId(episode) if kind == EVENT else None
+                records.append(Record(position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload))
+            offset += size
+        complete = complete or len(records) >= events_max or total >= bytes_max
+        return Batch(records, total, Cursor(number, offset, position), complete)
+
+    def close(self) -> None:
+        """Gives up the segment it looks at."""
+        if isinstance(self._buffer, mmap.mmap):
+            self._buffer.close()
+        self._number, self._buffer = 0, b""
+
+    def _turn_to(self, number: int) -> None:
+        self.close()
+        self._path, self._buffer = self._load(number)
+        self._number = number
+
+    def _next_segment(self, number: int, offset: int, position: int) -> int:
+        """The first frame of the segment that goes on where this one ends."""
+        before = self._path
+        try:
+            self._turn_to(number)
+        except FileNotFoundError:
+            raise SpoolDamaged(before, offset, f"position {position + 1} is missing") from None
+        header = decode_header(self._buffer)
+        if header is None or header.base != position + 1:
+            raise SpoolDamaged(before, offset, f"position {position + 1} is missing")
+        return header_bytes(len(header.open))

@@ -1,0 +1,170 @@
+"""A dead recorder's folder, recovered: a source of everything that is whole in it, and its deletion afterwards.
+
+Each episode left open gets an end of status LOST behind the last record, computed from that episode's last record and
+never written: recovering again, also after being killed in between, gives the same records.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId, parse_episode_id
+from pycrorm_async.queue.folder import ALIVE, DRAIN, TAIL, available, remove_folder, write_safely
+from pycrorm_async.queue.frame import Buffer
+from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.reader import Reader
+from pycrorm_async.queue.scan import Kept, scan
+from pycrorm_async.queue.segment import CLOSES, segment_path, sync_folder
+
+__all__ = ["LOST", "RecoveredQueue", "open_dead"]
+
+LOST: Final = b'{"status":"LOST"}'
+"""The payload of a computed end, version 1 of `EpisodeEnded` for ever."""
+
+
+def open_dead(folder: Path) -> RecoveredQueue | None:
+    """The folder as a source, or None if its recorder lives, somebody drains it, or it is gone.
+
+    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte: about a second
+    per GiB. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`, holding nothing.
+    """
+    with available(folder):
+        alive = FileLock.take(folder / ALIVE, create=False)
+        if alive is None:
+            return None
+        try:
+            drain = FileLock.take(folder / DRAIN)
+            if drain is None:
+                alive.release()
+                return None
+            try:
+                recorder = parse_episode_id(folder.name)
+                return RecoveredQueue(folder, recorder, scan(folder, recorder), (drain, alive))
+            except BaseException:
+                drain.release()
+                raise
+        except BaseException:
+            alive.release()
+            raise
+
+
+class RecoveredQueue:
+    """The records of a dead recorder, in order, then the computed ends. Made by `open_dead`; nothing waits."""
+
+    def __init__(self, folder: Path, recorder: EpisodeId, kept: Kept, locks: tuple[FileLock, ...]) -> None:
+        self.folder = folder
+        self.name = folder.name
+        self.lost = _ends(kept)
+        self._kept = kept
+        self._locks = locks
+        self._reader = Reader(recorder=recorder, start=kept.start, load=self._load)
+        self._given = kept.start.position
+        self._acknowledged = kept.start.position
+
+    @property
+    def last(self) -> int:
+        """Position of the last record, computed ends included."""
+        return self._kept.cut.position + len(self.lost)
+
+    @property
+    def tail_bytes(self) -> int:
+        """How much of the files lies behind the cut and is not zero: written, never synced, and torn."""
+        with available(self.folder):
+            return sum(len(tail) for _, tail in self._tails())
+
+    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
+        """The next records in order, at least one, at most the limits; empty when all are given."""
+        with available(self.folder):
+            batch = self._reader.read(last=self._kept.cut.position, events_max=events_max, bytes_max=bytes_max)
+        self._reader.cursor = batch.after
+        records, total = batch.records, batch.payload_bytes
+        for end in self.lost:
+            if end.position == (records[-1].position if records else self._given) + 1:
+                total += len(end.payload)
+                if records and (len(records) >= events_max or total > bytes_max):
+                    break
+                records.append(end)
+        if records:
+            self._given = records[-1].position
+        return records
+
+    async def acknowledge(self, position: int) -> None:
+        """Everything up to this position is stored for good: segments that hold no more are deleted, oldest first.
+
+        The last one stays, because the ends are computed from it. Raises `SpoolUnavailable`.
+        """
+        assert position <= self._given, "only what was given can be acknowledged"
+        self._acknowledged = max(self._acknowledged, position)
+        with available(self.folder):
+            for number in sorted(self._kept.bases):
+                following = self._kept.bases.get(number + 1)
+                if following is None or following - 1 > position:
+                    break
+                segment_path(self.folder, number).unlink(missing_ok=True)
+
+    def seal(self) -> None:
+        """Cuts the files where the records end; what is cut off is copied aside first, to `<segment>.tail`.
+
+        Twice is once, and killed at any point it can be done again. Raises `SpoolUnavailable`.
+        """
+        with available(self.folder):
+            for path, tail in self._tails():
+                if tail:
+                    write_safely(path.with_name(f"{path.name}{TAIL}"), tail)
+            for number in self._kept.numbers:
+                path = segment_path(self.folder, number)
+                if number > self._kept.cut.number:
+                    path.unlink(missing_ok=True)
+                elif number == self._kept.cut.number:
+                    with path.open("rb+") as file:
+                        file.truncate(self._kept.cut.offset)
+                        os.fsync(file.fileno())
+            sync_folder(self.folder)
+
+    def remove(self) -> None:
+        """Deletes the folder, all of which is stored, and gives up the locks. Raises `SpoolUnavailable`."""
+        assert self._acknowledged == self.last, "what is not acknowledged is not deleted"
+        self._reader.close()
+        try:
+            with available(self.folder):
+                remove_folder(self.folder)
+        finally:
+            self.release()
+
+    def release(self) -> None:
+        """Gives up the locks; what was not acknowledged is given again by whoever recovers next. Twice is once."""
+        self._reader.close()
+        for lock in self._locks:
+            lock.release()
+
+    def _tails(self) -> list[tuple[Path, bytes]]:
+        """For each file that reaches behind the cut what is there, without the zeros at its end."""
+        cut = self._kept.cut
+        return [
+            (path, path.read_bytes()[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
+            for number in self._kept.numbers
+            if number >= cut.number and (path := segment_path(self.folder, number)).exists()
+        ]
+
+    def _load(self, number: int) -> tuple[Path, Buffer]:
+        path = segment_path(self.folder, number)
+        return path, path.read_bytes()
+
+
+def _ends(kept: Kept) -> tuple[Record, ...]:
+    return tuple(
+        Record(
+            position=kept.cut.position + 1 + index,
+            episode=episode,
+            sequence=last.sequence + 1,
+            type=CLOSES,
+            version=1,
+            wall_ns=last.wall_ns,
+            monotonic_ns=last.monotonic_ns,
+            payload=LOST,
+        )
+        for index, (episode, last) in enumerate(sorted(kept.open.items()))
+    )

@@ -1,0 +1,183 @@
+"""What of a dead recorder's folder is kept: everything up to the first hole. Reads, and changes nothing.
+
+Behind the hole is a torn tail that no sync ever covered, unless a commit frame says that something in the hole was safe
+once: that is damage and raises. Ordinary records behind the hole prove nothing, for pages reach a disk in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from pycrorm_async.errors import SpoolDamaged, SpoolForeign
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue.frame import CHECKSUM, COMMIT, EVENT, HEADER_BYTES, Frame, chain, decode
+from pycrorm_async.queue.reader import Cursor
+from pycrorm_async.queue.segment import (
+    CLOSES,
+    FORMAT,
+    Last,
+    SegmentHeader,
+    decode_header,
+    format_of,
+    header_bytes,
+    salt_of,
+    segment_numbers,
+    segment_path,
+)
+
+__all__ = ["Kept", "scan"]
+
+_SALT_OFFSET = HEADER_BYTES - 8
+
+
+class Kept(NamedTuple):
+    """What of a folder is kept.
+
+    Attributes:
+        start: before the first record.
+        cut: behind the last one; what the files hold from here on is not kept. Number 0 if there is nothing at all.
+        bases: by number, the position of each kept segment's first record.
+        open: the episodes without an end, and the last record of each.
+        numbers: of all segment files, also those behind the cut.
+    """
+
+    start: Cursor
+    cut: Cursor
+    bases: dict[int, int]
+    open: dict[EpisodeId, Last]
+    numbers: list[int]
+
+
+def scan(folder: Path, recorder: bytes) -> Kept:
+    """Looks at every byte of the folder's segments once.
+
+    Raises `SpoolDamaged` with file and offset, `SpoolForeign` for a segment of a newer format or another recorder, and
+    `OSError`.
+    """
+    numbers = segment_numbers(folder)
+    walk = _Walk(folder, recorder)
+    for number in numbers:
+        if not walk.enter(number):
+            break
+    kept = walk.kept(numbers)
+    _refuse_damage(folder, recorder, kept)
+    return kept
+
+
+class _Walk:
+    """Goes from the oldest segment to the first hole."""
+
+    def __init__(self, folder: Path, recorder: bytes) -> None:
+        self._folder = folder
+        self._recorder = recorder
+        self._start = self._cut = Cursor(0, 0, 0)
+        self._bases: dict[int, int] = {}
+        self._open: dict[EpisodeId, Last] = {}
+        self._unsaid: list[int] = []  # checksums of the records that no commit frame has covered yet
+
+    def kept(self, numbers: list[int]) -> Kept:
+        return Kept(self._start, self._cut, self._bases, self._open, numbers)
+
+    def enter(self, number: int) -> bool:
+        """Goes through one segment; False if it does not go on where the one before ended."""
+        path = segment_path(self._folder, number)
+        buffer = path.read_bytes()
+        header = _header(path, buffer, recorder=self._recorder, number=number)
+        if not self._bases:
+            if header is None and number > 1:
+                raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are gone")
+            base = 1 if header is None else header.base
+            self._start = self._cut = Cursor(number, header_bytes(0), base - 1)
+        if header is None or number != self._cut.number + bool(self._bases) or header.base != self._cut.position + 1:
+            return False
+        first = header_bytes(len(header.open))
+        if not self._bases:
+            self._start = Cursor(number, first, header.base - 1)
+            self._open = dict(header.open)
+        self._bases[number] = header.base
+        self._cut = Cursor(number, first, header.base - 1)
+        salt = salt_of(self._recorder, number)
+        while (frame := decode(buffer, self._cut.offset, salt)) is not None:
+            if frame.kind == COMMIT:
+                self._check_commit(path, frame)
+                position = self._cut.position
+            elif frame.position == self._cut.position + 1:
+                self._keep(path, frame)
+                position = frame.position
+            else:
+                break
+            self._cut = Cursor(number, self._cut.offset + frame.size, position)
+        return True
+
+    def _keep(self, path: Path, frame: Frame) -> None:
+        self._unsaid.append(frame.checksum)
+        if frame.kind != EVENT:
+            return
+        episode = EpisodeId(frame.episode)
+        before = self._open.get(episode)
+        if frame.sequence != (before.sequence if before else 0) + 1:
+            raise SpoolDamaged(
+                path,
+                self._cut.offset,
+                f"event {frame.sequence} of episode {episode_text(episode)} follows {before and before.sequence}",
+            )
+        self._open[episode] = Last(frame.sequence, frame.wall_ns, frame.monotonic_ns)
+        if frame.type == CLOSES.encode():
+            del self._open[episode]
+
+    def _check_commit(self, path: Path, frame: Frame) -> None:
+        """The records it covers are all here and are those it was written for."""
+        later = self._cut.position - frame.position
+        if later < 0:
+            raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was safe and is missing")
+        covered = self._unsaid[: len(self._unsaid) - later]
+        self._unsaid = self._unsaid[len(covered) :]
+        if len(covered) < frame.sequence:
+            return  # the segments its first records were in are stored and gone
+        checksum = 0
+        for each in covered:
+            checksum = chain(each, checksum)
+        if len(covered) != frame.sequence or frame.payload != CHECKSUM.pack(checksum):
+            raise SpoolDamaged(path, self._cut.offset, "the records before are not those that were safe here")
+
+
+def _header(path: Path, buffer: bytes, *, recorder: bytes, number: int) -> SegmentHeader | None:
+    written_in = format_of(buffer)
+    if written_in is not None and written_in > FORMAT:
+        raise SpoolForeign(f"{path} is in format {written_in} of a newer program; this one reads format {FORMAT}")
+    header = decode_header(buffer)
+    if header is not None and (header.recorder, header.number) != (recorder, number):
+        raise SpoolForeign(f"{path} is segment {header.number} of recorder {episode_text(EpisodeId(header.recorder))}")
+    return header
+
+
+def _refuse_damage(folder: Path, recorder: bytes, kept: Kept) -> None:
+    """Raises if anything behind the cut says that something in the hole was safe."""
+    for number in kept.numbers:
+        if number < kept.cut.number:
+            continue
+        path = segment_path(folder, number)
+        start = kept.cut.offset if number == kept.cut.number else 0
+        for offset, frame in _commits(path.read_bytes(), start, salt_of(recorder, number)):
+            if frame.position > kept.cut.position:
+                raise SpoolDamaged(
+                    segment_path(folder, kept.cut.number),
+                    kept.cut.offset,
+                    f"position {kept.cut.position + 1} is missing, and {path.name} says at byte {offset} that all up"
+                    f" to position {frame.position} was safe",
+                )
+
+
+def _commits(buffer: bytes, start: int, salt: int) -> Iterator[tuple[int, Frame]]:
+    """Every commit frame from `start` on, whatever lies around it."""
+    salted = CHECKSUM.pack(salt)
+    found = buffer.find(salted, start)
+    while found >= 0:
+        offset = found - _SALT_OFFSET
+        if offset >= start and offset % 8 == 0 and buffer[offset] == COMMIT:
+            frame = decode(buffer, offset, salt)
+            if frame is not None:
+                yield offset, frame
+        found = buffer.find(salted, found + 1)

@@ -1,0 +1,106 @@
+"""The spool: the folder all recorders of one database write below, and the note which database that is."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
+from pycrorm_async.events.ids import parse_episode_id
+from pycrorm_async.queue.folder import ALIVE, MAKING, available
+from pycrorm_async.queue.locks import is_locked
+from pycrorm_async.queue.segment import sync_folder
+
+__all__ = ["Spool", "RecorderFolder"]
+
+BINDING: Final = "log"
+
+
+class RecorderFolder(NamedTuple):
+    """One recorder's folder. `alive`: its process lived when this was looked up; a dead one never lives again."""
+
+    path: Path
+    alive: bool
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+
+class Spool:
+    """A folder of recorders. Making one touches nothing; a folder that is not there has no recorders.
+
+    >>> Spool(Path("no.such.spool")).recorders()
+    []
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def recorders(self) -> list[RecorderFolder]:
+        """All recorders, oldest first. Raises `SpoolUnavailable`."""
+        with available(self.path):
+            return [
+                RecorderFolder(path, alive=is_locked(path / ALIVE)) for path in self._entries() if _is_recorder(path)
+            ]
+
+    def strangers(self) -> list[Path]:
+        """What lies in the spool and is not ours; it is left alone. Raises `SpoolUnavailable`."""
+        with available(self.path):
+            return [path for path in self._entries() if path.name != BINDING and not _is_recorder(path)]
+
+    def bind(self, log_id: str) -> None:
+        """Notes that this spool is drained into this log, for ever; the spool is made if need be.
+
+        Raises `SpoolForeign` naming both if it was another before, `SpoolUnavailable` if it cannot be noted.
+        """
+        if not log_id or log_id != log_id.strip() or "\n" in log_id:
+            raise ValueError(f"not an id: {log_id!r}")
+        bound = self.log_id()
+        if bound is None:
+            with available(self.path):
+                self.path.mkdir(parents=True, exist_ok=True)
+                self._note(log_id)
+            bound = self.log_id()
+        if bound != log_id:
+            raise SpoolForeign(f"spool {self.path} belongs to log {bound}, not to log {log_id}")
+
+    def log_id(self) -> str | None:
+        """The log this spool is bound to. Raises `SpoolUnavailable`."""
+        with available(self.path):
+            try:
+                return (self.path / BINDING).read_text(encoding="utf-8").strip()
+            except FileNotFoundError:
+                return None
+
+    def _note(self, log_id: str) -> None:
+        """Writes the note whole or not at all; of two at once the first stays."""
+        unfinished = self.path / f"{BINDING}.{os.getpid()}{MAKING}"
+        with unfinished.open("wb") as file:
+            file.write(f"{log_id}\n".encode())
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.link(unfinished, self.path / BINDING)
+        except FileExistsError:
+            pass
+        finally:
+            unfinished.unlink()
+        sync_folder(self.path)
+
+    def _entries(self) -> list[Path]:
+        try:
+            return sorted(self.path.iterdir())
+        except FileNotFoundError:
+            return []
+        except NotADirectoryError:
+            raise SpoolUnavailable(self.path, "is a file, not a folder") from None
+
+
+def _is_recorder(path: Path) -> bool:
+    try:
+        parse_episode_id(path.name)
+    except ValueError:
+        return False
+    return (path / ALIVE).exists()
