@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
 
 __all__ = ["Source", "Destination"]
 
@@ -34,14 +35,22 @@ class Source(Protocol):
 class Destination(Protocol):
     """The log in a database, and the tables behind it."""
 
-    async def append(self, records: Sequence[Record]) -> None:
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         """Durable when it returns. What is stored already with the same bytes is stored once.
 
-        A record the database refuses parks its episode with the reason and the others go on. Raises
-        `DatabaseUnavailable` when the database is away: the same call may be made again.
+        Gives the episodes of which it refused records (a gap, or what no database can hold) and why: these records are
+        not stored and must be kept; the other episodes go on. Raises `DatabaseUnavailable` when the database is away:
+        the same call may be made again. Raises `LogDamaged` when another event is stored under a record's key.
         """
         ...
 
     async def fold(self) -> int:
-        """Brings the tables up to date with the log; the number of events folded. An episode it cannot fold is parked."""
+        """Brings the tables up to date with the log; gives the number of events folded.
+
+        An episode it cannot fold is parked. May be cancelled: what was committed stays, the rest is folded next time.
+        """
+        ...
+
+    async def stopped(self) -> Mapping[str, str]:
+        """Every episode, by id, that is refused or parked, and why. Stays short however many episodes there are."""
         ...

@@ -1,0 +1,172 @@
+"""Moves records from one source into the log: read, append, acknowledge, in that order only.
+
+Killed or cancelled anywhere in between, the worst that follows is that a batch is appended a second time, which
+stores it once. While the database is away the drain waits and the source keeps its records. Once an episode's record
+is refused nothing from that record on is ever acknowledged, whatever happens to later ones: a source forgets by
+position only, so this is how the refused records are kept. They are offered again by the source of the next process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple, TypeVar
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.writer.backoff import PATIENT, Backoff
+from pycrorm_async.writer.ports import Destination, Source
+
+__all__ = ["Drain", "DrainState", "to_the_end"]
+
+_T = TypeVar("_T")
+
+
+class DrainState(NamedTuple):
+    """How far a drain is, for status.
+
+    Attributes:
+        source: the recorder's name.
+        records: appended so far, those that were there already included, refused ones not.
+        batches: appended so far.
+        retries: how often the database was away.
+        away: why it is away at this moment; None if it is not.
+        last_error: the latest of these reasons.
+        appended: position of the last record the log was given.
+        acknowledged: position up to which the source may forget.
+        refused: by episode id, why records of it were refused.
+    """
+
+    source: str
+    records: int
+    batches: int
+    retries: int
+    away: str | None
+    last_error: str | None
+    appended: int
+    acknowledged: int
+    refused: Mapping[str, str]
+
+
+class Drain:
+    """One source on its way into one log. Belongs to the loop that runs it; `state` may be read from any thread."""
+
+    def __init__(
+        self,
+        source: Source,
+        destination: Destination,
+        *,
+        settings: Settings,
+        backoff: Backoff = PATIENT,
+        on_append: Callable[[], None] = lambda: None,
+        randomness: Callable[[], float] = random.random,
+        sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+    ) -> None:
+        self._source = source
+        self._destination = destination
+        self._settings = settings
+        self._backoff = backoff
+        self._on_append = on_append
+        self._randomness = randomness
+        self._sleep = sleep
+        self._records = self._batches = self._retries = 0
+        self._away: str | None = None
+        self._last_error: str | None = None
+        self._appended = self._acknowledged = 0
+        self._ceiling: int | None = None  # the last position that may be acknowledged, once something was refused
+        self._refused: dict[str, str] = {}
+        self._moved = asyncio.Condition()
+        self._over = False
+
+    async def run(self) -> None:
+        """Drains until the source is closed and empty.
+
+        Raises what makes going on useless: `LogDamaged`, a damaged source, a database away after the last attempt.
+        """
+        settings = self._settings
+        try:
+            while batch := await self._source.get_batch(
+                events_max=settings.batch_events_max,
+                bytes_max=settings.batch_bytes_max,
+                age_s_max=settings.batch_age_ms / 1000,
+            ):
+                refusals = await self._append(batch)
+                await self._acknowledge(self._safe_position(batch, refusals))
+                self._batches += 1
+                self._appended = batch[-1].position
+                self._on_append()
+                await self._tell()
+        finally:
+            self._over = True
+            await self._tell()
+
+    async def reached(self, position: int) -> bool:
+        """Waits until the log was given everything up to this position; False if the drain ended before."""
+        async with self._moved:
+            await self._moved.wait_for(lambda: self._over or self._appended >= position)
+        return self._appended >= position
+
+    @property
+    def state(self) -> DrainState:
+        return DrainState(
+            source=self._source.name,
+            records=self._records,
+            batches=self._batches,
+            retries=self._retries,
+            away=self._away,
+            last_error=self._last_error,
+            appended=self._appended,
+            acknowledged=self._acknowledged,
+            refused=MappingProxyType(self._refused),
+        )
+
+    async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        attempt = 0
+        while True:
+            try:
+                refusals = await to_the_end(self._destination.append(batch))
+            except DatabaseUnavailable as error:
+                attempt += 1
+                self._retries += 1
+                self._away = self._last_error = str(error)
+                pause_s = self._backoff.pause_s(attempt, self._randomness())
+                if pause_s is None:
+                    raise
+                await self._sleep(pause_s)
+            else:
+                self._away = None
+                return refusals
+
+    def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
+        """How far the source may forget now."""
+        self._records += sum(1 for record in batch if record.episode not in refusals) if refusals else len(batch)
+        for episode, reason in refusals.items():
+            self._refused.setdefault(episode_text(episode), reason)
+        if refusals and self._ceiling is None:
+            self._ceiling = next(each.position for each in batch if each.episode in refusals) - 1
+        return batch[-1].position if self._ceiling is None else self._ceiling
+
+    async def _acknowledge(self, position: int) -> None:
+        if position > self._acknowledged:
+            await self._source.acknowledge(position)
+            self._acknowledged = position
+
+    async def _tell(self) -> None:
+        async with self._moved:
+            self._moved.notify_all()
+
+
+async def to_the_end(work: Coroutine[Any, Any, _T]) -> _T:
+    """Awaits work that is not to be left half done: a cancellation is passed on when the work is finished."""
+    task = asyncio.create_task(work)
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.wait([task])
+        if not task.cancelled():
+            task.exception()  # seen; the cancellation counts for more
+        raise

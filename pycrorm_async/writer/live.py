@@ -1,0 +1,176 @@
+"""The writer of one memory: drains its queue as it fills, folds when asked or idle, adopts what the dead left.
+
+Appending goes on beside the plan; folding costs interpreter time, so it waits until the plan is idle, flushes or ends.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable, Iterable, Mapping
+from typing import NamedTuple
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError, PycrormError
+from pycrorm_async.writer.backoff import PATIENT
+from pycrorm_async.writer.drain import Drain, DrainState
+from pycrorm_async.writer.ports import Destination, Source
+
+__all__ = ["LiveWriter", "WriterState"]
+
+
+class WriterState(NamedTuple):
+    """What the writer does, for status.
+
+    Attributes:
+        queue: the drain of this memory's own queue.
+        adopted: the drains of what dead recorders left.
+        failure: why appending stopped for good; None while it goes on. The queue keeps its events on disk.
+        fold_error: why the tables could not be brought up to date the last time; None if they could.
+        adoption_errors: folders that could not be adopted, and why.
+    """
+
+    queue: DrainState
+    adopted: tuple[DrainState, ...]
+    failure: str | None
+    fold_error: str | None
+    adoption_errors: tuple[str, ...]
+
+
+class LiveWriter:
+    """Runs in one loop, which should not be the plan's: a plan may never suspend."""
+
+    def __init__(
+        self,
+        source: Source,
+        destination: Destination,
+        *,
+        adopt: Callable[[], Iterable[Source]],
+        settings: Settings,
+        randomness: Callable[[], float] = random.random,
+    ) -> None:
+        self._destination = destination
+        self._adopt = adopt
+        self._settings = settings
+        self._randomness = randomness
+        self._news = asyncio.Event()
+        self._drain = Drain(source, destination, settings=settings, on_append=self._news.set)
+        self._adopted: list[Drain] = []
+        self._adoption_errors: list[str] = []
+        self._folding = asyncio.Lock()
+        self._fold_error: str | None = None
+        self._failure: Exception | None = None
+        self._stopped_before: Mapping[str, str] = {}
+
+    async def run(self) -> None:
+        """Until the queue is closed and drained and everything is folded.
+
+        Raises what stopped the appending, or `EpisodeParked` for episodes that stopped since this began.
+        """
+        self._stopped_before = await self._destination.stopped()
+        async with asyncio.TaskGroup() as tasks:
+            others = (
+                tasks.create_task(self._fold_when_idle(), name="pycrorm fold when idle"),
+                tasks.create_task(self._adopt_all(), name="pycrorm adopt"),
+            )
+            try:
+                await self._drain.run()
+            except Exception as error:  # noqa: BLE001 - kept, and raised below and at every flush
+                self._failure = error
+            finally:
+                for each in others:
+                    each.cancel()
+        self._raise_failure()
+        await self._fold()
+        await self._raise_stopped()
+
+    async def flush(self, position: int) -> None:
+        """Returns when everything up to this position is stored and the tables show all that is stored.
+
+        Raises what stopped the appending, `EpisodeParked` for episodes that stopped since `run` began, and
+        `FlushTimeout` after `flush_timeout_s`.
+        """
+        timeout_s = self._settings.flush_timeout_s
+        try:
+            async with asyncio.timeout(timeout_s):
+                reached = await self._drain.reached(position)
+                self._raise_failure()
+                if not reached:
+                    raise InternalError(f"the queue ended before position {position}")
+                await self._fold()
+                await self._raise_stopped()
+        except TimeoutError:
+            raise FlushTimeout(self._not_in_time(timeout_s)) from None
+
+    @property
+    def state(self) -> WriterState:
+        return WriterState(
+            queue=self._drain.state,
+            adopted=tuple(each.state for each in self._adopted),
+            failure=None if self._failure is None else str(self._failure),
+            fold_error=self._fold_error,
+            adoption_errors=tuple(self._adoption_errors),
+        )
+
+    def _not_in_time(self, timeout_s: float) -> str:
+        reason = self._drain.state.away or self._fold_error or "there was too much to store and fold"
+        return f"not finished after {timeout_s:g} s ({reason}); everything recorded is safe in the spool"
+
+    def _raise_failure(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+
+    async def _raise_stopped(self) -> None:
+        stopped = {**self._drain.state.refused, **await self._destination.stopped()}
+        news = {episode: reason for episode, reason in stopped.items() if episode not in self._stopped_before}
+        if news:
+            raise EpisodeParked(news)
+
+    async def _fold(self) -> None:
+        """Folds all there is, asking again while the database is away; the caller bounds the time."""
+        attempt = 0
+        while True:
+            try:
+                async with self._folding:
+                    await self._destination.fold()
+            except DatabaseUnavailable as error:
+                attempt += 1
+                self._fold_error = str(error)
+                await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0)
+            else:
+                self._fold_error = None
+                return
+
+    async def _fold_when_idle(self) -> None:
+        self._news.set()  # something may have been left behind before
+        while True:
+            await self._news.wait()
+            self._news.clear()
+            try:
+                async with asyncio.timeout(self._settings.idle_ms / 1000):
+                    await self._news.wait()
+            except TimeoutError:
+                await self._fold_once()
+
+    async def _fold_once(self) -> None:
+        try:
+            await self._fold()
+        except Exception as error:  # noqa: BLE001 - shown in the state; the next flush meets and raises it
+            self._fold_error = str(error)
+
+    async def _adopt_all(self) -> None:
+        # Finding and recovering folders reads files: in a thread, so that our own queue does not wait for it.
+        try:
+            sources = await asyncio.to_thread(lambda: iter(self._adopt()))
+            while (source := await asyncio.to_thread(next, sources, None)) is not None:
+                await self._drain_adopted(source)
+        except PycrormError as error:
+            self._adoption_errors.append(str(error))
+
+    async def _drain_adopted(self, source: Source) -> None:
+        drain = Drain(source, self._destination, settings=self._settings, on_append=self._news.set)
+        self._adopted.append(drain)
+        try:
+            await drain.run()
+        except PycrormError as error:
+            self._adoption_errors.append(f"{source.name}: {error}")

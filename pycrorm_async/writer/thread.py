@@ -1,0 +1,160 @@
+"""The writer inside a plan's process: a thread with a loop of its own, spoken to from the plan's loop.
+
+A task in the plan's loop would never run: a plan that moves no real time awaits all the way down without suspending.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Coroutine, Iterable
+from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager, AsyncExitStack
+from typing import Any
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import DatabaseUnavailable, FlushTimeout
+from pycrorm_async.writer.live import LiveWriter, WriterState
+from pycrorm_async.writer.ports import Destination, Source
+
+__all__ = ["WriterThread"]
+
+
+class WriterThread:
+    """Drains one queue from a thread of its own.
+
+        writer = WriterThread(source=queue, open_destination=open_log, adopt=dead_folders, settings=settings)
+        await writer.start()                # raises if the database cannot be opened
+        await writer.flush(position)        # stored and folded
+        queue.close(); await writer.close() # drains what is left, folds, closes the database, ends the thread
+
+    `open_destination` is entered and left inside the thread's loop, where its connections belong. `start`, `flush` and
+    `close` are called from the plan's loop; cancelling one of them stops the waiting, not the work.
+    """
+
+    def __init__(
+        self,
+        *,
+        source: Source,
+        open_destination: Callable[[], AbstractAsyncContextManager[Destination]],
+        adopt: Callable[[], Iterable[Source]],
+        settings: Settings,
+    ) -> None:
+        self._source = source
+        self._open_destination = open_destination
+        self._adopt = adopt
+        self._settings = settings
+        self._opened: Future[LiveWriter] = Future()
+        self._ended: Future[None] = Future()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._work: asyncio.Task[None] | None = None
+        self._leave: asyncio.Event | None = None
+        self._flushes: set[asyncio.Task[None]] = set()
+        # A daemon: what it has not stored is safe in the spool, so it is no reason to keep a process from ending.
+        self._thread = threading.Thread(target=self._run, name=f"pycrorm writer {source.name}", daemon=True)
+
+    async def start(self) -> None:
+        """Starts the thread; returns when the database is open. Raises what opening raised; the thread is gone then."""
+        self._thread.start()
+        try:
+            await asyncio.shield(asyncio.wrap_future(self._opened))
+        except asyncio.CancelledError:
+            self._opened.add_done_callback(lambda _: self._ask_to_leave(cancel=True))
+            raise
+        except Exception:
+            self._thread.join()
+            raise
+
+    async def flush(self, position: int) -> None:
+        """Returns when everything up to this position is stored and visible in the tables; see `LiveWriter.flush`."""
+        writer = self._opened.result(timeout=0)
+        if self._ended.done():
+            self._ended.result()
+            return
+        assert self._loop is not None
+        flush = asyncio.run_coroutine_threadsafe(self._counted(writer.flush(position)), self._loop)
+        await asyncio.shield(asyncio.wrap_future(flush))
+
+    async def close(self) -> None:
+        """Waits until the queue, which the caller closed, is drained and folded. The thread is gone afterwards.
+
+        Raises what stopped the appending, `EpisodeParked`, or `FlushTimeout` after `flush_timeout_s`.
+        """
+        self._ask_to_leave(cancel=False)
+        ended = asyncio.wrap_future(self._ended)
+        await asyncio.wait([ended], timeout=self._settings.flush_timeout_s)
+        if not ended.done():
+            late = self._too_late()
+            self._ask_to_leave(cancel=True)
+            await asyncio.wait([ended], timeout=self._settings.connect_timeout_s)
+            raise late
+        self._thread.join()
+        ended.result()
+
+    @property
+    def state(self) -> WriterState:
+        """What the writer does; from any thread, once started."""
+        return self._opened.result(timeout=0).state
+
+    def _too_late(self) -> FlushTimeout:
+        reason = self.state.queue.away or "there was too much to store and fold"
+        return FlushTimeout(
+            f"closed after {self._settings.flush_timeout_s:g} s with work left ({reason});"
+            " everything recorded is safe in the spool"
+        )
+
+    def _ask_to_leave(self, *, cancel: bool) -> None:
+        if self._ended.done() or self._loop is None or self._leave is None or self._work is None:
+            return
+        try:
+            self._loop.call_soon_threadsafe(self._work.cancel if cancel else self._leave.set)
+        except RuntimeError:  # the loop was closed at this moment: the thread is leaving
+            return
+
+    # --- in the thread ----------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._main())
+        except asyncio.CancelledError:
+            self._opened.cancel()
+            self._ended.set_result(None)  # whoever cancelled knows better what to raise
+        except BaseException as error:  # noqa: BLE001 - raised by `start`, or by `flush` and `close`
+            if not self._opened.done():
+                self._opened.set_exception(error)
+            self._ended.set_exception(error)
+        else:
+            self._ended.set_result(None)
+
+    async def _main(self) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._work = asyncio.current_task()
+        self._leave = asyncio.Event()
+        async with AsyncExitStack() as stack:
+            destination = await self._open(stack)
+            writer = LiveWriter(self._source, destination, adopt=self._adopt, settings=self._settings)
+            self._opened.set_result(writer)
+            # A writer that failed stays until it is told to leave, so that every flush is told why.
+            [outcome] = await asyncio.gather(writer.run(), return_exceptions=True)
+            await self._leave.wait()
+            if self._flushes:
+                await asyncio.wait(self._flushes)
+            if outcome is not None:
+                raise outcome
+
+    async def _open(self, stack: AsyncExitStack) -> Destination:
+        timeout_s = self._settings.connect_timeout_s
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await stack.enter_async_context(self._open_destination())
+        except TimeoutError:
+            raise DatabaseUnavailable(f"the database did not answer within {timeout_s:g} s") from None
+
+    async def _counted(self, flush: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._flushes.add(task)
+        try:
+            await flush
+        finally:
+            self._flushes.discard(task)
