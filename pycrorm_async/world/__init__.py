@@ -1,0 +1,81 @@
+"""Where a plan acts: a kinematic Bullet world, its objects, and the robot's measures. Knows nothing of memory.
+
+Importing this package imports neither Bullet nor numpy; Bullet is loaded when the first world is entered.
+
+>>> with BulletWorld() as world:
+...     robot = Object("pr2", ObjectType.ROBOT)
+...     kitchen = Object("kitchen", ObjectType.ENVIRONMENT)
+...     cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pycrorm_async.world.boxes import BoundingBox
+    from pycrorm_async.world.bullet import BulletWorld
+    from pycrorm_async.world.costmaps import (
+        Costmap,
+        GaussianCostmap,
+        OccupancyCostmap,
+        SemanticCostmap,
+        VisibilityCostmap,
+    )
+    from pycrorm_async.world.enums import Arms, Grasp, GripperState, JointType, ObjectType, WorldMode
+    from pycrorm_async.world.objects import Object
+    from pycrorm_async.world.pose import Pose, Quaternion, Vector
+    from pycrorm_async.world.robot import RobotDescription, robot_description
+    from pycrorm_async.world.state import WorldState
+    from pycrorm_async.world.watch import WorldObserver, WorldWatcher, current_world, watcher
+
+__all__ = [
+    "BulletWorld",
+    "Object",
+    "Pose",
+    "Vector",
+    "Quaternion",
+    "ObjectType",
+    "Arms",
+    "Grasp",
+    "GripperState",
+    "JointType",
+    "WorldMode",
+    "WorldState",
+    "BoundingBox",
+    "RobotDescription",
+    "robot_description",
+    "Costmap",
+    "OccupancyCostmap",
+    "GaussianCostmap",
+    "VisibilityCostmap",
+    "SemanticCostmap",
+    "WorldObserver",
+    "WorldWatcher",
+    "current_world",
+    "watcher",
+]
+
+_HOME = {
+    "boxes": ("BoundingBox",),
+    "bullet": ("BulletWorld",),
+    "costmaps": ("Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"),
+    "enums": ("Arms", "Grasp", "GripperState", "JointType", "ObjectType", "WorldMode"),
+    "objects": ("Object",),
+    "pose": ("Pose", "Quaternion", "Vector"),
+    "robot": ("RobotDescription", "robot_description"),
+    "state": ("WorldState",),
+    "watch": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _HOME.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,144 @@
+"""What room a thing takes: axis-aligned boxes reckoned from its collision shapes, without Bullet's margin.
+
+Bullet's own boxes are a margin too large; these are exact for boxes, spheres, cylinders and capsules, and for meshes
+those of the convex hull that Bullet makes of them.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.world.pose import Quaternion, Vector, product, rotated
+
+__all__ = ["BoundingBox", "Frame", "Solid", "solids_of", "box_around"]
+
+Array = NDArray[np.float64]
+Frame = tuple[Vector, Quaternion]
+"""A position and a unit quaternion, where a `Pose` would be too slow to make."""
+
+
+class BoundingBox(NamedTuple):
+    """The smallest box along the axes of "map" that holds something: its lowest and its highest corner, metres."""
+
+    min: Vector
+    max: Vector
+
+    @property
+    def centre(self) -> Vector:
+        """The middle."""
+        return Vector(*((low + high) / 2 for low, high in zip(self.min, self.max, strict=True)))
+
+    @property
+    def size(self) -> Vector:
+        """Edge lengths along x, y, z."""
+        return Vector(*(high - low for low, high in zip(self.min, self.max, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A convex shape in its link's frame: the hull of `points`, swelled by `radius`.
+
+    With an `axis` it swells only across that direction (a cylinder: two points and their discs), else all around.
+    """
+
+    points: Array
+    radius: float = 0.0
+    axis: Array | None = None
+
+    def box(self, rotation: Array, position: Array) -> tuple[Array, Array]:
+        """Lowest and highest corner where the link's frame is at (rotation matrix, position)."""
+        corners = self.points @ rotation.T + position
+        swell: Array | float = self.radius
+        if self.axis is not None:
+            along = rotation @ self.axis
+            swell = self.radius * np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
+        return corners.min(axis=0) - swell, corners.max(axis=0) + swell
+
+    @cached_property
+    def inner_points(self) -> Array:
+        """Points spread through the shape, none on its surface, at most about 150; the same every time."""
+        anchors = self.points[:: max(1, len(self.points) // 8)]
+        rim = [np.zeros(3)]
+        if self.radius:
+            rim += [out if self.axis is None else out - self.axis * (out @ self.axis) for out in _DIRECTIONS]
+        hull = [
+            (first + second) / 2 + self.radius * out
+            for first, second in itertools.combinations_with_replacement(anchors, 2)
+            for out in rim
+        ]
+        middle = anchors.mean(axis=0)
+        return np.concatenate([middle + (np.array(hull) - middle) * inward for inward in (0.9, 0.5)])
+
+
+_DIRECTIONS = tuple(
+    np.array(direction) / math.sqrt(sum(map(abs, direction)))
+    for direction in itertools.product((-1, 0, 1), repeat=3)
+    if any(direction)
+)
+"""Unit vectors to the faces, edges and corners of a cube."""
+
+
+def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> tuple[Solid, ...]:
+    """The collision shapes of one link as Bullet has them, from `inertial` (Bullet's frame) into the link's frame."""
+    shapes = bullet.getCollisionShapeData(body, link, physicsClientId=client)
+    return tuple(
+        solid
+        for index, shape in enumerate(shapes)
+        if (solid := _solid(bullet, client, body, link, index, shape, inertial)) is not None
+    )
+
+
+def _solid(
+    bullet: Any, client: int, body: int, link: int, index: int, shape: Sequence[Any], inertial: Frame
+) -> Solid | None:
+    kind, size = shape[2], shape[3]
+    position, turn = inertial
+    place = np.array(rotated(turn, shape[5])) + np.array(position)
+    rotation = rotation_matrix(product(turn, shape[6]))
+    if kind == bullet.GEOM_BOX:
+        half = np.array(size) / 2
+        return Solid(np.array(list(itertools.product((-1, 1), repeat=3))) * half @ rotation.T + place)
+    if kind == bullet.GEOM_SPHERE:
+        return Solid(place[None, :], size[0])
+    if kind in (bullet.GEOM_CYLINDER, bullet.GEOM_CAPSULE):
+        axis = rotation[:, 2]
+        ends = np.stack([place - axis * size[0] / 2, place + axis * size[0] / 2])
+        return Solid(ends, size[1], axis if kind == bullet.GEOM_CYLINDER else None)
+    if kind == bullet.GEOM_MESH:
+        count, vertices = bullet.getMeshData(body, link, collisionShapeIndex=index, physicsClientId=client)
+        return Solid(np.array(vertices).reshape(-1, 3) @ rotation.T + place) if count else None
+    return None
+
+
+def box_around(placed: Iterable[tuple[Frame, Iterable[Solid]]]) -> BoundingBox | None:
+    """The box around all the solids, each at its link's frame; None if there are none."""
+    corners = [
+        corner
+        for (position, turn), solids in placed
+        for solid in solids
+        for corner in solid.box(rotation_matrix(turn), np.array(position))
+    ]
+    if not corners:
+        return None
+    stacked = np.array(corners)
+    return BoundingBox(Vector(*stacked.min(axis=0).tolist()), Vector(*stacked.max(axis=0).tolist()))
+
+
+def rotation_matrix(turn: Sequence[float]) -> Array:
+    """The 3 by 3 matrix of a unit quaternion xyzw."""
+    x, y, z, w = turn
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
