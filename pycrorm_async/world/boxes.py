@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.world.pose import Quaternion, Vector, product, rotated
+from pycrorm_async.world.pose import Quaternion, Vector
 
 __all__ = ["BoundingBox", "Frame", "Solid", "solids_of", "box_around"]
 
@@ -78,6 +78,7 @@ class Solid:
         return np.concatenate([middle + (np.array(hull) - middle) * inward for inward in (0.9, 0.5)])
 
 
+_CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 _DIRECTIONS = tuple(
     np.array(direction) / math.sqrt(sum(map(abs, direction)))
     for direction in itertools.product((-1, 0, 1), repeat=3)
@@ -87,35 +88,48 @@ _DIRECTIONS = tuple(
 
 
 def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> tuple[Solid, ...]:
-    """The collision shapes of one link as Bullet has them, from `inertial` (Bullet's frame) into the link's frame."""
+    """The collision shapes of one link, in the link's frame; `inertial` is where in it Bullet's own frame is.
+
+    To be asked while the body stands where it was loaded.
+    """
     shapes = bullet.getCollisionShapeData(body, link, physicsClientId=client)
-    return tuple(
-        solid
-        for index, shape in enumerate(shapes)
-        if (solid := _solid(bullet, client, body, link, index, shape, inertial)) is not None
-    )
+    rotation, position = rotation_matrix(inertial[1]), np.array(inertial[0])
+    solids = []
+    for index, shape in enumerate(shapes):
+        kind, size, centre, turn = shape[2], shape[3], np.array(shape[5]), rotation_matrix(shape[6])
+        if kind == bullet.GEOM_MESH:
+            # Bullet gives the vertices of a link's first convex shape only, already turned into its inertial frame
+            vertices = bullet.getMeshData(body, link, physicsClientId=client)[1] if index == 0 else ()
+            if not vertices:
+                return (_as_bullet_has_it(bullet, client, body, link, inertial),)
+            solids.append(Solid(np.array(vertices) @ rotation.T + position))
+        else:
+            solids += _primitive(bullet, kind, size, rotation @ centre + position, rotation @ turn)
+    return tuple(solids)
 
 
-def _solid(
-    bullet: Any, client: int, body: int, link: int, index: int, shape: Sequence[Any], inertial: Frame
-) -> Solid | None:
-    kind, size = shape[2], shape[3]
-    position, turn = inertial
-    place = np.array(rotated(turn, shape[5])) + np.array(position)
-    rotation = rotation_matrix(product(turn, shape[6]))
+def _primitive(bullet: Any, kind: int, size: Sequence[float], centre: Array, rotation: Array) -> list[Solid]:
     if kind == bullet.GEOM_BOX:
-        half = np.array(size) / 2
-        return Solid(np.array(list(itertools.product((-1, 1), repeat=3))) * half @ rotation.T + place)
+        return [Solid(_CORNERS * np.array(size) / 2 @ rotation.T + centre)]
     if kind == bullet.GEOM_SPHERE:
-        return Solid(place[None, :], size[0])
+        return [Solid(centre[None, :], size[0])]
     if kind in (bullet.GEOM_CYLINDER, bullet.GEOM_CAPSULE):
         axis = rotation[:, 2]
-        ends = np.stack([place - axis * size[0] / 2, place + axis * size[0] / 2])
-        return Solid(ends, size[1], axis if kind == bullet.GEOM_CYLINDER else None)
-    if kind == bullet.GEOM_MESH:
-        count, vertices = bullet.getMeshData(body, link, collisionShapeIndex=index, physicsClientId=client)
-        return Solid(np.array(vertices).reshape(-1, 3) @ rotation.T + place) if count else None
-    return None
+        ends = np.stack([centre - axis * size[0] / 2, centre + axis * size[0] / 2])
+        return [Solid(ends, size[1], axis if kind == bullet.GEOM_CYLINDER else None)]
+    return []
+
+
+def _as_bullet_has_it(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> Solid:
+    """Bullet's own box around a link, some millimetres too large, for meshes it does not give away."""
+    low, high = bullet.getAABB(body, link, physicsClientId=client)
+    if link < 0:
+        placed = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
+    else:
+        placed = bullet.getLinkState(body, link, physicsClientId=client)
+    corners = (np.array(low) + np.array(high)) / 2 + _CORNERS * (np.array(high) - np.array(low)) / 2
+    in_inertial = (corners - np.array(placed[0])) @ rotation_matrix(placed[1])
+    return Solid(in_inertial @ rotation_matrix(inertial[1]).T + np.array(inertial[0]))
 
 
 def box_around(placed: Iterable[tuple[Frame, Iterable[Solid]]]) -> BoundingBox | None:

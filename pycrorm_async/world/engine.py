@@ -12,6 +12,7 @@ import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib.util import find_spec
 from threading import Lock
 from typing import Any
 
@@ -23,6 +24,11 @@ _ONE_AT_A_TIME = Lock()  # a process has one C stdout
 @cache
 def engine() -> Any:
     """The module `pybullet`, imported at the first call."""
+    found = find_spec("pybullet")
+    if found is not None and found.origin is not None:
+        # Loaded before it is imported: the C++ runtime that comes with it keeps the streams it finds when it starts,
+        # and would keep, and at exit flush, the memory that is gone by then.
+        ctypes.CDLL(found.origin)
     with captured():
         import pybullet
     return pybullet
