@@ -1,0 +1,136 @@
+"""What every mapped class is built on, and the smallest of them: episodes and poses.
+
+All classes are for asking: they stand on views, which the projections keep, and nothing is ever inserted through them.
+Relationships are loaded with the object that has them, so that reading an attribute never waits for the database.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, ClassVar
+
+from sqlalchemy import BigInteger, Boolean, Double, ForeignKey, Text, inspect
+from sqlalchemy.ext.asyncio import AsyncAttrs
+from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship
+
+from pycrorm_async.orm.types import Moment, Named
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
+
+__all__ = ["Base", "ProcessMetaData", "Position", "Quaternion", "Pose", "RobotState"]
+
+
+class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
+    """The root of the mapped classes. Its repr shows what is loaded and never waits for more."""
+
+    type_annotation_map: ClassVar[dict[Any, Any]] = {
+        int: BigInteger(),
+        float: Double(),
+        str: Text(),
+        bool: Boolean(),
+        datetime: Moment(),
+        Arms: Named(Arms),
+        Grasp: Named(Grasp),
+        GripperState: Named(GripperState),
+        ObjectType: Named(ObjectType),
+        TaskStatus: Named(TaskStatus),
+    }
+
+    def __repr__(self) -> str:
+        state = inspect(self)
+        names = [
+            *(each.key for each in state.mapper.column_attrs if not each.key.startswith("_")),
+            *(["robot_state"] if "robot_state" in state.mapper.relationships else []),
+        ]
+        shown = ", ".join(f"{name}={state.dict[name]!r}" for name in names if state.dict.get(name) is not None)
+        return f"{type(self).__name__}({shown})"
+
+
+class ProcessMetaData(Base):
+    """An episode: who ran what, why, with what, and how it ended. `id` is the episode's number in this database.
+
+    `status` is RUNNING, SUCCEEDED, FAILED, ERROR, INTERRUPTED or LOST.
+    """
+
+    __tablename__ = "process_metadata"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    uuid: Mapped[str]
+    created_at: Mapped[datetime]
+    created_by: Mapped[str]
+    description: Mapped[str]
+    version: Mapped[str]
+    """Of the software that recorded it."""
+    host: Mapped[str]
+    python: Mapped[str]
+    plan: Mapped[str | None]
+    world: Mapped[str | None]
+    seed: Mapped[int | None]
+    status: Mapped[str]
+    ended_at: Mapped[datetime | None]
+    failure_type: Mapped[str | None]
+    failure_message: Mapped[str | None]
+
+
+class Position(Base):
+    """Metres. One for each pose, with the same id."""
+
+    __tablename__ = "position"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    x: Mapped[float]
+    y: Mapped[float]
+    z: Mapped[float]
+
+
+class Quaternion(Base):
+    """A rotation of length one. One for each pose, with the same id."""
+
+    __tablename__ = "quaternion"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    x: Mapped[float]
+    y: Mapped[float]
+    z: Mapped[float]
+    w: Mapped[float]
+
+
+class Pose(Base):
+    """Where something was and how it was turned. The numbers are here too, so that a query needs no join for them."""
+
+    __tablename__ = "pose"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    time: Mapped[datetime]
+    frame: Mapped[str]
+    position_id: Mapped[int] = mapped_column(ForeignKey("position.id"))
+    orientation_id: Mapped[int] = mapped_column(ForeignKey("quaternion.id"))
+    x: Mapped[float]
+    y: Mapped[float]
+    z: Mapped[float]
+    qx: Mapped[float]
+    qy: Mapped[float]
+    qz: Mapped[float]
+    qw: Mapped[float]
+
+    position: Mapped[Position] = relationship(viewonly=True, lazy="joined", innerjoin=True)
+    orientation: Mapped[Quaternion] = relationship(viewonly=True, lazy="joined", innerjoin=True)
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+
+class RobotState(Base):
+    """The robot when a node started: base pose and torso position (m). None of it exists without a robot."""
+
+    __tablename__ = "robot_state"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    torso_height: Mapped[float | None]
+    type: Mapped[ObjectType]
+    pose_id: Mapped[int] = mapped_column(ForeignKey("pose.id"))
+
+    pose: Mapped[Pose] = relationship(viewonly=True, lazy="joined", innerjoin=True)
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

@@ -1,0 +1,132 @@
+"""What was performed: designators, which are actions, motions or expressions of the plan language.
+
+`select(Action)` gives every action, each as the nearest class this process has: the built-in ones, those declared with
+`class ORMSaying(Action)`, those a memory makes for types that have none; without any of these it is an `Action`, whose
+fields are in `parameters` (`await action.awaitable_attrs.parameters`).
+
+Descend from `Action` or `Motion` to map a designator of your own; its table is named like the class:
+
+>>> class ORMSaying(Action):
+...     id: Mapped[int] = mapped_column(ForeignKey(f"{Action.__tablename__}.id"), primary_key=True)
+...     text: Mapped[str]
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import ForeignKey
+from sqlalchemy.orm import Mapped, declared_attr, mapped_column, relationship
+
+from pycrorm_async.orm.base import Base, ProcessMetaData, RobotState
+from pycrorm_async.orm.objects import Object
+from pycrorm_async.orm.types import ClassOfRow, JsonText
+
+__all__ = ["ParameterItem", "Designator", "Action", "Motion"]
+
+
+class ParameterItem(Base):
+    """One entry of a list or dict field. Its value is in the column of its type; a pose lies in x to frame.
+
+    Attributes:
+        field: the field's name.
+        position: 0, 1, 2 … in the order of the list or dict.
+        key: of a dict; None in a list.
+        object_id: the object as it was; for one the world does not hold, its name and type are here instead.
+    """
+
+    __tablename__ = "parameter_item"
+
+    node_id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
+    field: Mapped[str] = mapped_column(primary_key=True)
+    position: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    key: Mapped[str | None]
+    integer: Mapped[int | None]
+    real: Mapped[float | None]
+    text: Mapped[str | None]
+    boolean: Mapped[bool | None]
+    time: Mapped[datetime | None]
+    x: Mapped[float | None]
+    y: Mapped[float | None]
+    z: Mapped[float | None]
+    qx: Mapped[float | None]
+    qy: Mapped[float | None]
+    qz: Mapped[float | None]
+    qw: Mapped[float | None]
+    frame: Mapped[str | None]
+    object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    object_name: Mapped[str | None]
+    obj_type: Mapped[str | None]
+
+    object: Mapped[Object | None] = relationship(viewonly=True, lazy="selectin")
+
+    @property
+    def value(self) -> Any:
+        """A scalar, or the item itself where it is a pose or an object."""
+        if self.x is not None or self.object_id is not None or self.object_name is not None:
+            return self
+        values = (self.integer, self.real, self.text, self.boolean, self.time)
+        return next((value for value in values if value is not None), None)
+
+
+class Designator(Base):
+    """Something that was performed; its id is that of its task tree node.
+
+    Attributes:
+        dtype: the type's name, `PickUpAction`, also where there is no class for it.
+        kind: action, motion or language.
+        robot_state: of the moment it started; None without a robot.
+        items: the entries of its list and dict fields.
+        parameters: its fields as they were recorded. Not loaded unless asked for: `undefer(Action.parameters)`, or
+            `await action.awaitable_attrs.parameters`.
+    """
+
+    @declared_attr.directive
+    def __tablename__(cls) -> str:  # noqa: N805  SQLAlchemy calls it with the class
+        return "designator" if cls.__name__ == "Designator" else cls.__name__
+
+    @declared_attr.directive
+    def __mapper_args__(cls) -> dict[str, Any]:  # noqa: N805
+        # "selectin" at every level: a query for a base loads what the leaves add without a join for each of them.
+        arguments = {"polymorphic_identity": cls.__name__, "polymorphic_load": "selectin"}
+        return {"polymorphic_on": "_lineage", **arguments} if cls.__name__ == "Designator" else arguments
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    dtype: Mapped[str]
+    kind: Mapped[str]
+    robot_state_id: Mapped[int | None] = mapped_column(ForeignKey("robot_state.id"))
+    parameters: Mapped[dict[str, Any]] = mapped_column(JsonText(), deferred=True)
+    _lineage: Mapped[str] = mapped_column("lineage", ClassOfRow())
+
+    robot_state: Mapped[RobotState | None] = relationship(viewonly=True, lazy="selectin")
+    items: Mapped[list[ParameterItem]] = relationship(
+        viewonly=True, lazy="selectin", order_by=(ParameterItem.field, ParameterItem.position)
+    )
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+    def entries(self, field: str) -> list[Any]:
+        """The values of a list field, in order."""
+        return [item.value for item in self.items if item.field == field]
+
+    def mapping(self, field: str) -> dict[str, Any]:
+        """The values of a dict field by key."""
+        return {item.key: item.value for item in self.items if item.field == field and item.key is not None}
+
+
+class Action(Designator):
+    """An action: something a plan wanted done."""
+
+    __tablename__ = "action"
+
+    id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
+
+
+class Motion(Designator):
+    """A motion: something a robot's controllers did at once."""
+
+    __tablename__ = "motion"
+
+    id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)

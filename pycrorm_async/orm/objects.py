@@ -1,0 +1,118 @@
+"""Objects as they were, and what happened to them.
+
+A row of `object` is an object at a moment: one when it was added and one each time it moved. What an action names is
+the row in force when it started, so `PickUpAction.object.pose` is the pose at execution, wherever the object is now.
+All rows of one object share `identity_id`.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import ForeignKey
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData
+from pycrorm_async.orm.types import JsonText
+from pycrorm_async.world.enums import ObjectType
+
+__all__ = ["Object", "ObjectPart", "BelieveObject", "ObjectRemoval", "Attachment", "JointChange"]
+
+
+class Object(Base):
+    """An object of the world at a moment.
+
+    Attributes:
+        identity_id: the row that was written when it was added; None for what the world does not hold.
+        joints: positions (rad or m) when it was added; None in later rows.
+        node_id: the node that moved it; None if no node did.
+    """
+
+    __tablename__ = "object"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    dtype: Mapped[str]
+    name: Mapped[str]
+    obj_type: Mapped[ObjectType | None]
+    pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
+    identity_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    time: Mapped[datetime]
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    joints: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
+
+    pose: Mapped[Pose | None] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+    __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
+
+
+class ObjectPart(Object):
+    """A link of an object that an action was about; `part_of` is the object it belongs to."""
+
+    part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+
+    part_of: Mapped[Object | None] = relationship(
+        foreign_keys=part_of_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=1
+    )
+
+    __mapper_args__ = {"polymorphic_identity": "ObjectPart", "polymorphic_load": "inline"}  # noqa: RUF012
+
+
+class BelieveObject(Object):
+    """An object that was believed to be somewhere and that nobody had seen."""
+
+    __mapper_args__ = {"polymorphic_identity": "BelieveObject", "polymorphic_load": "inline"}  # noqa: RUF012
+
+
+class ObjectRemoval(Base):
+    """An object left the world."""
+
+    __tablename__ = "object_removal"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    identity_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    time: Mapped[datetime]
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+
+    object: Mapped[Object] = relationship(foreign_keys=object_id, viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+
+class Attachment(Base):
+    """From `time` on `child` moves with `link` of `parent` (`kind` attached), or no longer does (detached)."""
+
+    __tablename__ = "attachment"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    kind: Mapped[str]
+    parent_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    child_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    link: Mapped[str | None]
+    time: Mapped[datetime]
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+
+    parent: Mapped[Object] = relationship(foreign_keys=parent_id, viewonly=True, lazy="selectin")
+    child: Mapped[Object] = relationship(foreign_keys=child_id, viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+
+class JointChange(Base):
+    """A joint of an object has a new position (rad or m). Rows of one motion share their `id`."""
+
+    __tablename__ = "joint_change"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    joint: Mapped[str] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    position: Mapped[float]
+    time: Mapped[datetime]
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+
+    object: Mapped[Object] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

@@ -1,0 +1,119 @@
+"""The task tree: a node for every perform, and what location designators offered to it."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import ForeignKey
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData
+from pycrorm_async.orm.designators import Designator
+from pycrorm_async.orm.types import JsonText
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.world.enums import Arms
+
+__all__ = ["TaskTreeNode", "LocationResolution", "LocationCandidate"]
+
+
+class TaskTreeNode(Base):
+    """One perform, from its start to its end.
+
+    Attributes:
+        action: what was performed, an `Action`, a `Motion` or another `Designator`; None at the root of an episode.
+        parent: the node it ran inside, loaded one level up; further ones by `await node.awaitable_attrs.parent`.
+        end_time: None while it runs, and for ever if it was LOST.
+        start_ns, end_ns: monotonic time, for exact durations.
+        reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
+        result: what perform returned, as JSON.
+        simulated: it was thought through in a copy of the world.
+    """
+
+    __tablename__ = "task_tree_node"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    parent_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    action_id: Mapped[int | None] = mapped_column(ForeignKey("designator.id"))
+    kind: Mapped[str]
+    dtype: Mapped[str | None]
+    status: Mapped[TaskStatus]
+    start_time: Mapped[datetime]
+    end_time: Mapped[datetime | None]
+    start_ns: Mapped[int]
+    end_ns: Mapped[int | None]
+    reason: Mapped[str | None]
+    failure_message: Mapped[str | None]
+    failure_arguments: Mapped[list[Any] | None] = mapped_column(JsonText())
+    result: Mapped[Any | None] = mapped_column(JsonText())
+    robot_pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
+    torso_height: Mapped[float | None]
+    robot_object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    simulated: Mapped[bool]
+
+    action: Mapped[Designator | None] = relationship(viewonly=True, lazy="selectin")
+    parent: Mapped[TaskTreeNode | None] = relationship(
+        remote_side="TaskTreeNode.id", viewonly=True, lazy="selectin", join_depth=1
+    )
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+    @property
+    def duration_s(self) -> float | None:
+        """Seconds it ran; None while it runs, and if it was LOST."""
+        return None if self.end_ns is None else (self.end_ns - self.start_ns) / 1e9
+
+
+class LocationCandidate(Base):
+    """A place that a location designator offered; `position` is its rank, 0 first."""
+
+    __tablename__ = "location_candidate"
+
+    resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
+    position: Mapped[int] = mapped_column(primary_key=True)
+    x: Mapped[float]
+    y: Mapped[float]
+    z: Mapped[float]
+    qx: Mapped[float]
+    qy: Mapped[float]
+    qz: Mapped[float]
+    qw: Mapped[float]
+    frame: Mapped[str]
+    arms: Mapped[str]
+    """Names of the arms that reach from there, with a comma between them."""
+    taken: Mapped[bool]
+
+    @property
+    def reachable_arms(self) -> list[Arms]:
+        """The arms that reach from there."""
+        return [Arms[name] for name in self.arms.split(",") if name]
+
+
+class LocationResolution(Base):
+    """A location designator was asked for a place.
+
+    Attributes:
+        location: its class.
+        considered, offered: how many places it looked at, how many it found good.
+        taken: the rank of the one the plan went on with, and `pose` that place; None if there was none.
+        node: the node that asked.
+    """
+
+    __tablename__ = "location_resolution"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    location: Mapped[str]
+    considered: Mapped[int]
+    offered: Mapped[int]
+    taken: Mapped[int | None]
+    pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
+    time: Mapped[datetime]
+
+    node: Mapped[TaskTreeNode | None] = relationship(viewonly=True, lazy="selectin")
+    pose: Mapped[Pose | None] = relationship(viewonly=True, lazy="selectin")
+    candidates: Mapped[list[LocationCandidate]] = relationship(
+        viewonly=True, lazy="selectin", order_by=LocationCandidate.position
+    )
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

@@ -1,0 +1,43 @@
+"""Views that join what learning asks for; users register more of them, see `pycrorm_async.projections.views`."""
+
+from __future__ import annotations
+
+from sqlalchemy import ForeignKey
+from sqlalchemy.orm import Mapped, mapped_column
+
+from pycrorm_async.orm.base import Base
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+
+__all__ = ["PickUpWithContextView"]
+
+
+class PickUpWithContextView(Base):
+    """Every pick-up with what was around it: the sample the thesis learns from (section 5.2).
+
+    Attributes:
+        torso_height: of the robot, m.
+        relative_x, relative_y: robot minus object, m, along the axes of the map.
+        quaternion_x, quaternion_y, quaternion_z, quaternion_w: of the robot's base.
+        obj_type: of the object, as it was when the action started.
+        status: of the action's node.
+        process_metadata_id: the episode.
+        node_id: the node; the same number as `id`.
+    """
+
+    __tablename__ = "PickUpWithContextView"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    arm: Mapped[Arms]
+    grasp: Mapped[Grasp]
+    torso_height: Mapped[float | None]
+    relative_x: Mapped[float]
+    relative_y: Mapped[float]
+    quaternion_x: Mapped[float]
+    quaternion_y: Mapped[float]
+    quaternion_z: Mapped[float]
+    quaternion_w: Mapped[float]
+    obj_type: Mapped[ObjectType | None]
+    status: Mapped[TaskStatus]
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    node_id: Mapped[int] = mapped_column(ForeignKey("task_tree_node.id"))

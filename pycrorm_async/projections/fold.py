@@ -1,0 +1,252 @@
+"""The fold: one event in, rows out. Pure: no clock, no lookup, no state but the rows of the batch.
+
+The same events give the same rows, live or rebuilt, in one batch or one by one. An event whose rows cannot be made
+raises `CannotFold` before it has left any, so that its episode can be parked there and the others go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from pycrorm_async.events.codec import decode
+from pycrorm_async.events.happenings import (
+    EVENT_TYPES,
+    EpisodeEnded,
+    EpisodeStarted,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectMoved,
+    ObjectRemoved,
+    RobotValue,
+)
+from pycrorm_async.events.ids import SLOT_ROBOT_POSE
+from pycrorm_async.projections.parameters import Designators, Parameters
+from pycrorm_async.projections.rows import EpisodeEnd, NodeEnd, Row, Rows
+from pycrorm_async.projections.values import CannotFold, json_text, microseconds, pose_columns, row
+from pycrorm_async.store.rows import StoredEvent
+
+__all__ = ["fold", "CannotFold"]
+
+
+def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
+    """Adds what this event means to `rows`. Raises `CannotFold`, and then has added nothing."""
+    shape = EVENT_TYPES.get(event.type)
+    if shape is None or event.type not in _FOLDS:
+        raise CannotFold(f"{event.type} is not an event this version knows")
+    if event.version != shape.version:
+        raise CannotFold(f"{event.type} has version {event.version}, this version knows {shape.version}")
+    try:
+        happening = decode(event.type, event.payload)
+    except msgspec.DecodeError as error:
+        raise CannotFold(f"{event.type} cannot be decoded: {error}") from None
+    _FOLDS[event.type](event, happening, designators, rows)
+
+
+# --- episodes -------------------------------------------------------------------------------------------------
+
+
+def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: Designators, rows: Rows) -> None:
+    rows.episodes[event.number] = [
+        event.number,
+        microseconds(event.wall_ns),
+        started.created_by,
+        started.description,
+        started.software,
+        started.host,
+        started.python,
+        started.plan,
+        started.world,
+        started.seed,
+        "RUNNING",
+        None,
+        None,
+        None,
+    ]
+
+
+def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Designators, rows: Rows) -> None:
+    failure = ended.failure
+    rows.end_episode(
+        EpisodeEnd(
+            event.number,
+            ended.status,
+            microseconds(event.wall_ns),
+            failure.type if failure else None,
+            failure.message if failure else None,
+        )
+    )
+
+
+# --- nodes ----------------------------------------------------------------------------------------------------
+
+
+def _node_started(event: StoredEvent, started: NodeStarted, designators: Designators, rows: Rows) -> None:
+    number = event.number
+    node = row(number, event.sequence)
+    designator = designators.of(started)
+    parameters = designator.parameters(event, started.parameters) if designator else Parameters()
+    parent = row(number, started.parent) if started.parent is not None else None
+    robot = _robot_columns(event, started.robot)
+    # Nothing raises from here on.
+    if started.robot is not None:
+        rows.inserts["pose"].append(_pose_row(event, SLOT_ROBOT_POSE, started.robot.pose))
+    if designator is not None:
+        rows.leaves.setdefault((designator.table, designator.columns), []).append((node, *parameters.columns))
+        for table, made in parameters.rows.items():
+            rows.inserts[table].extend(made)
+    rows.nodes[node] = [
+        node,
+        number,
+        parent,
+        started.kind,
+        designator.dtype if designator else None,
+        "RUNNING",
+        microseconds(event.wall_ns),
+        None,
+        event.monotonic_ns,
+        None,
+        None,
+        None,
+        None,
+        None,
+        *robot,
+        started.simulated,
+    ]
+
+
+def _robot_columns(
+    event: StoredEvent, robot: RobotValue | None
+) -> tuple[int | None, float | None, str | None, int | None]:
+    if robot is None:
+        return None, None, None, None
+    pose = row(event.number, event.sequence, SLOT_ROBOT_POSE)
+    robot_object = row(event.number, robot.object.row) if robot.object is not None else None
+    return pose, robot.torso_height, robot.object_type, robot_object
+
+
+def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:
+    failure = ended.failure
+    lost = ended.status == "LOST"  # nobody saw when it ended
+    rows.end_node(
+        NodeEnd(
+            row(event.number, ended.node),
+            ended.status,
+            None if lost else microseconds(event.wall_ns),
+            None if lost else event.monotonic_ns,
+            failure.type.rpartition(".")[2] if failure else None,
+            failure.message if failure else None,
+            json_text(failure.arguments) if failure and failure.arguments else None,
+            json_text(ended.result) if ended.result is not None else None,
+        )
+    )
+
+
+# --- the world ------------------------------------------------------------------------------------------------
+
+
+def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designators, rows: Rows) -> None:
+    identity = row(event.number, event.sequence)
+    joints = json_text(added.joints) if added.joints else None
+    rows.inserts["pose"].append(_pose_row(event, 0, added.pose))
+    rows.inserts["object"].append(_object_row(event, added, identity, None, joints))
+
+
+def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designators, rows: Rows) -> None:
+    identity, node = row(event.number, moved.object), _node(event, moved.node)
+    pose = _pose_row(event, 0, moved.pose)
+    rows.inserts["pose"].append(pose)
+    rows.inserts["object"].append(_object_row(event, moved, identity, node, None))
+
+
+def _object_row(
+    event: StoredEvent, value: ObjectAdded | ObjectMoved, identity: int, node: int | None, joints: str | None
+) -> Row:
+    own = row(event.number, event.sequence)
+    time = microseconds(event.wall_ns)
+    return own, event.number, "Object", value.name, value.object_type, own, None, identity, time, node, joints
+
+
+def _object_removed(event: StoredEvent, removed: ObjectRemoved, _designators: Designators, rows: Rows) -> None:
+    reference = removed.object
+    seen, identity = row(event.number, reference.row), row(event.number, reference.object)
+    rows.inserts["object_removal"].append(
+        (*_own(event), seen, identity, microseconds(event.wall_ns), _node(event, removed.node))
+    )
+
+
+def _attachment(
+    event: StoredEvent, change: ObjectAttached | ObjectDetached, _designators: Designators, rows: Rows
+) -> None:
+    kind = "attached" if isinstance(change, ObjectAttached) else "detached"
+    parent, child = row(event.number, change.parent.row), row(event.number, change.child.row)
+    rows.inserts["attachment"].append(
+        (*_own(event), kind, parent, child, change.link, microseconds(event.wall_ns), _node(event, change.node))
+    )
+
+
+def _joints_moved(event: StoredEvent, moved: JointsMoved, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    seen, node, time = row(number, moved.object.row), _node(event, moved.node), microseconds(event.wall_ns)
+    rows.inserts["joint_change"].extend(
+        (own, joint, number, seen, position, time, node) for joint, position in moved.joints.items()
+    )
+
+
+# --- locations ------------------------------------------------------------------------------------------------
+
+
+def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    offered, taken = resolved.offered, resolved.taken
+    if taken is not None and not 0 <= taken < len(offered):
+        raise CannotFold(f"candidate {taken} was taken of {len(offered)}")
+    node, time = _node(event, resolved.node), microseconds(event.wall_ns)
+    pose_id = own if taken is not None else None
+    if taken is not None:
+        rows.inserts["pose"].append(_pose_row(event, 0, offered[taken].pose))
+    rows.inserts["location_resolution"].append(
+        (own, number, node, resolved.location, resolved.considered, len(offered), taken, pose_id, time)
+    )
+    rows.inserts["location_candidate"].extend(
+        (own, rank, number, *pose_columns(each.pose), ",".join(each.arms), rank == taken)
+        for rank, each in enumerate(offered)
+    )
+
+
+# --- parts ----------------------------------------------------------------------------------------------------
+
+
+def _own(event: StoredEvent) -> tuple[int, int]:
+    return row(event.number, event.sequence), event.number
+
+
+def _node(event: StoredEvent, sequence: int | None) -> int | None:
+    return row(event.number, sequence) if sequence is not None else None
+
+
+def _pose_row(event: StoredEvent, slot: int, pose: Any) -> Row:
+    own = row(event.number, event.sequence, slot)
+    return own, event.number, *pose_columns(pose), microseconds(pose.time_ns)
+
+
+_FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {
+    "EpisodeStarted": _episode_started,
+    "EpisodeEnded": _episode_ended,
+    "NodeStarted": _node_started,
+    "NodeEnded": _node_ended,
+    "ObjectAdded": _object_added,
+    "ObjectMoved": _object_moved,
+    "ObjectRemoved": _object_removed,
+    "ObjectAttached": _attachment,
+    "ObjectDetached": _attachment,
+    "JointsMoved": _joints_moved,
+    "LocationResolved": _location_resolved,
+}

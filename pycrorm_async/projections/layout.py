@@ -1,0 +1,135 @@
+"""What designator types add to the tables: a leaf table each, which views show it, which class its rows become.
+
+A layout only grows. Declarations unite in the order they came: a new field is a new column; a column that would need two
+types is refused with both named, and so is the declaration that brought it. A type's view shows the rows of all tables
+of that type and of the types that descend from it, so `pick_up_action` has every careful pick-up too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple, Self
+
+import msgspec
+
+from pycrorm_async.events.fields import table_name
+from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldType
+from pycrorm_async.projections.tables import CORE, Storage
+
+__all__ = ["Layout", "DesignatorType", "Leaf", "Contradictory", "STORED_AS", "TAKEN_NAMES"]
+
+STORED_AS: dict[FieldType, Storage] = {
+    "integer": "integer",
+    "real": "real",
+    "text": "text",
+    "boolean": "boolean",
+    "datetime": "time",
+    "enum": "text",
+    "pose": "pose",
+    "object": "object",
+}
+"""A field's column; lists and dicts have none."""
+
+_BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Designator"}
+
+TAKEN_NAMES = frozenset(CORE) | {"designator", "action", "motion", "robot_state", "position", "quaternion"}
+"""Tables and views that are no designator's."""
+
+
+class Contradictory(ValueError):
+    """A declaration that cannot share the tables with what is there."""
+
+
+class Leaf(NamedTuple):
+    """A leaf table as one class or declaration has it."""
+
+    table: str
+    columns: dict[str, Storage]
+    dtype: str | None = None
+    kind: str | None = None
+
+
+class DesignatorType(msgspec.Struct, frozen=True):
+    """What is known of a dtype: its kind, its tables (the first one first), the recorded types it descends from."""
+
+    kind: str
+    tables: tuple[str, ...]
+    bases: tuple[str, ...] = ()
+
+
+class Layout(msgspec.Struct, frozen=True):
+    """Leaf tables by name, designator types by dtype, and users' views (name to SQL) of one memory."""
+
+    leaves: dict[str, dict[str, Storage]] = {}
+    types: dict[str, DesignatorType] = {}
+    user_views: dict[str, str] = {}
+
+    def with_leaves(self, leaves: Iterable[Leaf]) -> Self:
+        """With the tables of these mapped classes; what is declared already wins."""
+        tables, types = dict(self.leaves), dict(self.types)
+        for leaf in leaves:
+            tables[leaf.table] = leaf.columns | tables.get(leaf.table, {})
+            if leaf.dtype is not None and leaf.kind is not None and leaf.dtype not in types:
+                types[leaf.dtype] = DesignatorType(leaf.kind, (leaf.table,))
+        return msgspec.structs.replace(self, leaves=tables, types=types)
+
+    def with_views(self, views: Mapping[str, str]) -> Self:
+        """With these users' views, in place of those of the same names."""
+        return msgspec.structs.replace(self, user_views=self.user_views | dict(views))
+
+    def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
+        """With the table of this type. Raises `Contradictory` and says why."""
+        columns = {each.column: STORED_AS[each.type] for each in declared.fields if each.type in STORED_AS}
+        known = self.types.get(declared.dtype) or DesignatorType(declared.kind, ())
+        if declared.kind != known.kind:
+            raise Contradictory(f"{declared.dtype} is declared as {known.kind} and as {declared.kind}")
+        self._refuse_taken(declared)
+        for table in (declared.table, *known.tables):
+            _refuse_different(declared.dtype, self.leaves.get(table, {}), columns)
+        tables = tuple(dict.fromkeys((*known.tables, declared.table)))
+        return msgspec.structs.replace(
+            self,
+            leaves=self.leaves | {declared.table: self.leaves.get(declared.table, {}) | columns},
+            types=self.types | {declared.dtype: DesignatorType(declared.kind, tables, declared.bases or known.bases)},
+        )
+
+    def _refuse_taken(self, declared: DesignatorTypeDeclared) -> None:
+        # Databases take names that differ in case alone for the same.
+        lowered = declared.table.lower()
+        taken = TAKEN_NAMES | {name.lower() for name in self.user_views}
+        taken |= {name.lower() for name in self.leaves if name != declared.table}
+        if lowered in taken:
+            raise Contradictory(f"{declared.dtype} asks for the table {declared.table}, whose name is taken")
+
+    def members(self, table: str) -> tuple[str, ...]:
+        """The leaf tables whose rows the view of `table` shows: its own, then those of its types' and descendants'."""
+        own = {dtype for dtype, each in self.types.items() if table in each.tables}
+        shown = [
+            member
+            for dtype, each in self.types.items()
+            if dtype in own or own.intersection(each.bases)
+            for member in each.tables
+        ]
+        return tuple(dict.fromkeys((table, *shown)))
+
+    def lineage(self, dtype: str) -> str:
+        """The names a row of this type answers to, nearest first, the last one a class that always exists."""
+        known = self.types[dtype]
+        names = [dtype, *(table for table in reversed(known.tables) if table != table_name(dtype))]
+        for base in known.bases:
+            tables = self.types[base].tables if base in self.types else ()
+            names += [base, *(table for table in reversed(tables) if table != table_name(base))]
+        return " ".join([*names, _BASE_OF_KIND[known.kind]])
+
+
+def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mapping[str, Storage]) -> None:
+    lowered = {name.lower(): name for name in present}
+    for column, storage in columns.items():
+        known = lowered.get(column.lower(), column)
+        if known != column:
+            raise Contradictory(f"{dtype} is declared with the column {known} and with {column}: rename one")
+        if present.get(column, storage) != storage:
+            raise Contradictory(
+                f"{dtype}.{column} is declared as {present[column]} and as {storage}"
+                " (types that share a name must agree: rename one field or set another dtype)"
+            )

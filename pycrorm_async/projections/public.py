@@ -1,0 +1,141 @@
+"""The views in front of a generation's tables: what people and the mapped classes read under a table's own name.
+
+Most show their table as it is. `designator`, `action`, `motion` and `robot_state` are cut from `task_tree_node`,
+`position` and `quaternion` from `pose`; a leaf's view unites the tables of its descendants.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from sqlalchemy import ColumnElement, Select, Table, case, cast, column, func, null, select, table, union_all
+from sqlalchemy.sql.selectable import CompoundSelect
+
+from pycrorm_async.events.fields import table_name
+from pycrorm_async.events.ids import SEQUENCE_MAX
+from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.tables import CORE, column_type, make_table
+
+__all__ = ["public_views", "View"]
+
+View: TypeAlias = Select[Any] | CompoundSelect[Any]
+
+_event = table("event", column("episode"), column("sequence"), column("payload"))
+_episode = table("episode", column("number"), column("id"))
+
+
+def public_views(layout: Layout, generation: int) -> dict[str, View]:
+    """Name and meaning of every view in front of this generation; users' views not among them."""
+    core = {name: make_table(name, columns, generation) for name, columns in CORE.items()}
+    views: dict[str, View] = {name: select(each) for name, each in core.items()}
+    views |= {name: make(core, layout) for name, make in _CUT.items()}
+    views |= {name: _leaf(name, layout, generation) for name in layout.leaves}
+    return views
+
+
+def _process_metadata(core: dict[str, Table], _layout: Layout) -> View:
+    episodes = core["process_metadata"]
+    first, *others = episodes.c
+    return select(first, _episode.c.id.label("uuid"), *others).join_from(
+        episodes, _episode, _episode.c.number == episodes.c.id
+    )
+
+
+def _task_tree_node(core: dict[str, Table], _layout: Layout) -> View:
+    nodes = core["task_tree_node"]
+    action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
+    return select(*nodes.c, action_id.label("action_id"))
+
+
+def _designator(core: dict[str, Table], layout: Layout) -> View:
+    nodes = core["task_tree_node"]
+    started = (
+        select(func.json_extract(_event.c.payload, "$.parameters"))
+        .where(_event.c.episode == nodes.c.process_metadata_id)
+        .where(_event.c.sequence == nodes.c.id.bitwise_rshift(5).bitwise_and(SEQUENCE_MAX))
+        .scalar_subquery()
+    )
+    robot_state_id = case((nodes.c.robot_pose_id.is_not(None), nodes.c.id), else_=null())
+    return select(
+        nodes.c.id,
+        nodes.c.process_metadata_id,
+        nodes.c.dtype,
+        nodes.c.kind,
+        robot_state_id.label("robot_state_id"),
+        func.coalesce(started, "{}").label("parameters"),
+        _lineage(nodes, layout).label("lineage"),
+    ).where(nodes.c.dtype.is_not(None))
+
+
+def _lineage(nodes: Table, layout: Layout) -> ColumnElement[str]:
+    """Only types that descend from recorded ones, or have a table of another name, need an entry of their own."""
+    kind = case((nodes.c.kind == "action", " Action"), (nodes.c.kind == "motion", " Motion"), else_=" Designator")
+    ordinary: ColumnElement[str] = nodes.c.dtype.concat(kind)
+    special = {
+        dtype: layout.lineage(dtype)
+        for dtype, each in layout.types.items()
+        if each.bases or each.tables != (table_name(dtype),)
+    }
+    return case(special, value=nodes.c.dtype, else_=ordinary) if special else ordinary
+
+
+def _of_kind(kind: str) -> Callable[[dict[str, Table], Layout], View]:
+    def view(core: dict[str, Table], _layout: Layout) -> View:
+        nodes = core["task_tree_node"]
+        return select(nodes.c.id).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
+
+    return view
+
+
+def _robot_state(core: dict[str, Table], _layout: Layout) -> View:
+    nodes = core["task_tree_node"]
+    return select(
+        nodes.c.id,
+        nodes.c.process_metadata_id,
+        nodes.c.torso_height,
+        nodes.c.robot_type.label("type"),
+        nodes.c.robot_pose_id.label("pose_id"),
+    ).where(nodes.c.robot_pose_id.is_not(None))
+
+
+def _pose(core: dict[str, Table], _layout: Layout) -> View:
+    poses = core["pose"]
+    return select(*poses.c, poses.c.id.label("position_id"), poses.c.id.label("orientation_id"))
+
+
+def _position(core: dict[str, Table], _layout: Layout) -> View:
+    poses = core["pose"]
+    return select(poses.c.id, poses.c.process_metadata_id, poses.c.x, poses.c.y, poses.c.z)
+
+
+def _quaternion(core: dict[str, Table], _layout: Layout) -> View:
+    poses = core["pose"]
+    parts = (poses.c[f"q{axis}"].label(axis) for axis in "xyzw")
+    return select(poses.c.id, poses.c.process_metadata_id, *parts)
+
+
+_CUT: dict[str, Callable[[dict[str, Table], Layout], View]] = {
+    "process_metadata": _process_metadata,
+    "task_tree_node": _task_tree_node,
+    "designator": _designator,
+    "action": _of_kind("action"),
+    "motion": _of_kind("motion"),
+    "robot_state": _robot_state,
+    "pose": _pose,
+    "position": _position,
+    "quaternion": _quaternion,
+}
+
+
+def _leaf(name: str, layout: Layout, generation: int) -> View:
+    """The rows of a leaf table and of its members, with the columns of the leaf; what a member lacks is null."""
+    parts = []
+    for member in layout.members(name):
+        rows = make_table(member, {"id": "key", **layout.leaves[member]}, generation)
+        columns: list[ColumnElement[Any]] = [rows.c.id]
+        for each, storage in layout.leaves[name].items():
+            same = layout.leaves[member].get(each) == storage
+            columns.append(rows.c[each] if same else cast(null(), column_type(storage)).label(each))
+        parts.append(select(*columns))
+    return parts[0] if len(parts) == 1 else union_all(*parts)

@@ -1,0 +1,101 @@
+"""What a batch of events makes: rows to insert, and changes of rows that are in the tables already.
+
+A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`; of nodes
+and episodes they are lists until the batch is over.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, TypeAlias
+
+from pycrorm_async.projections.tables import COLUMNS
+
+__all__ = ["Rows", "Row", "NodeEnd", "EpisodeEnd"]
+
+Row: TypeAlias = tuple[Any, ...]
+
+_NODE = COLUMNS["task_tree_node"]
+_EPISODE = COLUMNS["process_metadata"]
+
+
+class NodeEnd(NamedTuple):
+    """What the end of a node changes in its row."""
+
+    id: int
+    status: str
+    end_time: int | None
+    end_ns: int | None
+    reason: str | None
+    failure_message: str | None
+    failure_arguments: str | None
+    result: str | None
+
+
+class EpisodeEnd(NamedTuple):
+    """What the end of an episode changes in its row."""
+
+    id: int
+    status: str
+    ended_at: int
+    failure_type: str | None
+    failure_message: str | None
+
+
+_NODE_END = tuple(_NODE.index(name) for name in NodeEnd._fields)
+_EPISODE_END = tuple(_EPISODE.index(name) for name in EpisodeEnd._fields)
+_NODE_NUMBER = _NODE.index("process_metadata_id")
+_NODE_STATUS = _NODE.index("status")
+
+
+class Rows:
+    """The rows of one batch.
+
+    Attributes:
+        nodes, episodes: to insert, by id.
+        inserts: to insert into the other core tables, by table.
+        leaves: to insert into leaf tables, by (table, columns).
+        node_ends, episode_ends: to update, of rows that came with an earlier batch.
+        lost: episodes whose nodes that are still running in the tables are lost.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: dict[int, list[Any]] = {}
+        self.episodes: dict[int, list[Any]] = {}
+        self.inserts: dict[str, list[Row]] = {table: [] for table in COLUMNS}
+        self.leaves: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
+        self.node_ends: list[NodeEnd] = []
+        self.episode_ends: list[EpisodeEnd] = []
+        self.lost: list[int] = []
+
+    def end_node(self, end: NodeEnd) -> None:
+        """The node's row has an end, here or in the tables."""
+        row = self.nodes.get(end.id)
+        if row is None:
+            self.node_ends.append(end)
+            return
+        for index, value in zip(_NODE_END, end, strict=True):
+            row[index] = value
+
+    def end_episode(self, end: EpisodeEnd) -> None:
+        """The episode's row has an end, here or in the tables."""
+        row = self.episodes.get(end.id)
+        if row is None:
+            self.episode_ends.append(end)
+        else:
+            for index, value in zip(_EPISODE_END, end, strict=True):
+                row[index] = value
+        if end.status == "LOST":
+            self._lose_nodes(end.id)
+
+    def _lose_nodes(self, number: int) -> None:
+        self.lost.append(number)
+        for row in self.nodes.values():
+            if row[_NODE_NUMBER] == number and row[_NODE_STATUS] == "RUNNING":
+                row[_NODE_STATUS] = "LOST"
+
+    def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
+        """All rows to insert, by (table, columns)."""
+        self.inserts["task_tree_node"] = [tuple(row) for row in self.nodes.values()]
+        self.inserts["process_metadata"] = [tuple(row) for row in self.episodes.values()]
+        core = {(table, COLUMNS[table]): rows for table, rows in self.inserts.items()}
+        return {key: rows for key, rows in (core | self.leaves).items() if rows}

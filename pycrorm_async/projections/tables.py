@@ -1,0 +1,213 @@
+"""The tables every memory has, column by column; what designator types add is in `layout`.
+
+Every row knows its episode (`process_metadata_id`). Row ids are made of (episode number, sequence, slot), see
+`pycrorm_async.events.ids`: a node, its designator and its leaf row have one id; an object's row and its pose too. No
+foreign key is enforced here, that would cost a third of the rate; `verify` is the integrity check.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, TypeAlias
+
+from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, Table, Text
+from sqlalchemy.types import TypeEngine
+
+__all__ = ["Storage", "CORE", "COLUMNS", "make_table", "physical_name", "column_type"]
+
+Storage: TypeAlias = Literal["key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json"]
+"""How a column is stored: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON."""
+
+_POSE: dict[str, Storage] = {
+    "x": "real",
+    "y": "real",
+    "z": "real",
+    "qx": "real",
+    "qy": "real",
+    "qz": "real",
+    "qw": "real",
+    "frame": "text",
+}
+
+CORE: dict[str, dict[str, Storage]] = {
+    "process_metadata": {
+        "id": "key",
+        "created_at": "time",
+        "created_by": "text",
+        "description": "text",
+        "version": "text",
+        "host": "text",
+        "python": "text",
+        "plan": "text",
+        "world": "text",
+        "seed": "integer",
+        "status": "text",
+        "ended_at": "time",
+        "failure_type": "text",
+        "failure_message": "text",
+    },
+    "task_tree_node": {
+        "id": "key",
+        "process_metadata_id": "row",
+        "parent_id": "row",
+        "kind": "text",
+        "dtype": "text",
+        "status": "text",
+        "start_time": "time",
+        "end_time": "time",
+        "start_ns": "integer",
+        "end_ns": "integer",
+        "reason": "text",
+        "failure_message": "text",
+        "failure_arguments": "json",
+        "result": "json",
+        "robot_pose_id": "pose",
+        "torso_height": "real",
+        "robot_type": "text",
+        "robot_object_id": "object",
+        "simulated": "boolean",
+    },
+    "pose": {"id": "key", "process_metadata_id": "row", **_POSE, "time": "time"},
+    "object": {
+        "id": "key",
+        "process_metadata_id": "row",
+        "dtype": "text",
+        "name": "text",
+        "obj_type": "text",
+        "pose_id": "pose",
+        "part_of_id": "object",
+        "identity_id": "object",
+        "time": "time",
+        "node_id": "row",
+        "joints": "json",
+    },
+    "object_removal": {
+        "id": "key",
+        "process_metadata_id": "row",
+        "object_id": "object",
+        "identity_id": "object",
+        "time": "time",
+        "node_id": "row",
+    },
+    "parameter_item": {
+        "node_id": "key",
+        "field": "key",
+        "position": "key",
+        "process_metadata_id": "row",
+        "key": "text",
+        "integer": "integer",
+        "real": "real",
+        "text": "text",
+        "boolean": "boolean",
+        "time": "time",
+        **_POSE,
+        "object_id": "object",
+        "object_name": "text",
+        "obj_type": "text",
+    },
+    "attachment": {
+        "id": "key",
+        "process_metadata_id": "row",
+        "kind": "text",
+        "parent_id": "object",
+        "child_id": "object",
+        "link": "text",
+        "time": "time",
+        "node_id": "row",
+    },
+    "joint_change": {
+        "id": "key",
+        "joint": "key",
+        "process_metadata_id": "row",
+        "object_id": "object",
+        "position": "real",
+        "time": "time",
+        "node_id": "row",
+    },
+    "location_resolution": {
+        "id": "key",
+        "process_metadata_id": "row",
+        "node_id": "row",
+        "location": "text",
+        "considered": "integer",
+        "offered": "integer",
+        "taken": "integer",
+        "pose_id": "pose",
+        "time": "time",
+    },
+    "location_candidate": {
+        "resolution_id": "key",
+        "position": "key",
+        "process_metadata_id": "row",
+        **_POSE,
+        "arms": "text",
+        "taken": "boolean",
+    },
+}
+"""Table by table, column by column, in the order a fold gives the values."""
+
+COLUMNS = {table: tuple(columns) for table, columns in CORE.items()}
+
+_TEXT_KEYS = {("parameter_item", "field"), ("joint_change", "joint")}
+
+_INDEXED = {
+    "task_tree_node": ("process_metadata_id", "parent_id", "status", "dtype"),
+    "pose": ("process_metadata_id",),
+    "object": ("process_metadata_id", "identity_id", "obj_type"),
+    "object_removal": ("process_metadata_id", "identity_id"),
+    "parameter_item": ("process_metadata_id",),
+    "attachment": ("process_metadata_id", "child_id"),
+    "joint_change": ("process_metadata_id", "object_id"),
+    "location_resolution": ("process_metadata_id", "node_id"),
+    "location_candidate": ("process_metadata_id",),
+}
+
+
+def physical_name(table: str, generation: int) -> str:
+    """Where the rows are: `pose__1`."""
+    return f"{table}__{generation}"
+
+
+def make_table(name: str, columns: dict[str, Storage], generation: int) -> Table:
+    """The table and its indexes, in one generation."""
+    table = Table(
+        physical_name(name, generation),
+        MetaData(),
+        *(
+            Column(
+                column,
+                Text() if (name, column) in _TEXT_KEYS else column_type(storage),
+                primary_key=storage == "key",
+                autoincrement=False,
+            )
+            for column, storage in columns.items()
+        ),
+    )
+    for column in indexed(name, columns):
+        Index(index_name(name, column, generation), table.c[column])
+    return table
+
+
+def indexed(name: str, columns: dict[str, Storage]) -> tuple[str, ...]:
+    """The columns that people filter and join by. Of a designator's own table: the objects it names."""
+    if name in CORE:
+        return _INDEXED.get(name, ())
+    return tuple(column for column, storage in columns.items() if storage == "object")
+
+
+def index_name(name: str, column: str, generation: int) -> str:
+    return f"{physical_name(name, generation)}_by_{column}"
+
+
+def column_type(storage: Storage) -> TypeEngine[Any]:
+    """The column type; on SQLite a key must be called INTEGER to be the row's own place in the table."""
+    match storage:
+        case "key":
+            return BigInteger().with_variant(Integer(), "sqlite")
+        case "row" | "pose" | "object" | "integer" | "time":
+            return BigInteger()
+        case "real":
+            return Double()
+        case "boolean":
+            return Boolean()
+        case "text" | "json":
+            return Text()

@@ -1,0 +1,90 @@
+"""Views that users register: a name and a `select`, made beside the tables and made again with them.
+
+>>> successes = UserView("successful_grasps", select(PickUpWithContextView.grasp, PickUpWithContextView.status))
+>>> select(successes.table).where(successes.table.c.grasp == Grasp.TOP)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from sqlalchemy import Dialect, Select, TableClause, column, select, table
+from sqlalchemy.orm import aliased
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm import Object, PickUpAction, Pose, TaskTreeNode
+from pycrorm_async.projections.layout import TAKEN_NAMES, Layout
+
+__all__ = ["UserView", "BUILT_IN_VIEWS", "view_texts", "view_text"]
+
+
+@dataclass(frozen=True)
+class UserView:
+    """A question with a name.
+
+    Attributes:
+        name: of the view in the database; not that of a table of the memory.
+        meaning: a select over the mapped classes, or over anything else in this database.
+    """
+
+    name: str
+    meaning: Select[Any]
+
+    @cached_property
+    def table(self) -> TableClause:
+        """What to select from; `table.c` has its columns with their types."""
+        return table(self.name, *(column(name, each.type) for name, each in self.meaning.subquery().c.items()))
+
+
+def view_text(meaning: Any, dialect: Dialect) -> str:
+    """The SQL of a select, its parameters written in."""
+    return str(meaning.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
+
+
+def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> dict[str, str]:
+    """Name and SQL of these views. Raises `CallerError` for a name that is taken."""
+    taken = {name.lower() for name in (*TAKEN_NAMES, *layout.leaves)}
+    texts: dict[str, str] = {}
+    for view in views:
+        lowered = view.name.lower()
+        if lowered in taken or lowered.startswith(("pycrorm_", "sqlite_")) or lowered in ("event", "episode"):
+            raise CallerError(f"a view cannot be called {view.name!r}: the name is taken (choose another)")
+        taken.add(lowered)
+        texts[view.name] = view_text(view.meaning, dialect)
+    return texts
+
+
+def _pick_up_with_context() -> Select[Any]:
+    # Joined at the ids themselves: a node, its designator and its leaf row have the same one.
+    picked = PickUpAction.__table__
+    node = TaskTreeNode.__table__
+    robot, there = aliased(Pose, name="robot"), aliased(Pose, name="there")
+    return (
+        select(
+            picked.c.id,
+            picked.c.arm,
+            picked.c.grasp,
+            node.c.torso_height,
+            (robot.x - there.x).label("relative_x"),
+            (robot.y - there.y).label("relative_y"),
+            robot.qx.label("quaternion_x"),
+            robot.qy.label("quaternion_y"),
+            robot.qz.label("quaternion_z"),
+            robot.qw.label("quaternion_w"),
+            Object.obj_type,
+            node.c.status,
+            node.c.process_metadata_id,
+            node.c.id.label("node_id"),
+        )
+        .select_from(picked)
+        .join(node, node.c.id == picked.c.id)
+        .join(robot, robot.id == node.c.robot_pose_id)
+        .join(Object, Object.id == picked.c.object_designator_id)
+        .join(there, there.id == Object.pose_id)
+    )
+
+
+BUILT_IN_VIEWS = (UserView("PickUpWithContextView", _pick_up_with_context()),)
