@@ -66,8 +66,7 @@ def pr2_mesh_urdf_path() -> Path:
         path = Path(str(distribution("example-robot-data").locate_file(_MESH_MODEL)))
     except PackageNotFoundError:
         raise MissingExtra(
-            "the PR2's mesh model is not installed: pip install 'pycrorm-async[pr2]'; "
-            "the built-in model needs nothing"
+            "the PR2's mesh model is not installed: pip install 'pycrorm-async[pr2]'; the built-in model needs nothing"
         ) from None
     if not path.is_file():
         raise MissingExtra(f"example-robot-data has no PR2 at {path}: pip install 'pycrorm-async[pr2]'")

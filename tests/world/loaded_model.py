@@ -1,0 +1,77 @@
+"""A model as Bullet itself sees it, without our world in between: the oracle for frames and forward kinematics."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Mapping
+from pathlib import Path
+
+import pybullet
+
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Pose, Quaternion, Vector, product
+from pycrorm_async.world.robot import PR2, Limits
+
+LINK_WORLD_POSITION, LINK_WORLD_ORIENTATION = 4, 5
+
+
+class LoadedModel:
+    """One URDF in a Bullet of its own, without a window."""
+
+    def __init__(self, urdf: Path) -> None:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        self._body = pybullet.loadURDF(str(urdf), useFixedBase=True, physicsClientId=self._client)
+        facts = [
+            pybullet.getJointInfo(self._body, index, physicsClientId=self._client)
+            for index in range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
+        ]
+        self.root: str = pybullet.getBodyInfo(self._body, physicsClientId=self._client)[0].decode()
+        self.links: dict[str, int] = {fact[12].decode(): fact[0] for fact in facts}
+        self._joints: dict[str, int] = {fact[1].decode(): fact[0] for fact in facts}
+        self.limits: dict[str, tuple[float, float]] = {
+            fact[1].decode(): (fact[8], fact[9]) for fact in facts if fact[2] != pybullet.JOINT_FIXED
+        }
+
+    def close(self) -> None:
+        pybullet.disconnect(physicsClientId=self._client)
+
+    def put(self, *, base: Pose, joints: Mapping[str, float]) -> None:
+        pybullet.resetBasePositionAndOrientation(
+            self._body, base.position, base.orientation, physicsClientId=self._client
+        )
+        for name, value in joints.items():
+            pybullet.resetJointState(self._body, self._joints[name], value, physicsClientId=self._client)
+
+    def link_pose(self, link: str) -> Pose:
+        state = pybullet.getLinkState(
+            self._body, self.links[link], computeForwardKinematics=True, physicsClientId=self._client
+        )
+        return Pose(state[LINK_WORLD_POSITION], state[LINK_WORLD_ORIENTATION])
+
+    def bounding_box(self, link: str) -> tuple[Vector, Vector]:
+        lower, upper = pybullet.getAABB(self._body, self.links[link], physicsClientId=self._client)
+        return Vector(*lower), Vector(*upper)
+
+
+def random_arm(rng: random.Random, arm: Arms, limits: Limits) -> dict[str, float]:
+    """Joint angles drawn evenly from inside the limits."""
+    bounds = PR2.arms[arm].limits(limits)
+    return {
+        name: rng.uniform(max(bounds[name].lower, -3.14), min(bounds[name].upper, 3.14))
+        if "forearm_roll" in name or "wrist_roll" in name
+        else rng.uniform(*bounds[name])
+        for name in PR2.arms[arm].joints
+    }
+
+
+def random_stand(rng: random.Random) -> tuple[Pose, float]:
+    """A base pose, not only upright, and a torso height."""
+    turn = [rng.gauss(0, 1) for _ in range(4)]
+    return Pose([rng.uniform(-3, 3) for _ in range(3)], turn), rng.uniform(0.0, 0.33)
+
+
+def angle_between(a: Quaternion, b: Quaternion) -> float:
+    """Rad; exact also for small angles."""
+    x, y, z, _ = product((-a.x, -a.y, -a.z, a.w), b)
+    return 2 * math.hypot(x, y, z)

@@ -1,0 +1,311 @@
+"""Inverse kinematics: exact where it answers, right where it refuses, the same every time."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import random
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import pycrorm_async
+from pycrorm_async.errors import CallerError, PycrormError
+from pycrorm_async.world import BulletWorld, Object, ObjectType
+from pycrorm_async.world.enums import Arms, Grasp
+from pycrorm_async.world.kinematics import Unreachable, forward, solve, solve_from
+from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated, yaw_quaternion
+from pycrorm_async.world.robot import GRASP_ORIENTATIONS, PR2, Limits
+from pycrorm_async.world.robot_urdf import pr2_urdf
+from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_stand
+
+ARMS = (Arms.LEFT, Arms.RIGHT)
+EXACT = 1e-6
+AHEAD = Pose([0.6, 0.2, 0.9])
+
+
+def reached(arm: Arms, joints: dict[str, float], *, base: Pose, torso_height: float) -> Pose:
+    return forward(PR2, arm, joints, torso_height=torso_height, base=base)
+
+
+def least_margin(arm: Arms, joints: dict[str, float], limits: Limits) -> float:
+    """Rad between the joint nearest to a limit and that limit; negative if one is outside."""
+    bounds = PR2.arms[arm].limits(limits)
+    return min(min(joints[name] - lower, upper - joints[name]) for name, (lower, upper) in bounds.items())
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Iterator[LoadedModel]:
+    path = tmp_path / "pr2.urdf"
+    path.write_text(pr2_urdf(), encoding="utf-8")
+    loaded = LoadedModel(path)
+    yield loaded
+    loaded.close()
+
+
+@pytest.mark.parametrize("limits", Limits)
+@pytest.mark.parametrize("arm", ARMS)
+def test_whatever_a_posture_within_limits_reaches_is_solved_exactly_within_limits(arm: Arms, limits: Limits) -> None:
+    rng = random.Random(31)
+    for _ in range(3000):
+        joints = random_arm(rng, arm, limits)
+        base, torso_height = random_stand(rng)
+        target = reached(arm, joints, base=base, torso_height=torso_height)
+        answer = solve_from(PR2, arm, target, base=base, torso_height=torso_height, limits=limits)
+        there = reached(arm, answer, base=base, torso_height=torso_height)
+        assert there.distance(target) < EXACT
+        assert angle_between(there.orientation, target.orientation) < EXACT
+        assert least_margin(arm, answer, limits) >= 0
+        assert tuple(answer) == PR2.arms[arm].joints
+
+
+@pytest.mark.parametrize("limits", Limits)
+@pytest.mark.parametrize("arm", ARMS)
+def test_answers_lead_there_in_bullet_too(model: LoadedModel, arm: Arms, limits: Limits) -> None:
+    rng = random.Random(32)
+    tool = PR2.arms[arm].tool_frame
+    for _ in range(300):
+        base, torso_height = random_stand(rng)
+        torso = {PR2.torso_joint: torso_height}
+        model.put(base=base, joints=random_arm(rng, arm, limits) | torso)
+        target = model.link_pose(tool)
+        answer = solve_from(PR2, arm, target, base=base, torso_height=torso_height, limits=limits)
+        model.put(base=base, joints=answer | torso)
+        assert model.link_pose(tool).distance(target) < EXACT
+        assert angle_between(model.link_pose(tool).orientation, target.orientation) < EXACT
+
+
+@pytest.mark.parametrize("limits", Limits)
+def test_the_answer_stays_as_far_from_the_limits_as_any_other_posture(limits: Limits) -> None:
+    rng = random.Random(33)
+    for _ in range(1000):
+        joints = random_arm(rng, Arms.LEFT, limits)
+        target = reached(Arms.LEFT, joints, base=Pose(), torso_height=0.1)
+        answer = solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.1, limits=limits)
+        one_step = 0.05
+        assert least_margin(Arms.LEFT, answer, limits) > least_margin(Arms.LEFT, joints, limits) - one_step
+
+
+def test_the_stretched_arm_is_within_hard_limits_and_out_of_soft_ones() -> None:
+    for arm in ARMS:
+        stretched = dict.fromkeys(PR2.arms[arm].joints, 0.0)
+        target = reached(arm, stretched, base=Pose(), torso_height=0.0)
+        answer = solve_from(PR2, arm, target, base=Pose(), torso_height=0.0, limits=Limits.HARD)
+        assert reached(arm, answer, base=Pose(), torso_height=0.0).distance(target) < EXACT
+        with pytest.raises(Unreachable, match=r"too far: from shoulder to wrist 0\.721 m"):
+            solve_from(PR2, arm, target, base=Pose(), torso_height=0.0)
+
+
+def test_the_arms_are_mirror_images() -> None:
+    rng = random.Random(34)
+    for _ in range(200):
+        joints = random_arm(rng, Arms.LEFT, Limits.SOFT)
+        target = reached(Arms.LEFT, joints, base=Pose(), torso_height=0.0)
+        (x, y, z), (qx, qy, qz, qw) = target.position, target.orientation
+        left = solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0)
+        mirrored = Pose([x, -y, z], [-qx, qy, -qz, qw])
+        right = solve_from(PR2, Arms.RIGHT, mirrored, base=Pose(), torso_height=0.0)
+        sides = (-1, 1, -1, 1, -1, 1, -1)
+        expected = [side * angle for side, angle in zip(sides, left.values(), strict=True)]
+        assert list(right.values()) == pytest.approx(expected, abs=1e-6)
+
+
+def test_what_matters_is_the_target_as_the_torso_sees_it() -> None:
+    rng = random.Random(35)
+    plain = solve_from(PR2, Arms.LEFT, AHEAD, base=Pose(), torso_height=0.0)
+    for _ in range(50):
+        base, torso_height = random_stand(rng)
+        lifted = base @ Pose([AHEAD.position.x, AHEAD.position.y, AHEAD.position.z + torso_height])
+        answer = solve_from(PR2, Arms.LEFT, lifted, base=base, torso_height=torso_height)
+        assert list(answer.values()) == pytest.approx(list(plain.values()), abs=1e-6)
+
+
+def test_a_torso_outside_its_soft_range_is_taken_as_it_is() -> None:
+    for torso_height in (0.0, 0.33):
+        answer = solve_from(PR2, Arms.LEFT, AHEAD, base=Pose(), torso_height=torso_height)
+        there = reached(Arms.LEFT, answer, base=Pose(), torso_height=torso_height)
+        assert there.distance(AHEAD) < EXACT
+
+
+def test_the_hand_is_turned_as_asked_or_the_target_refused() -> None:
+    turns = [yaw_quaternion(angle) for angle in (0.0, 0.4, -0.7)]
+    for turn in turns:
+        target = Pose(AHEAD.position, turn)
+        answer = solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0)
+        there = reached(Arms.LEFT, answer, base=Pose(), torso_height=0.0)
+        assert angle_between(there.orientation, turn) < EXACT
+    towards_the_robot = Pose([0.75, 0.2, 0.9], yaw_quaternion(math.pi))
+    with pytest.raises(Unreachable):
+        solve_from(PR2, Arms.LEFT, towards_the_robot, base=Pose(), torso_height=0.0)
+
+
+@pytest.mark.parametrize("limits", Limits)
+@pytest.mark.parametrize("arm", ARMS)
+def test_three_metres_away_is_refused_as_too_far(arm: Arms, limits: Limits) -> None:
+    target = Pose([3.0, 0.0, 0.9])
+    with pytest.raises(Unreachable, match="too far: from shoulder to wrist") as refused:
+        solve_from(PR2, arm, target, base=Pose(), torso_height=0.0, limits=limits)
+    assert (refused.value.target, refused.value.arm) == (target, arm)
+    assert str(refused.value) == f"the {arm.name} arm cannot reach {target!r}: {refused.value.reason}"
+
+
+@pytest.mark.parametrize("limits", Limits)
+@pytest.mark.parametrize("grasp", Grasp)
+def test_a_wrist_inside_its_own_shoulder_is_refused_as_too_near(grasp: Grasp, limits: Limits) -> None:
+    turn = GRASP_ORIENTATIONS[grasp]
+    hand = rotated(turn, (0.18, 0.0, 0.0))
+    target = Pose([-0.05 + hand.x, 0.188 + hand.y, 0.790675 + hand.z], turn)
+    with pytest.raises(Unreachable, match="too near: from shoulder to wrist"):
+        solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0, limits=limits)
+
+
+def test_a_refusal_says_which_limit_stands_against_it() -> None:
+    def reason(target: Pose) -> str:
+        with pytest.raises(Unreachable) as refused:
+            solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0)
+        return refused.value.reason
+
+    at_the_shoulder = Pose([-0.05 + 0.1 + 0.18, 0.188, 0.79])
+    assert reason(at_the_shoulder) == ("too near: from shoulder to wrist 0.200 m or less, where the arm needs 0.359 m")
+    behind = Pose([-0.05 + 0.97 * math.cos(-2), 0.188 + 0.97 * math.sin(-2), 0.79], yaw_quaternion(-2))
+    assert reason(behind).startswith("its wrist would come there only with l_shoulder_pan_joint outside its ")
+    from_above = Pose([0.6, 0.2, 0.9], GRASP_ORIENTATIONS[Grasp.TOP])
+    assert reason(from_above).startswith("the posture that comes nearest has l_")
+    assert "outside its soft limits" in reason(from_above)
+
+
+def test_unreachable_is_an_outcome_and_nobodys_fault() -> None:
+    assert not issubclass(Unreachable, PycrormError)
+
+
+@pytest.mark.parametrize(
+    ("arm", "target", "says"),
+    [
+        (Arms.BOTH, AHEAD, "one arm at a time"),
+        (Arms.LEFT, Pose(AHEAD.position, frame="kitchen"), "'kitchen'"),
+        (Arms.LEFT, Pose([math.nan, 0, 0]), "not finite"),
+        (Arms.LEFT, Pose([0, math.inf, 0]), "not finite"),
+    ],
+)
+def test_a_question_that_makes_no_sense_is_the_callers_error(arm: Arms, target: Pose, says: str) -> None:
+    with pytest.raises(CallerError, match=says):
+        solve_from(PR2, arm, target, base=Pose(), torso_height=0.0)
+
+
+FINGERPRINT = """
+import hashlib, random
+from pycrorm_async.world.kinematics import Unreachable, solve_from
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.robot import PR2
+rng, seen = random.Random(36), hashlib.sha256()
+for _ in range(400):
+    target = Pose([rng.uniform(0, 0.9), rng.uniform(-0.3, 0.8), rng.uniform(0.3, 1.2)],
+                  [rng.gauss(0, 1) for _ in range(4)])
+    try:
+        answer = solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.2)
+        seen.update(" ".join(map(float.hex, answer.values())).encode())
+    except Unreachable as refused:
+        seen.update(refused.reason.encode())
+"""
+
+
+def test_the_same_question_has_the_same_answer_to_the_bit_here_again_and_in_another_process() -> None:
+    def here() -> str:
+        names: dict[str, hashlib._Hash] = {}
+        exec(FINGERPRINT, names)
+        return names["seen"].hexdigest()
+
+    root = str(Path(pycrorm_async.__file__).parents[1])
+    script = f"import sys; sys.path.insert(0, {root!r})\n{FINGERPRINT}print(seen.hexdigest())"
+    elsewhere = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=True)
+    assert here() == here() == elsewhere.stdout.strip()
+
+
+# --- the robot of a world -------------------------------------------------------------------------------------------
+
+
+def test_a_robot_in_a_world_is_asked_where_it_stands_and_is_not_moved() -> None:
+    with BulletWorld():
+        robot = Object("pr2", ObjectType.ROBOT, pose=Pose([1.0, -0.5, 0.0], yaw_quaternion(0.7)))
+        robot.set_joint_position("torso_lift_joint", 0.25)
+        before = (robot.pose, robot.joint_positions())
+        target = robot.pose @ Pose([0.65, -0.3, 1.0])
+        answer = solve(robot, Arms.RIGHT, target)
+        assert (robot.pose, robot.joint_positions()) == before
+        assert answer == solve_from(PR2, Arms.RIGHT, target, base=robot.pose, torso_height=0.25)
+        robot.set_joint_positions(answer)
+        assert robot.link_pose("r_gripper_tool_frame").distance(target) < EXACT
+
+
+def test_hard_limits_are_those_of_the_loaded_model_where_it_stops_earlier() -> None:
+    target = Pose([0.55, 0.3, 0.75], GRASP_ORIENTATIONS[Grasp.TOP])
+    stiff = pr2_urdf().replace('lower="-2.18"', 'lower="-1.0"')
+    with BulletWorld():
+        robot = Object("pr2", ObjectType.ROBOT)
+        answer = solve(robot, Arms.LEFT, target, limits=Limits.HARD)
+        assert answer["l_wrist_flex_joint"] < -1.0
+    with BulletWorld():
+        robot = Object("pr2", ObjectType.ROBOT, stiff)
+        with pytest.raises(Unreachable, match=r"l_wrist_flex_joint outside its hard limits -1\.000\.\.0\.000"):
+            solve(robot, Arms.LEFT, target, limits=Limits.HARD)
+
+
+def test_a_robot_without_a_description_is_the_callers_error() -> None:
+    with BulletWorld():
+        cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL)
+        with pytest.raises(CallerError, match="cereal"):
+            solve(cereal, Arms.LEFT, AHEAD)
+
+
+# --- the thesis' default policy -------------------------------------------------------------------------------------
+
+
+def default_pick_up(rng: random.Random) -> tuple[Arms, Grasp, Pose, list[Pose]]:
+    """A random stand around milk at (1.3, 1, 0.9) that faces it, arm, grasp, and the three poses of a pick up."""
+    arm, grasp = rng.choice(ARMS), rng.choice(list(Grasp))
+    x = y = 0.0
+    while max(abs(x), abs(y)) < 0.2 or max(abs(x), abs(y)) > 2:
+        x, y = rng.gauss(0, math.sqrt(0.5)), rng.gauss(0, math.sqrt(0.5))
+    milk = Vector(1.3, 1.0, 0.9)
+    base = Pose([milk.x + x, milk.y + y, 0], yaw_quaternion(math.atan2(-y, -x)))
+    turn = product(Quaternion(0, 0, 0, 1), GRASP_ORIENTATIONS[grasp])
+    back = rotated(base.orientation, (-0.1, 0.0, 0.0))
+    before = (milk.x + back.x, milk.y + back.y, milk.z)
+    above = (milk.x, milk.y, milk.z + 0.03)
+    return arm, grasp, base, [Pose(place, turn) for place in (before, milk, above)]
+
+
+def picked_up(limits: Limits, *, attempts: int) -> tuple[float, dict[Grasp, float]]:
+    """Share of attempts that succeed, in percent: of all, and of those with each grasp."""
+    rng = random.Random(69)
+    tried: Counter[Grasp] = Counter()
+    done: Counter[Grasp] = Counter()
+    for _ in range(attempts):
+        arm, grasp, base, targets = default_pick_up(rng)
+        tried[grasp] += 1
+        try:
+            for target in targets:
+                solve_from(PR2, arm, target, base=base, torso_height=0.0, limits=limits)
+        except Unreachable:
+            continue
+        done[grasp] += 1
+    return 100 * done.total() / attempts, {grasp: 100 * done[grasp] / tried[grasp] for grasp in Grasp}
+
+
+def test_the_default_policy_succeeds_as_often_as_in_the_thesis() -> None:
+    share, by_grasp = picked_up(Limits.SOFT, attempts=4000)
+    assert 13.5 < share < 18  # the thesis: 15.77 of 50,000
+    assert by_grasp[Grasp.TOP] == 0
+    for grasp in (Grasp.FRONT, Grasp.LEFT, Grasp.RIGHT):
+        assert 17 < by_grasp[grasp] < 25
+
+
+def test_hard_limits_double_the_default_policys_success_and_allow_grasps_from_above() -> None:
+    share, by_grasp = picked_up(Limits.HARD, attempts=2000)
+    assert 26 < share < 34
+    assert by_grasp[Grasp.TOP] > 26
