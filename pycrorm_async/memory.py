@@ -19,7 +19,7 @@ from contextvars import ContextVar, Token
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 
 from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
@@ -34,6 +34,7 @@ from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.recorder import Recorder, current_episode
 from pycrorm_async.plan.ports import PlanObserver, recorder
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.views import UserView
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.recorder import RecorderQueue
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
@@ -83,12 +84,20 @@ class Memory:
     whose episode is open.
     """
 
-    def __init__(self, address: DatabaseAddress, spool: Path | None, settings: Settings, clock: Clock) -> None:
+    def __init__(
+        self,
+        address: DatabaseAddress,
+        *,
+        spool: Path | None,
+        views: Sequence[UserView],
+        settings: Settings,
+        clock: Clock,
+    ) -> None:
         self._address = address
         self._spool_path = spool
+        self._views = tuple(views)
         self._settings = settings
         self._clock = clock
-        self._opened: list[Episode] = []
         self._unadopted: dict[str, PycrormError] = {}
         self._stack = AsyncExitStack()
         self._closed = False
@@ -99,7 +108,7 @@ class Memory:
         url: str,
         *,
         spool: Path | str | None = None,
-        writer: Literal["thread"] = "thread",
+        views: Sequence[UserView] = (),
         settings: Settings | None = None,
         clock: Clock = SYSTEM_CLOCK,
     ) -> Memory:
@@ -108,7 +117,7 @@ class Memory:
         Args:
             url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that is gone when closed.
             spool: folder of the write-ahead queue; by default `memory.db.spool` beside `memory.db`.
-            writer: where the writer runs: in a thread of this process.
+            views: questions with a name, kept beside the tables.
             settings: limits and rhythms.
             clock: where the time comes from.
 
@@ -116,10 +125,12 @@ class Memory:
             UnknownUrl: at once. On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`,
                 `SpoolForeign`.
         """
-        if writer != "thread":
-            raise CallerError(f"writer={writer!r} is not offered by this version: use writer='thread'")
         return cls(
-            DatabaseAddress.parse(url), Path(spool) if spool is not None else None, settings or Settings(), clock
+            DatabaseAddress.parse(url),
+            spool=Path(spool) if spool is not None else None,
+            views=views,
+            settings=settings or Settings(),
+            clock=clock,
         )
 
     # --- opening and closing ----------------------------------------------------------------------------------
@@ -145,7 +156,7 @@ class Memory:
         self._stack.callback(self._queue.release)
         self._writer = WriterThread(
             source=self._queue,
-            open_destination=lambda: _destination(address, self._spool, self._clock),
+            open_destination=lambda: _destination(address, self._spool, self._clock, self._views),
             adopt=self._dead_queues,
             settings=self._settings,
         )
@@ -165,9 +176,8 @@ class Memory:
         self._closed = True
         _reset(recorder, self._tokens[0])
         _reset(watcher, self._tokens[1])
-        for episode in self._opened:
-            if not episode.closed:
-                self._recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
+        for episode in self._recorder.open_episodes:
+            self._recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
         await self._stack.__aexit__(kind, error, traceback)
 
     async def _drain(
@@ -200,7 +210,6 @@ class Memory:
         """
         self._require_open()
         episode = self._recorder.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
-        self._opened = [each for each in self._opened if not each.closed] + [episode]
         tokens = recorder.set(self._recorder), watcher.set(self._recorder), current_episode.set(episode)
         try:
             yield episode
@@ -244,6 +253,11 @@ class Memory:
             writer=self._writer.state,
             unadopted=dict(self._unadopted),
         )
+
+    @property
+    def recent_episodes(self) -> tuple[str, ...]:
+        """The ids of the last hundred episodes this memory opened."""
+        return self._recorder.recent_episodes
 
     # --- asking -----------------------------------------------------------------------------------------------
 
@@ -302,11 +316,15 @@ class _Destination:
 
 
 @asynccontextmanager
-async def _destination(address: DatabaseAddress, spool: Spool, clock: Clock) -> AsyncIterator[_Destination]:
+async def _destination(
+    address: DatabaseAddress, spool: Spool, clock: Clock, views: Sequence[UserView] = ()
+) -> AsyncIterator[_Destination]:
     log = await EventLog.open(address, create=True, clock=clock)
     try:
         spool.bind(log.log_id)
-        yield _Destination(log, await Projector.open(log))
+        projector = Projector(log, views=views)
+        await projector.open()
+        yield _Destination(log, projector)
     finally:
         await log.close()
 

@@ -74,7 +74,7 @@ async def _remembered(
             await memory.flush()
         except EpisodeParked as parked:
             note(str(parked))
-        opened = memory.opened_episodes
+        opened = memory.recent_episodes
         return failure, [each for each in await memory.reading.episodes() if each.id in opened]
 
 

@@ -45,7 +45,7 @@ class DeclaredType(NamedTuple):
 
 
 class _Shape(NamedTuple):
-    type: FieldType
+    kind: FieldType
     optional: bool = False
     item: ItemType | None = None
     enum: type[Enum] | None = None
@@ -121,8 +121,8 @@ def _fields(designator: type) -> typing.Iterator[Field]:
         yield Field(
             FieldDeclared(
                 name=name,
-                column=column_name(name, shape.type),
-                type=shape.type,
+                column=column_name(name, shape.kind),
+                type=shape.kind,
                 slot=slot,
                 optional=shape.optional,
                 enum=_path(shape.enum) if shape.enum is not None else None,
@@ -218,7 +218,7 @@ def _container(origin: type, arguments: tuple[Any, ...]) -> _Shape | None:
     kind: FieldType
     if issubclass(origin, Mapping) and len(arguments) == 2:
         key = _shape(arguments[0])
-        if key is None or key.type not in ("text", "enum") or key.optional:
+        if key is None or key.kind not in ("text", "enum") or key.optional:
             return None
         kind, value = "dict", arguments[1]
     elif issubclass(origin, Sequence) and len({each for each in arguments if each is not Ellipsis}) == 1:
@@ -226,9 +226,9 @@ def _container(origin: type, arguments: tuple[Any, ...]) -> _Shape | None:
     else:
         return None
     item = _shape(value)
-    if item is None or item.nested is not None or item.type in ("list", "dict"):
+    if item is None or item.nested is not None or item.kind in ("list", "dict"):
         return None
-    return _Shape(kind, item=typing.cast("ItemType", item.type), enum=item.enum)
+    return _Shape(kind, item=typing.cast("ItemType", item.kind), enum=item.enum)
 
 
 def _path(kind: type) -> str:

@@ -22,7 +22,7 @@ _BLOCK_S = 1.0
 class Faults(NamedTuple):
     """How often the hooks failed to record something, and the last reason; status shows both."""
 
-    count: int
+    total: int
     last: str | None
 
 

@@ -7,12 +7,13 @@ Three things may reach a plan, all by the caller's choice or fault: `SpoolFull` 
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError, EpisodeRefused, SpoolFull
-from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode, EpisodeOpening, NodeRecord, current_task
@@ -22,6 +23,8 @@ from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.watch import current_world
 
 __all__ = ["Recorder", "current_episode"]
+
+RECENT_MAX = 100
 
 current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
 
@@ -42,7 +45,8 @@ class Recorder:
         self._software = software
         self._randomness = randomness
         self._declarations = Declarations()
-        self._owned: set[EpisodeId] = set()
+        self._open: dict[EpisodeId, Episode] = {}
+        self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
 
     # --- episodes ---------------------------------------------------------------------------------------------
 
@@ -55,7 +59,8 @@ class Recorder:
             )
         name = episode_id(self._clock.wall_ns(), self._randomness(10))
         episode = Episode(self._emitter, name, EpisodeOpening(description, self._software, plan, seed))
-        self._owned.add(name)
+        self._open[name] = episode
+        self._recent.append(name)
         world = current_world.get()
         if world is not None:
             episode.enter_world(world)
@@ -63,16 +68,26 @@ class Recorder:
 
     def close_episode(self, episode: Episode, failure: BaseException | None) -> None:
         """Its last event. A fault of ours is counted, not raised."""
-        self._owned.discard(episode.id)
+        self._open.pop(episode.id, None)
         try:
             episode.end(failure)
         except Exception as error:  # noqa: BLE001  the plan's own outcome matters more
             self._emitter.note_fault("EpisodeEnded", error)
 
+    @property
+    def open_episodes(self) -> tuple[Episode, ...]:
+        """Those that have begun and not ended, oldest first."""
+        return tuple(self._open.values())
+
+    @property
+    def recent_episodes(self) -> tuple[str, ...]:
+        """The ids of the last hundred that were opened, also of those that have ended."""
+        return tuple(map(episode_text, self._recent))
+
     def _open_here(self) -> Episode | None:
         """The open episode of this memory in this context."""
         episode = current_episode.get()
-        return episode if episode is not None and not episode.closed and episode.id in self._owned else None
+        return episode if episode is not None and not episode.closed and episode.id in self._open else None
 
     # --- the plan layer's port ----------------------------------------------------------------------------------
 

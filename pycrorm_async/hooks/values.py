@@ -262,7 +262,7 @@ def _any(value: Any, references: References, depth: int) -> Any:
     if isinstance(value, np.generic):
         return _any(value.item(), references, depth + 1)
     for kind, writer in ((Pose, _pose), (datetime, _datetime), (OBJECT_TYPES, _object)):
-        if isinstance(value, kind):  # type: ignore[arg-type]  # mypy joins the tuple and the classes
+        if isinstance(value, kind):
             return writer(value, None, references)
     if isinstance(value, Mapping):
         return {_key(key): _any(each, references, depth + 1) for key, each in value.items()}

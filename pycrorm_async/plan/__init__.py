@@ -1,0 +1,108 @@
+"""What a robot does: designators, the actions and motions that are there, and the tree of what was performed.
+
+Runs without a memory; `pycrorm_async.plan.ports` is what a memory implements to be told. Importing this loads neither
+Bullet nor a database. The kinds of `PlanFailure` are in `pycrorm_async.plan.failures`.
+
+>>> with BulletWorld() as world, simulated_robot:
+...     robot = Object("pr2", ObjectType.ROBOT)
+...     await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
+"""
+
+from pycrorm_async.plan.actions import (
+    FaceAtPerformable,
+    LookAtActionPerformable,
+    MoveAndPickUpPerformable,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    ParkArmsActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    SetGripperActionPerformable,
+)
+from pycrorm_async.plan.descriptions import (
+    ActionDescription,
+    LookAtAction,
+    MoveTorsoAction,
+    NavigateAction,
+    ParkArmsAction,
+    PickUpAction,
+    PlaceAction,
+    SetGripperAction,
+)
+from pycrorm_async.plan.designator import ActionAbstract, BaseMotion, Designator
+from pycrorm_async.plan.errors import NoRobotChosen, NoWorldHere, PerformNotAsync, ResolutionError
+from pycrorm_async.plan.failures import IKError, PlanFailure
+from pycrorm_async.plan.locations import (
+    CostmapLocation,
+    Location,
+    LocationDesignator,
+    ObjectRelativeLocation,
+    SemanticCostmapLocation,
+)
+from pycrorm_async.plan.motions import (
+    LookingMotion,
+    MoveArmJointsMotion,
+    MoveGripperMotion,
+    MoveJointsMotion,
+    MoveMotion,
+    MoveTCPMotion,
+)
+from pycrorm_async.plan.objects import (
+    BelieveObject,
+    ObjectDesignator,
+    ObjectDesignatorDescription,
+    ObjectPart,
+)
+from pycrorm_async.plan.process_modules import ProcessModules, Robot, simulated_robot
+from pycrorm_async.plan.task_tree import CollectedTree, TaskStatus, TaskTreeNode, collected_tree
+
+__all__ = [
+    "Designator",
+    "ActionAbstract",
+    "BaseMotion",
+    "PlanFailure",
+    "IKError",
+    "simulated_robot",
+    "ProcessModules",
+    "Robot",
+    "collected_tree",
+    "CollectedTree",
+    "TaskStatus",
+    "TaskTreeNode",
+    "ActionDescription",
+    "LookAtAction",
+    "MoveTorsoAction",
+    "NavigateAction",
+    "ParkArmsAction",
+    "PickUpAction",
+    "PlaceAction",
+    "SetGripperAction",
+    "FaceAtPerformable",
+    "LookAtActionPerformable",
+    "MoveAndPickUpPerformable",
+    "MoveTorsoActionPerformable",
+    "NavigateActionPerformable",
+    "ParkArmsActionPerformable",
+    "PickUpActionPerformable",
+    "PlaceActionPerformable",
+    "SetGripperActionPerformable",
+    "MoveMotion",
+    "MoveTCPMotion",
+    "LookingMotion",
+    "MoveGripperMotion",
+    "MoveArmJointsMotion",
+    "MoveJointsMotion",
+    "ObjectDesignatorDescription",
+    "ObjectDesignator",
+    "ObjectPart",
+    "BelieveObject",
+    "LocationDesignator",
+    "Location",
+    "ObjectRelativeLocation",
+    "CostmapLocation",
+    "SemanticCostmapLocation",
+    "NoRobotChosen",
+    "NoWorldHere",
+    "PerformNotAsync",
+    "ResolutionError",
+]

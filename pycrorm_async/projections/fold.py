@@ -122,9 +122,8 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     ]
 
 
-def _robot_columns(
-    event: StoredEvent, robot: RobotValue | None
-) -> tuple[int | None, float | None, str | None, int | None]:
+def _robot_columns(event: StoredEvent, robot: RobotValue | None) -> Row:
+    """robot_pose_id to robot_object_id."""
     if robot is None:
         return None, None, None, None
     pose = row(event.number, event.sequence, SLOT_ROBOT_POSE)

@@ -1,8 +1,8 @@
 """What designator types add to the tables: a leaf table each, which views show it, which class its rows become.
 
-A layout only grows. Declarations unite in the order they came: a new field is a new column; a column that would need two
-types is refused with both named, and so is the declaration that brought it. A type's view shows the rows of all tables
-of that type and of the types that descend from it, so `pick_up_action` has every careful pick-up too.
+A layout only grows. Declarations unite in the order they came: a new field is a new column; a column that would need
+two types is refused with both named, and so is the declaration that brought it. A type's view shows the rows of all
+tables of that type and of the types that descend from it, so `pick_up_action` has every careful pick-up too.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ _ITEM_SCALARS = {"integer": 0, "real": 1, "text": 2, "enum": 2, "boolean": 3, "d
 
 
 class Parameters:
-    """What one node's parameters make: the values of its leaf columns, and rows of `pose`, `object`, `parameter_item`."""
+    """What one node's parameters make: the values of its leaf columns, and rows of other tables."""
 
     def __init__(self) -> None:
         self.columns: list[Any] = []

@@ -1,8 +1,8 @@
 """Keeps the tables up to date with the log: reads what is behind, folds it, writes rows and progress together.
 
-Reading and folding hold no lock. The write transaction then checks that both the tables and the progress are as they were
-taken to be; if somebody else was quicker it is rolled back and the loop reads again. So any number of projectors may work
-on one memory, and none of them ever shows an event twice or half.
+Reading and folding hold no lock. The write transaction then checks that both the tables and the progress are as they
+were taken to be; if somebody else was quicker it is rolled back and the loop reads again. So any number of projectors
+may work on one memory, and none of them ever shows an event twice or half.
 
     projector = Projector(log)
     await projector.open()
@@ -97,8 +97,8 @@ class Projector:
     async def fold_behind(self) -> int:
         """Shows in the tables what the log holds; the number of events folded.
 
-        An event that cannot be folded parks its episode with the reason, what came before it is shown, and the others go
-        on. Raises `DatabaseUnavailable`; what was folded stays, and the call may be made again.
+        An event that cannot be folded parks its episode with the reason, what came before it is shown, and the others
+        go on. Raises `DatabaseUnavailable`; what was folded stays, and the call may be made again.
         """
         count = 0
         with self._translated():

@@ -1,7 +1,7 @@
 """What a batch of events makes: rows to insert, and changes of rows that are in the tables already.
 
-A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`; of nodes
-and episodes they are lists until the batch is over.
+A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`; of
+nodes and episodes they are lists until the batch is over.
 """
 
 from __future__ import annotations

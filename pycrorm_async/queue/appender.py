@@ -277,8 +277,11 @@ class Appender:
 
     def admits_again(self, *, reserved: bool) -> bool:
         """Whether a record as large as the largest that was refused would be taken now."""
+        frame_bytes = max(self._refused_bytes, HEADER_BYTES)
+        if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
+            return True
         with self._lock:
-            return self._admits(max(self._refused_bytes, HEADER_BYTES), reserved=reserved)
+            return self._admits(frame_bytes, reserved=reserved)
 
     @property
     def bytes_held(self) -> int:

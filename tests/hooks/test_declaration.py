@@ -103,7 +103,7 @@ def test_a_subclass_of_an_action_names_its_ancestors() -> None:
 )
 def test_a_field_without_a_column_is_refused_by_name_and_type(kind: Any) -> None:
     namespace = {"__annotations__": {"odd": kind}, "perform": EverythingActionPerformable.perform.__wrapped__}  # type: ignore[attr-defined]
-    made = dataclass(type("OddActionPerformable", (ActionAbstract,), namespace))
+    made: type[ActionAbstract] = dataclass(type("OddActionPerformable", (ActionAbstract,), namespace))
     with pytest.raises(DeclarationRefused, match="field 'odd' has the type"):
         declared_type(made)
 

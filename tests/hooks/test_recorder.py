@@ -343,7 +343,7 @@ async def test_nan_in_a_pose_names_the_designator_and_the_field() -> None:
     refusal = r"^NavigateAction\.target_location cannot be recorded: the pose holds"
     with rigged() as rig, rig.episode(), pytest.raises(Unrecordable, match=refusal):
         await NavigateActionPerformable(Pose([math.nan, 0, 0])).perform()
-    assert rig.emitter.faults.count == 0
+    assert rig.emitter.faults.total == 0
 
 
 async def test_a_parameter_that_cannot_be_recorded_is_recorded_as_missing_if_so_chosen() -> None:
@@ -423,7 +423,7 @@ async def test_a_fault_of_the_memory_never_reaches_the_plan_and_is_counted() -> 
         note = NoteActionPerformable("x")
         assert await note.perform() == "x"
         assert note.ran
-        assert rig.emitter.faults.count == 2
+        assert rig.emitter.faults.total == 2
         assert rig.emitter.faults.last == "NodeStarted: RuntimeError: the disk is on fire"
         rig.sink.broken = False
 

@@ -47,7 +47,10 @@ SELECT value->>0, value->>1, value->>2, value->>3, value->>4, value->>5 FROM jso
 ON CONFLICT (number) DO UPDATE
 SET head = excluded.head, ended_wall_ns = excluded.ended_wall_ns, refused = excluded.refused"""
 
-_EVENT = "event.episode, sequence, type, version, wall_ns, monotonic_ns, CAST(payload AS BLOB)"
+_EVENT = (
+    "event.episode, event.sequence, event.type, event.version, event.wall_ns, event.monotonic_ns,"
+    " CAST(event.payload AS BLOB)"
+)
 
 SELECT_STORED_AGAIN = f"""
 SELECT {_EVENT} FROM json_each(?) JOIN event ON event.episode = value->>0 AND event.sequence = value->>1"""
@@ -64,8 +67,8 @@ SELECT_STOPPED = f"SELECT {_EPISODE} FROM episode WHERE refused IS NOT NULL OR p
 SELECT_EVENTS = f"SELECT {_EVENT} FROM event WHERE episode = ? AND sequence > ? ORDER BY sequence LIMIT ?"
 
 SELECT_UNFOLDED = f"""
-SELECT {_EVENT} FROM episode JOIN event ON event.episode = number AND sequence > folded
-WHERE folded < head AND parked IS NULL ORDER BY number, sequence LIMIT ?"""
+SELECT {_EVENT} FROM episode JOIN event ON event.episode = number AND event.sequence > folded
+WHERE folded < head AND parked IS NULL ORDER BY number, event.sequence LIMIT ?"""
 
 SELECT_DECLARATIONS = "SELECT CAST(payload AS BLOB) FROM pycrorm_declaration ORDER BY ordinal"
 
