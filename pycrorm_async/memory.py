@@ -49,7 +49,7 @@ from pycrorm_async.writer.thread import WriterThread
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["Memory", "MemoryStatus", "RecoveryReport", "recover"]
+__all__ = ["Memory", "MemoryStatus", "RecoveryReport", "recover", "spool_of"]
 
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
@@ -377,3 +377,8 @@ async def recover(url: str, *, spool: Path | None = None, settings: Settings | N
     async with _destination(address, place, SYSTEM_CLOCK) as destination:
         done = await drain_once(_dead_queues(place, failures, lost), destination, settings=settings or Settings())
     return RecoveryReport(done, tuple(lost), {**done.failed, **failures})
+
+
+def spool_of(url: str) -> Path:
+    """Where the write-ahead queue of this database is, if nobody says otherwise."""
+    return DatabaseAddress.parse(url).default_spool

@@ -7,7 +7,7 @@ import asyncio
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, print_json, print_table
 from pycrorm_async.cli.waiting import note_what_waits
-from pycrorm_async.memory import Reading
+from pycrorm_async.query.reading import Reading
 
 __all__ = ["episodes"]
 

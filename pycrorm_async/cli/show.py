@@ -1,0 +1,43 @@
+"""`pycrorm show EPISODE`: one episode: what it was, and its task tree."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import duration, print_json, print_table
+from pycrorm_async.cli.tree import print_tree
+from pycrorm_async.cli.waiting import note_what_waits
+from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
+from pycrorm_async.query.reading import Reading
+
+__all__ = ["show"]
+
+
+def show(
+    episode: Annotated[str, typer.Argument(help="Its number, its id, or the first digits of its id; `last`.")],
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show an episode's task tree, with statuses and durations."""
+
+    async def asked() -> tuple[EpisodeSummary, list[NodeSummary]]:
+        async with Reading.open(url) as reading:
+            found = await reading.episode(episode)
+            return found, await reading.tree(found.number)
+
+    found, tree = asyncio.run(asked())
+    note_what_waits(url, spool)
+    if as_json:
+        print_json({"episode": found, "tree": tree})
+        return
+    print_table(
+        f"Episode {found.number}",
+        ("id", "started", "by", "took", "status", "description"),
+        [(found.id, found.started_at, found.created_by, duration(found.duration_ns), found.status, found.description)],
+    )
+    print_tree(tree)
