@@ -84,7 +84,7 @@ def _head(robot: Element) -> None:
         _Z,
         Bounds(-3.007, 3.007),
     )
-    _link(robot, PR2.head_pan_link, (0.16, 0.2, 0.08), (0.02, 0, -0.02), _DARK)
+    _link(robot, PR2.head_pan_link, (0.16, 0.2, 0.2), (0.02, 0, -0.06), _DARK)
     _moving(
         robot,
         PR2.head_tilt_joint,
