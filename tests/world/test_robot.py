@@ -209,7 +209,6 @@ except MissingExtra as missing:
     assert "pip install 'pycrorm-async[pr2]'" in done.stdout
 
 
-@pytest.mark.pr2
 def test_the_mesh_model_has_every_joint_and_link_of_ours_in_the_same_place(model: LoadedModel) -> None:
     mesh = LoadedModel(pr2_mesh_urdf_path())
     try:
