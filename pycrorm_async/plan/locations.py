@@ -1,0 +1,176 @@
+"""Where to stand and where to put things: location designators that look for places and tell what they offered.
+
+`resolve()` gives the best place, iterating gives one after another, both at the moment they are asked. Each
+time a recorder is told once: what was offered, which was taken, how many places were looked at.
+
+>>> stand = CostmapLocation(target=cereal, reachable_for=robot).resolve()
+>>> stand.reachable_arms
+(<Arms.LEFT: 1>,)
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+
+from pycrorm_async.plan.failures import (
+    LookingHighLevelFailure,
+    ObjectUnavailable,
+    ObjectUnreachable,
+    PlanFailure,
+    ReachabilityFailure,
+)
+from pycrorm_async.plan.objects import ObjectLike, designator_of
+from pycrorm_async.plan.ports import Candidate, recorder
+from pycrorm_async.plan.standing import stands
+from pycrorm_async.plan.surfaces import places_on
+from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Pose
+
+__all__ = ["CostmapLocation", "Location", "LocationDesignator", "ObjectRelativeLocation", "SemanticCostmapLocation"]
+
+
+class LocationDesignator(ABC):
+    """What every location designator does. A subclass says which places it looks at."""
+
+    @abstractmethod
+    def _look(self) -> Iterator[Location | None]:
+        """Every place it looks at, in order; None for one that will not do."""
+
+    @abstractmethod
+    def _nowhere(self) -> PlanFailure:
+        """What it means for a plan that there is no place."""
+
+    def resolve(self) -> Location:
+        """The first place that will do. Raises a plan failure, which each designator names, if there is none."""
+        places = iter(self)
+        try:
+            place = next(places, None)
+        finally:
+            places.close()
+        if place is None:
+            raise self._nowhere()
+        return place
+
+    def __iter__(self) -> Generator[Location, None, None]:
+        """One place after another that will do; the last one asked for counts as taken, none if all were."""
+        observer, node = recorder.get(), current_node.get()
+        offered: list[Candidate] = []
+        taken: int | None = None
+        considered = 0
+        try:
+            for place in self._look():
+                considered += 1
+                if place is not None:
+                    taken = len(offered)
+                    offered.append(Candidate(place.pose, place.reachable_arms))
+                    yield place
+                    taken = None
+        finally:
+            if observer is not None:
+                observer.location_resolved(
+                    location=type(self).__name__,
+                    offered=tuple(offered),
+                    taken=taken,
+                    considered=considered,
+                    node=node,
+                )
+
+
+@dataclass(frozen=True)
+class Location(LocationDesignator):
+    """A place: a pose in the map, and the arms that reach what it was looked for. Resolves to itself."""
+
+    pose: Pose
+    reachable_arms: tuple[Arms, ...] = ()
+
+    def _look(self) -> Iterator[Location | None]:
+        yield self
+
+    def _nowhere(self) -> PlanFailure:
+        raise AssertionError("a place is somewhere")
+
+
+@dataclass(frozen=True)
+class ObjectRelativeLocation(LocationDesignator):
+    """The place that is at `relative_pose` as seen from an object. Raises `PerceptionObjectNotInWorld`."""
+
+    relative_pose: Pose
+    reference_object: ObjectLike
+
+    def _look(self) -> Iterator[Location | None]:
+        yield Location(designator_of(self.reference_object).pose @ self.relative_pose)
+
+    def _nowhere(self) -> PlanFailure:
+        raise AssertionError("beside a thing is somewhere")
+
+
+@dataclass(frozen=True)
+class CostmapLocation(LocationDesignator):
+    """Where a robot can stand, facing the target, to reach or to see it: near it, and clear of what is around.
+
+    Args:
+        target: an object, to be picked up, or a pose, to bring the tool frame to or to put a held object
+        down at. reachable_for: the robot that is to reach it. For an object that means all three goals of a
+        pick-up from the
+            front (`Grasp.FRONT`), for a pose those of placing what the arm holds, with the torso and the
+            arms as they are now.
+        visible_for: the robot that is to see it.
+        reachable_arm: only places where this arm reaches; for BOTH, each of the two.
+
+    Up to 600 places are looked at, best first. Resolving raises `ObjectUnreachable` (an object),
+    `ReachabilityFailure` (a pose), `LookingHighLevelFailure` (only to be seen) or
+    `PerceptionObjectNotInWorld`.
+    """
+
+    target: Pose | ObjectLike
+    reachable_for: ObjectLike | None = None
+    visible_for: ObjectLike | None = None
+    reachable_arm: Arms | None = None
+
+    def _look(self) -> Iterator[Location | None]:
+        for pose, arms in stands(
+            self.target,
+            reachable_for=self.reachable_for,
+            visible_for=self.visible_for,
+            reachable_arm=self.reachable_arm,
+        ):
+            yield Location(pose, arms) if arms is not None else None
+
+    def _nowhere(self) -> PlanFailure:
+        if self.reachable_for is None:
+            return LookingHighLevelFailure("there is no place to see it from")
+        if isinstance(self.target, Pose):
+            return ReachabilityFailure(f"there is no place to stand and reach {self.target}", self.target)
+        name = self.target.name
+        return ObjectUnreachable(f"there is no place to stand and pick up {name}", name)
+
+
+@dataclass(frozen=True)
+class SemanticCostmapLocation(LocationDesignator):
+    """Where something can be put on a link of an object, for example on the surface of a table.
+
+    Args:
+        urdf_link_name: the link; the top of its bounding box is the surface.
+        part_of: the object that has the link.
+        for_object: what is to be put there: its bottom will be on the surface, and it has room there.
+        Without it, the
+            poses are on the surface itself.
+
+    The middle comes first, then places all over the surface in a fixed order. Resolving raises
+    `ObjectUnavailable` if there is no room, `PerceptionObjectNotInWorld` and `UnknownLink`.
+    """
+
+    urdf_link_name: str
+    part_of: ObjectLike
+    for_object: ObjectLike | None = None
+
+    def _look(self) -> Iterator[Location | None]:
+        for pose in places_on(self.urdf_link_name, self.part_of, self.for_object):
+            yield Location(pose) if pose is not None else None
+
+    def _nowhere(self) -> PlanFailure:
+        what = self.for_object.name if self.for_object is not None else "anything"
+        return ObjectUnavailable(f"there is no room for {what} on {self.urdf_link_name}", self.urdf_link_name, what)

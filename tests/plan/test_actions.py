@@ -1,0 +1,258 @@
+"""What the actions do in the world, by which motions, and how they fail."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+
+import pytest
+
+from pycrorm_async.plan import (
+    BelieveObject,
+    FaceAtPerformable,
+    IKError,
+    LookAtActionPerformable,
+    MoveAndPickUpPerformable,
+    MoveTCPMotion,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    ObjectPart,
+    ParkArmsActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    SetGripperActionPerformable,
+    TaskStatus,
+    collected_tree,
+)
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.failures import ObjectLost, PerceptionObjectNotInWorld, TorsoGoalUnreachable
+from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.plan.task_tree import CollectedTree
+from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose
+from pycrorm_async.world.pose import rotated, yaw_quaternion
+from tests.plan.conftest import Scene
+
+LEFT_TOOL, RIGHT_TOOL = "l_gripper_tool_frame", "r_gripper_tool_frame"
+
+
+def shape(tree: CollectedTree) -> list[str]:
+    return ["  " * tree.depth(node) + type(node.designator).__name__ for node in tree]
+
+
+def targets(tree: CollectedTree) -> list[Pose]:
+    return [node.designator.target for node in tree if isinstance(node.designator, MoveTCPMotion)]
+
+
+@pytest.mark.parametrize(
+    ("action", "dtype", "concept", "names"),
+    [
+        (MoveTorsoActionPerformable, "MoveTorsoAction", "MoveTorso", ["position"]),
+        (SetGripperActionPerformable, "SetGripperAction", "SettingGripper", ["gripper", "motion"]),
+        (ParkArmsActionPerformable, "ParkArmsAction", "ParkingArms", ["arm"]),
+        (NavigateActionPerformable, "NavigateAction", "Navigating", ["target_location"]),
+        (PickUpActionPerformable, "PickUpAction", "PickingUp", ["object_designator", "arm", "grasp"]),
+        (PlaceActionPerformable, "PlaceAction", "Placing", ["object_designator", "arm", "target_location"]),
+        (LookAtActionPerformable, "LookAtAction", "LookingAt", ["target"]),
+        (FaceAtPerformable, "FaceAtAction", None, ["pose"]),
+        (
+            MoveAndPickUpPerformable,
+            "MoveAndPickUpAction",
+            None,
+            ["standing_position", "object_designator", "arm", "grasp"],
+        ),
+    ],
+)
+def test_actions_have_the_names_concepts_and_fields_that_are_known(
+    action: type[ActionAbstract], dtype: str, concept: str | None, names: list[str]
+) -> None:
+    assert (action.dtype, action.concept, action.kind) == (dtype, concept, "action")
+    assert [field.name for field in fields(action)] == names  # type: ignore[arg-type]  # each is a dataclass
+
+
+async def test_a_pick_up_goes_before_the_object_to_it_and_up(scene: Scene) -> None:
+    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
+    with collected_tree() as tree:
+        await PickUpActionPerformable(designator_of(scene.milk), Arms.LEFT, Grasp.FRONT).perform()
+    assert shape(tree) == [
+        "PickUpActionPerformable",
+        "  MoveTCPMotion",
+        "  MoveGripperMotion",
+        "  MoveTCPMotion",
+        "  MoveGripperMotion",
+        "  MoveTCPMotion",
+    ]
+    # with all joints at zero the gripper points ahead: along x of the map
+    assert [list(each.position) for each in targets(tree)] == [
+        pytest.approx([1.2, 1, 0.9]),
+        pytest.approx([1.3, 1, 0.9]),
+        pytest.approx([1.3, 1, 0.93]),
+    ]
+    assert all(node.designator.allow_gripper_collision for node in tree if isinstance(node.designator, MoveTCPMotion))
+    assert scene.robot.attachments == {scene.milk: LEFT_TOOL}
+    assert scene.milk.pose.position == pytest.approx((1.3, 1, 0.93), abs=1e-6)
+    assert scene.robot.joint_position("l_gripper_l_finger_joint") == 0.0
+
+
+async def test_the_approach_is_along_the_gripper_as_it_points_at_the_start(scene: Scene) -> None:
+    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
+    await MoveTCPMotion(Pose([1.2, 1.1, 0.9], yaw_quaternion(0.5)), Arms.LEFT).perform()
+    with collected_tree() as tree:
+        await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+    before = targets(tree)[0]
+    assert list(before.position) == pytest.approx([1.3 - 0.1 * math.cos(0.5), 1 - 0.1 * math.sin(0.5), 0.9], abs=1e-6)
+    assert before.orientation == pytest.approx((0, 0, 0, 1))
+
+
+async def test_a_turned_object_is_grasped_from_its_own_front(scene: Scene) -> None:
+    scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(math.pi / 2)))
+    await NavigateActionPerformable(Pose([1.2, 0.3, 0], yaw_quaternion(math.pi / 2))).perform()
+    with collected_tree() as tree:
+        await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+    for goal in targets(tree):
+        assert rotated(goal.orientation, (1, 0, 0)) == pytest.approx((0, 1, 0), abs=1e-9)
+    assert targets(tree)[0].position == pytest.approx((1.3, 0.9, 0.9), abs=1e-6)
+    assert scene.milk.pose.position == pytest.approx((1.3, 1, 0.93), abs=1e-6)
+
+
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -2.0])
+async def test_a_grasp_from_the_top_comes_from_above_however_the_object_is_turned(scene: Scene, yaw: float) -> None:
+    scene.milk.set_pose(Pose([0.6, 0.2, 0.75], yaw_quaternion(yaw)))
+    await MoveTorsoActionPerformable(0.3).perform()
+    with collected_tree() as tree:
+        await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.TOP).perform()
+    for goal in targets(tree):
+        assert rotated(goal.orientation, (1, 0, 0)) == pytest.approx((0, 0, -1), abs=1e-9)
+
+
+async def test_picking_up_what_is_out_of_reach_fails_at_the_first_motion(scene: Scene) -> None:
+    with collected_tree() as tree, pytest.raises(IKError) as caught:
+        await PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.FRONT).perform()
+    assert (caught.value.arm, caught.value.tip_frame) == (Arms.RIGHT, RIGHT_TOOL)
+    assert [(type(node.designator).__name__, node.status) for node in tree] == [
+        ("PickUpActionPerformable", TaskStatus.FAILED),
+        ("MoveTCPMotion", TaskStatus.FAILED),
+    ]
+    assert scene.robot.attachments == {}
+
+
+async def test_what_is_not_in_the_world_cannot_be_picked_up(scene: Scene) -> None:
+    scene.world.remove(scene.milk)
+    believed = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.3, 1, 0.9]))
+    for meant in (scene.milk, believed, ObjectPart("sink_area", scene.kitchen)):
+        with collected_tree() as tree, pytest.raises(PerceptionObjectNotInWorld, match=meant.name):
+            await PickUpActionPerformable(meant, Arms.LEFT, Grasp.FRONT).perform()
+        assert len(tree) == 1
+
+
+async def test_an_object_is_taken_over_from_what_it_hung_on(scene: Scene) -> None:
+    tray = Object("tray", ObjectType.GENERIC_OBJECT, pose=Pose([1.3, 1, 0.75]))
+    tray.attach(scene.milk)
+    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
+    await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+    assert (tray.attachments, scene.robot.attachments) == ({}, {scene.milk: LEFT_TOOL})
+    assert tray.pose == Pose([1.3, 1, 0.75])
+
+
+async def test_a_placed_object_is_at_its_target_and_the_gripper_behind_it(scene: Scene) -> None:
+    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
+    await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+    await ParkArmsActionPerformable(Arms.BOTH).perform()
+    assert scene.milk.pose.position != pytest.approx((1.3, 1, 0.93), abs=0.1)
+    goal = Pose([1.25, 0.8, 0.95], yaw_quaternion(0.2))
+    with collected_tree() as tree:
+        await PlaceActionPerformable(scene.milk, Arms.LEFT, goal).perform()
+    assert shape(tree) == [
+        "PlaceActionPerformable",
+        "  MoveTCPMotion",
+        "  MoveGripperMotion",
+        "  MoveTCPMotion",
+    ]
+    assert scene.milk.pose.position == pytest.approx(goal.position, abs=1e-6)
+    assert scene.milk.pose.orientation == pytest.approx(goal.orientation, abs=1e-6)
+    assert (scene.robot.attachments, scene.milk.attached_to) == ({}, None)
+    at, behind = targets(tree)
+    assert behind.relative_to(at).position == pytest.approx((-0.07, 0, 0), abs=1e-9)
+    assert scene.robot.link_pose(LEFT_TOOL).position == pytest.approx(behind.position, abs=1e-6)
+    assert scene.robot.joint_position("l_gripper_l_finger_joint") == 0.548
+
+
+async def test_only_what_this_arm_holds_can_be_placed(scene: Scene) -> None:
+    with pytest.raises(ObjectLost, match="the LEFT gripper does not hold milk"):
+        await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([1.3, 1, 0.9])).perform()
+    scene.robot.attach(scene.milk, RIGHT_TOOL)
+    with pytest.raises(ObjectLost):
+        await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([1.3, 1, 0.9])).perform()
+    scene.world.remove(scene.milk)
+    with pytest.raises(PerceptionObjectNotInWorld):
+        await PlaceActionPerformable(scene.milk, Arms.RIGHT, Pose([1.3, 1, 0.9])).perform()
+
+
+async def test_a_place_out_of_reach_keeps_the_object_in_the_hand(scene: Scene) -> None:
+    scene.robot.attach(scene.milk, LEFT_TOOL)
+    with pytest.raises(IKError):
+        await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([5, 5, 1])).perform()
+    assert scene.robot.attachments == {scene.milk: LEFT_TOOL}
+
+
+async def test_facing_turns_base_and_head_and_stays(scene: Scene) -> None:
+    await NavigateActionPerformable(Pose([0.5, 0.5, 0], yaw_quaternion(3.0))).perform()
+    with collected_tree() as tree:
+        await FaceAtPerformable(Pose([0.5, -1.5, 1.0])).perform()
+    assert shape(tree) == [
+        "FaceAtPerformable",
+        "  NavigateActionPerformable",
+        "    MoveMotion",
+        "  LookAtActionPerformable",
+        "    LookingMotion",
+    ]
+    assert scene.robot.pose.position == (0.5, 0.5, 0)
+    assert scene.robot.pose.yaw == pytest.approx(-math.pi / 2)
+    assert scene.robot.joint_position("head_pan_joint") == pytest.approx(0, abs=1e-9)
+
+
+async def test_move_and_pick_up_is_a_node_with_its_three_steps(scene: Scene) -> None:
+    with collected_tree() as tree:
+        await MoveAndPickUpPerformable(Pose([0.6, 0.9, 0]), scene.milk, Arms.RIGHT, Grasp.FRONT).perform()
+    assert [line for line in shape(tree) if not line.startswith("    ")] == [
+        "MoveAndPickUpPerformable",
+        "  NavigateActionPerformable",
+        "  FaceAtPerformable",
+        "  PickUpActionPerformable",
+    ]
+    assert len(tree) == 14
+    assert scene.robot.attachments == {scene.milk: RIGHT_TOOL}
+
+
+@pytest.mark.parametrize(("arm", "count"), [(Arms.LEFT, 7), (Arms.RIGHT, 7), (Arms.BOTH, 14)])
+async def test_parked_arms_are_at_their_park_positions(scene: Scene, arm: Arms, count: int) -> None:
+    with collected_tree() as tree:
+        await ParkArmsActionPerformable(arm).perform()
+    moved = {name for name, position in scene.robot.joint_positions().items() if position != 0.0}
+    assert len(moved) == (count if arm is Arms.RIGHT else count - 1)  # the left wrist roll is parked at 0
+    assert {name[0] for name in moved} == {Arms.LEFT: {"l"}, Arms.RIGHT: {"r"}, Arms.BOTH: {"l", "r"}}[arm]
+    if arm is not Arms.RIGHT:
+        assert scene.robot.joint_position("l_shoulder_pan_joint") == 1.712
+    if arm is not Arms.LEFT:
+        assert scene.robot.joint_position("r_shoulder_pan_joint") == -1.712
+    assert shape(tree) == ["ParkArmsActionPerformable", "  MoveArmJointsMotion"]
+
+
+async def test_the_torso_goes_up_and_not_too_far(scene: Scene) -> None:
+    with collected_tree() as tree:
+        await MoveTorsoActionPerformable(0.3).perform()
+    assert scene.robot.joint_position("torso_lift_joint") == 0.3
+    assert shape(tree) == ["MoveTorsoActionPerformable", "  MoveJointsMotion"]
+    with pytest.raises(TorsoGoalUnreachable):
+        await MoveTorsoActionPerformable(1.0).perform()
+
+
+async def test_gripper_and_look_at_are_one_motion_each(scene: Scene) -> None:
+    with collected_tree() as tree:
+        await SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
+        await LookAtActionPerformable(Pose([1.3, 1, 0.9])).perform()
+    assert shape(tree) == [
+        "SetGripperActionPerformable",
+        "  MoveGripperMotion",
+        "LookAtActionPerformable",
+        "  LookingMotion",
+    ]

@@ -1,0 +1,15 @@
+"""Importing the plan layer."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+
+def test_importing_plans_loads_neither_bullet_nor_a_database() -> None:
+    code = (
+        "import sys, pycrorm_async.plan as plan; assert all(hasattr(plan, name) for name in plan.__all__);"
+        "print(sorted({'pybullet', 'sqlalchemy', 'pycrorm_async.events', 'pycrorm_async.hooks'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"

@@ -1,0 +1,107 @@
+"""The plan of thesis 5.1, from the first parked arm to the last."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from pycrorm_async.plan import (
+    CostmapLocation,
+    MoveTorsoAction,
+    NavigateAction,
+    ObjectDesignatorDescription,
+    ParkArmsAction,
+    ParkArmsActionPerformable,
+    PickUpAction,
+    PlaceAction,
+    SemanticCostmapLocation,
+    TaskStatus,
+    collected_tree,
+)
+from pycrorm_async.world import Arms, Grasp, Pose
+from tests.plan.conftest import Scene
+from tests.plan.recording import Recording
+
+TREE = """\
+ParkArmsActionPerformable
+└── MoveArmJointsMotion
+MoveTorsoActionPerformable
+└── MoveJointsMotion
+NavigateActionPerformable
+└── MoveMotion
+PickUpActionPerformable
+├── MoveTCPMotion
+├── MoveGripperMotion
+├── MoveTCPMotion
+├── MoveGripperMotion
+└── MoveTCPMotion
+ParkArmsActionPerformable
+└── MoveArmJointsMotion
+NavigateActionPerformable
+└── MoveMotion
+PlaceActionPerformable
+├── MoveTCPMotion
+├── MoveGripperMotion
+└── MoveTCPMotion
+ParkArmsActionPerformable
+└── MoveArmJointsMotion"""
+
+
+async def thesis_plan() -> Pose:
+    """As it is printed there, awaited; returns where the cereal was to be put."""
+    cereal_desig = ObjectDesignatorDescription(names=["cereal"])
+    robot_desig = ObjectDesignatorDescription(names=["pr2"]).resolve()
+    kitchen_desig = ObjectDesignatorDescription(names=["kitchen"])
+
+    await ParkArmsActionPerformable(Arms.BOTH).perform()
+    await MoveTorsoAction([0.3]).resolve().perform()
+    pickup_pose = CostmapLocation(target=cereal_desig.resolve(), reachable_for=robot_desig).resolve()
+    pickup_arm = pickup_pose.reachable_arms[0]
+    await NavigateAction(target_locations=[pickup_pose.pose]).resolve().perform()
+    await (
+        PickUpAction(object_designator_description=cereal_desig, arms=[pickup_arm], grasps=[Grasp.FRONT])
+        .resolve()
+        .perform()
+    )
+    await ParkArmsAction([Arms.BOTH]).resolve().perform()
+    place_island = SemanticCostmapLocation(
+        "kitchen_island_surface", kitchen_desig.resolve(), cereal_desig.resolve()
+    ).resolve()
+    place_stand = CostmapLocation(place_island.pose, reachable_for=robot_desig, reachable_arm=pickup_arm).resolve()
+    await NavigateAction(target_locations=[place_stand.pose]).resolve().perform()
+    await PlaceAction(cereal_desig, target_locations=[place_island.pose], arms=[pickup_arm]).resolve().perform()
+    await ParkArmsActionPerformable(Arms.BOTH).perform()
+    return place_island.pose
+
+
+async def test_the_thesis_plan_puts_the_cereal_on_the_island(scene: Scene) -> None:
+    with collected_tree() as tree:
+        goal = await thesis_plan()
+    assert scene.cereal.pose.distance(goal) < 0.01
+    island, cereal = scene.kitchen.bounding_box("kitchen_island_surface"), scene.cereal.bounding_box()
+    assert math.isclose(cereal.min.z, island.max.z, abs_tol=1e-9)
+    assert island.min.x < cereal.min.x < cereal.max.x < island.max.x
+    assert island.min.y < cereal.min.y < cereal.max.y < island.max.y
+    assert (scene.cereal.attached_to, scene.milk.pose.position) == (None, (1.3, 1, 0.9))
+    assert re.sub(r" SUCCEEDED \d+\.\d ms", "", str(tree)) == TREE
+    assert {node.status for node in tree} == {TaskStatus.SUCCEEDED}
+
+
+async def test_a_recorder_hears_all_of_the_thesis_plan(scene: Scene) -> None:
+    with Recording().listening() as recording:
+        await thesis_plan()
+    assert len(recording.ended) == len(TREE.splitlines()) == 22
+    assert recording.open == []
+    assert [each for each in recording.told if each.startswith("place")] == [
+        "place CostmapLocation",
+        "place SemanticCostmapLocation",
+        "place CostmapLocation",
+    ]
+    assert all((taken, len(offered)) == (0, 1) for _, offered, taken, _, _ in recording.places)
+
+
+async def test_the_plan_is_the_same_twice(scene: Scene) -> None:
+    first = await thesis_plan()
+    robot = scene.robot.pose
+    scene.world.reset()
+    assert (await thesis_plan(), scene.robot.pose) == (first, robot)
