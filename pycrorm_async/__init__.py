@@ -1,1 +1,42 @@
-"""Episodic memory for robots: plans remembered as events, asked about as tables."""
+"""Episodic memory for robots: plans remembered as events, asked about as tables.
+
+>>> async with Memory.open("sqlite:///memory.db") as memory:
+...     async with memory.episode(description="Tutorial"):
+...         await plan()
+...     await memory.flush()
+...     async with memory.session() as session:
+...         actions = (await session.scalars(select(Action))).all()
+
+The parts a user meets: `pycrorm_async.plan` (designators), `pycrorm_async.world` (where they act), `pycrorm_async.orm`
+(the classes to ask for). Importing this loads nothing else.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pycrorm_async.config import Settings
+    from pycrorm_async.errors import PycrormError
+    from pycrorm_async.memory import Memory, MemoryStatus, recover
+    from pycrorm_async.projections.views import UserView
+    from pycrorm_async.query.reading import Reading
+
+__version__ = "0.1.0"
+
+__all__ = ["Memory", "MemoryStatus", "PycrormError", "Reading", "Settings", "UserView", "recover"]
+
+_HOMES = {
+    "Memory": "memory",
+    "MemoryStatus": "memory",
+    "PycrormError": "errors",
+    "Reading": "query.reading",
+    "Settings": "config",
+    "UserView": "projections.views",
+    "recover": "memory",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

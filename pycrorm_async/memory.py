@@ -16,7 +16,6 @@ import os
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, suppress
 from contextvars import ContextVar, Token
-from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
@@ -24,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
 from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
 
+from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError, PycrormError
@@ -164,7 +164,7 @@ class Memory:
         self._stack.push_async_exit(self._drain)
         self._reading = await self._stack.enter_async_context(Reading.open_address(address))
         self._emitter = Emitter(self._queue, self._settings)
-        self._recorder = Recorder(self._emitter, clock=self._clock, software=version("pycrorm-async"))
+        self._recorder = Recorder(self._emitter, clock=self._clock, software=__version__)
         self._tokens: tuple[Token[PlanObserver | None], Token[WorldWatcher | None]] = (
             recorder.set(self._recorder),
             watcher.set(self._recorder),

@@ -1,0 +1,6 @@
+"""`python -m pycrorm_async`: the same as the command `pycrorm`."""
+
+from pycrorm_async.cli.main import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""A plan killed in the middle: every node whose hook returned is remembered once, and the episode says LOST."""
+
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.commands import COMMAND, answer, environment, pycrorm
+
+PLAN = '''
+import itertools, os
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract, NavigateActionPerformable, simulated_robot
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+
+def say(*words):
+    os.write(1, (" ".join(map(str, words)) + "\\n").encode())
+
+@dataclass
+class StepActionPerformable(ActionAbstract):
+    index: int
+
+    async def perform(self):
+        say("started", self.index)
+        await NavigateActionPerformable(Pose([self.index / 1000, 0, 0])).perform()
+
+async def plan():
+    """Walk until killed."""
+    with BulletWorld(), simulated_robot:
+        Object("pr2", ObjectType.ROBOT)
+        for index in itertools.count():
+            await StepActionPerformable(index).perform()
+            say("ended", index)
+'''
+
+
+def killed(folder: Path, seconds: float) -> tuple[set[int], set[int]]:
+    """Runs the plan, kills it that long after its first step; the steps that said they started, and ended."""
+    process = subprocess.Popen([*COMMAND, "run", "walk.py"], cwd=folder, env=environment(), stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    output = process.stdout.readline()
+    assert output == b"started 0\n"
+    read_end = process.stdout.fileno()
+    os.set_blocking(read_end, False)
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        try:
+            output += os.read(read_end, 1 << 16)
+        except BlockingIOError:
+            continue
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    os.set_blocking(read_end, True)
+    output += process.stdout.read()
+    process.stdout.close()
+    whole = output[: output.rfind(b"\n")].decode().splitlines()
+    steps = [line.split() for line in whole]
+    return (
+        {int(step[1]) for step in steps if step[0] == "started"},
+        {int(step[1]) for step in steps if step[0] == "ended"},
+    )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_every_node_whose_hook_returned_is_there_once_and_the_episode_is_lost(tmp_path: Path, seed: int) -> None:
+    (tmp_path / "walk.py").write_text(PLAN)
+    seconds = random.Random(seed).uniform(0.0, 0.6)
+    print(f"seed {seed}: killed after {seconds:.3f} s")
+    started, ended = killed(tmp_path, seconds)
+
+    waiting = pycrorm("episodes", cwd=tmp_path)
+    assert "pycrorm writer --once" in waiting.stderr
+    report = answer("writer", "--once", cwd=tmp_path)
+    assert len(report["lost"]) == 1
+    shown = answer("show", "last", cwd=tmp_path)
+    assert shown["episode"]["status"] == "LOST"
+
+    steps = [node for node in shown["tree"] if node["dtype"] == "StepAction"]
+    found = {node["parameters"]["index"]: node["status"] for node in steps}
+    assert len(found) == len(steps)
+    assert started <= set(found) <= started | {len(started)}
+    assert {index for index in ended if found[index] != "SUCCEEDED"} == set()
+    assert set(found.values()) <= {"SUCCEEDED", "LOST"}
+    assert len([index for index in found if found[index] == "LOST"]) <= 1
+    root = next(node for node in shown["tree"] if node["dtype"] is None)
+    assert root["status"] == "LOST"
+
+    again = answer("writer", "--once", cwd=tmp_path)
+    assert (again["recorders"], again["events_stored"], again["lost"]) == ([], 0, [])
+    assert answer("show", "last", cwd=tmp_path) == shown
+    assert not [path for path in (tmp_path / "pycrorm.db.spool").iterdir() if path.is_dir()]

@@ -1,0 +1,67 @@
+"""A plan that never suspends, 100,000 actions long: all of them stored, and the process does not grow."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.commands import environment
+
+SCRIPT = '''
+import asyncio, json, re, sys
+from dataclasses import dataclass
+from pathlib import Path
+from sqlalchemy import func, select
+from pycrorm_async import Memory
+from pycrorm_async.orm import Designator, TaskTreeNode
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.plan.task_tree import TaskStatus
+
+@dataclass
+class CountActionPerformable(ActionAbstract):
+    index: int
+
+    async def perform(self):
+        return None
+
+def anonymous_kib():
+    return int(re.search(r"RssAnon:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+
+async def main(url, total):
+    sizes = []
+    async with Memory.open(url) as memory:
+        async with memory.episode(description="count"):
+            for index in range(total):
+                await CountActionPerformable(index).perform()
+                if index % (total // 10) == total // 10 - 1:
+                    sizes.append(anonymous_kib())
+        await memory.flush()
+        async with memory.session() as session:
+            counting = memory.mapped(CountActionPerformable)
+            rows = (await session.execute(select(func.count(), func.min(counting.index), func.max(counting.index),
+                func.count(counting.index.distinct())))).one()
+            done = await session.scalar(select(func.count()).where(TaskTreeNode.status == TaskStatus.SUCCEEDED))
+    print(json.dumps({"sizes": sizes, "rows": list(rows), "done": done}))
+
+asyncio.run(main(sys.argv[1], int(sys.argv[2])))
+'''
+
+
+@pytest.mark.parametrize("total", [100_000])
+def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path, total: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, f"sqlite:///{tmp_path}/long.db", str(total)],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["rows"] == [total, 0, total - 1, total]
+    assert found["done"] == total + 1  # the root of the episode as well
+    # 90,000 actions more, at the 32 kB a node of the reference system, would be 2.8 GB.
+    assert found["sizes"][-1] - found["sizes"][0] < 40_000, found["sizes"]
