@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import re
+from collections.abc import Awaitable
 
 from pycrorm_async.plan import (
     CostmapLocation,
@@ -17,8 +19,9 @@ from pycrorm_async.plan import (
     SemanticCostmapLocation,
     TaskStatus,
     collected_tree,
+    simulated_robot,
 )
-from pycrorm_async.world import Arms, Grasp, Pose
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, WorldMode
 from tests.plan.conftest import Scene
 from tests.plan.recording import Recording
 
@@ -98,6 +101,32 @@ async def test_a_recorder_hears_all_of_the_thesis_plan(scene: Scene) -> None:
         "place CostmapLocation",
     ]
     assert all((taken, len(offered)) == (0, 1) for _, offered, taken, _, _ in recording.places)
+
+
+class Alternating(Recording):
+    """Lets other tasks run before every node."""
+
+    def admit(self) -> Awaitable[None]:
+        return asyncio.sleep(0)
+
+
+async def test_three_plans_in_three_worlds_at_once_do_not_mix() -> None:
+    async def alone() -> tuple[float, str]:
+        with BulletWorld(mode=WorldMode.DIRECT), simulated_robot, collected_tree() as tree:
+            Object("pr2", ObjectType.ROBOT)
+            Object("kitchen", ObjectType.ENVIRONMENT)
+            cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
+            await all_ready.wait()
+            goal = await thesis_plan()
+            return cereal.pose.distance(goal), re.sub(r" SUCCEEDED \d+\.\d ms", "", str(tree))
+
+    all_ready = asyncio.Barrier(3)
+    with Alternating().listening() as recording:
+        for distance, tree in await asyncio.gather(alone(), alone(), alone()):
+            assert distance < 0.01
+            assert tree == TREE
+    assert recording.told[:3] == ["start ParkArmsActionPerformable"] * 3
+    assert [node.parent for node in recording.ended].count(None) == 3 * 8
 
 
 async def test_the_plan_is_the_same_twice(scene: Scene) -> None:

@@ -1,0 +1,280 @@
+"""Where places are found, that what is offered works, and that a recorder hears of it once."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+
+from pycrorm_async.plan import (
+    ActionAbstract,
+    CostmapLocation,
+    Location,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    NoWorldHere,
+    ObjectRelativeLocation,
+    ParkArmsActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    SemanticCostmapLocation,
+)
+from pycrorm_async.plan.failures import (
+    LookingHighLevelFailure,
+    ObjectUnavailable,
+    ObjectUnreachable,
+    PerceptionObjectNotInWorld,
+    ReachabilityFailure,
+)
+from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.plan.ports import Candidate
+from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world.errors import UnknownLink
+from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.shapes import box_urdf
+from tests.plan.conftest import Scene
+from tests.plan.recording import Recording
+
+LEFT_TOOL = "l_gripper_tool_frame"
+OUT_OF_REACH = Pose([1.3, 1, 3])
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, math.pi])
+async def test_from_every_stand_that_is_offered_the_object_can_be_picked_up(scene: Scene, yaw: float) -> None:
+    await MoveTorsoActionPerformable(0.2).perform()
+    await ParkArmsActionPerformable(Arms.RIGHT).perform()
+    scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(yaw)))
+    before = scene.world.save_state()
+    stands = list(CostmapLocation(target=scene.milk, reachable_for=scene.robot))
+    assert len(stands) > 100
+    for stand in stands[::9]:
+        for arm in stand.reachable_arms:
+            await NavigateActionPerformable(stand.pose).perform()
+            await PickUpActionPerformable(scene.milk, arm, Grasp.FRONT).perform()
+            scene.world.restore_state(before)
+
+
+async def test_from_every_stand_that_is_offered_the_held_object_can_be_placed(scene: Scene) -> None:
+    await MoveTorsoActionPerformable(0.2).perform()
+    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
+    await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.RIGHT).perform()
+    await ParkArmsActionPerformable(Arms.BOTH).perform()
+    goal = Pose([-1.4, 0.8, 0.99], yaw_quaternion(0.5))
+    before = scene.world.save_state()
+    stands = list(CostmapLocation(goal, reachable_for=scene.robot, reachable_arm=Arms.LEFT))
+    assert len(stands) > 100
+    for stand in stands[::9]:
+        assert stand.reachable_arms == (Arms.LEFT,)
+        await NavigateActionPerformable(stand.pose).perform()
+        await PlaceActionPerformable(scene.milk, Arms.LEFT, goal).perform()
+        scene.world.restore_state(before)
+
+
+def test_stands_are_on_the_floor_face_the_target_and_are_clear_of_furniture(scene: Scene) -> None:
+    boxes = [box for link in scene.kitchen.links if (box := scene.kitchen.bounding_box(link)).size != (0, 0, 0)]
+    stands = list(CostmapLocation(scene.cereal, reachable_for=scene.robot))
+    for pose in (each.pose for each in stands):
+        assert pose.position.z == 0
+        away = (1.3 - pose.position.x, 0.7 - pose.position.y)
+        assert pose.yaw == pytest.approx(math.atan2(away[1], away[0]))
+        for box in boxes:
+            gap_x = max(box.min.x - pose.position.x, pose.position.x - box.max.x)
+            gap_y = max(box.min.y - pose.position.y, pose.position.y - box.max.y)
+            assert max(gap_x, gap_y) >= 0.32 - 1e-9
+    distances = [stand.pose.distance(Pose([1.3, 0.7, 0])) for stand in stands]
+    assert distances == pytest.approx(sorted(distances))
+
+
+def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
+    def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
+        found = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=arm)
+        return {each.reachable_arms for each in found}
+
+    scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(1.0)))
+    assert reaching(Arms.RIGHT) == {(Arms.RIGHT,)}
+    assert reaching(Arms.BOTH) == {(Arms.LEFT, Arms.RIGHT)}
+    assert {(Arms.RIGHT,), (Arms.LEFT, Arms.RIGHT)} <= reaching(None)
+
+
+async def test_from_where_it_is_to_be_seen_it_is_seen(scene: Scene) -> None:
+    Object("wall", ObjectType.GENERIC_OBJECT, box_urdf("wall", x=(-0.02, 0.02), y=(-0.3, 0.3), z=(0, 2)),
+           Pose([1.0, 0.9, 0]))  # fmt: skip
+    stands = list(CostmapLocation(scene.milk, visible_for=scene.robot))
+    assert stands
+    assert all(each.reachable_arms == () for each in stands)
+    for stand in stands[::20]:
+        await NavigateActionPerformable(stand.pose).perform()
+        eye = scene.robot.link_pose("wide_stereo_optical_frame").position
+        assert scene.world.visible(scene.milk, eye, ignore=[scene.robot]) >= 0.5
+    for stand in list(CostmapLocation(scene.milk.pose, visible_for=scene.robot))[::20]:
+        await NavigateActionPerformable(stand.pose).perform()
+        eye = scene.robot.link_pose("wide_stereo_optical_frame").position
+        assert scene.world.ray_test([eye], [scene.milk.pose.position], ignore=[scene.robot]) in ([None], [scene.milk])
+
+
+def test_looking_for_places_moves_nothing(scene: Scene) -> None:
+    before = scene.world.save_state()
+    list(itertools.islice(CostmapLocation(scene.milk, reachable_for=scene.robot, visible_for=scene.robot), 5))
+    list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk))
+    assert scene.world.save_state() == before
+
+
+def test_no_place_to_reach_it_from_is_a_failure_and_is_recorded(scene: Scene) -> None:
+    scene.milk.set_pose(OUT_OF_REACH)
+    with Recording().listening() as recording:
+        with pytest.raises(ObjectUnreachable, match="pick up milk"):
+            CostmapLocation(scene.milk, reachable_for=scene.robot).resolve()
+        with pytest.raises(ReachabilityFailure) as caught:
+            CostmapLocation(OUT_OF_REACH, reachable_for=scene.robot).resolve()
+        assert caught.value.data == (OUT_OF_REACH,)
+        assert list(CostmapLocation(OUT_OF_REACH, reachable_for=scene.robot)) == []
+    assert recording.places == [("CostmapLocation", (), None, 600, None)] * 3
+
+
+def test_no_place_to_see_it_from_is_a_failure_and_is_recorded(scene: Scene) -> None:
+    crate = box_urdf("crate", x=(-0.2, 0.2), y=(-0.2, 0.2), z=(-0.2, 0.2))
+    Object("crate", ObjectType.GENERIC_OBJECT, crate, scene.milk.pose)
+    with Recording().listening() as recording, pytest.raises(LookingHighLevelFailure):
+        CostmapLocation(scene.milk, visible_for=scene.robot).resolve()
+    assert recording.places == [("CostmapLocation", (), None, 0, None)]
+
+
+def test_a_target_that_is_gone_or_no_robot_is_said(scene: Scene) -> None:
+    scene.world.remove(scene.milk)
+    with pytest.raises(PerceptionObjectNotInWorld, match="milk"):
+        SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk).resolve()
+    with pytest.raises(NoWorldHere, match="'cereal' is not a robot"):
+        CostmapLocation(scene.kitchen, reachable_for=scene.cereal).resolve()
+    with pytest.raises(UnknownLink):
+        SemanticCostmapLocation("attic", scene.kitchen).resolve()
+
+
+# --- what a recorder hears -----------------------------------------------------------------------------------------
+
+
+def test_resolving_is_told_with_what_was_taken(scene: Scene) -> None:
+    with Recording().listening() as recording:
+        stand = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.RIGHT).resolve()
+    offered = (Candidate(stand.pose, (Arms.RIGHT,)),)
+    ((name, told, taken, considered, node),) = recording.places
+    assert (name, told, taken, node) == ("CostmapLocation", offered, 0, None)
+    first = next(iter(CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.RIGHT)))
+    assert first == stand
+    assert 1 <= considered <= 600
+
+
+def test_a_loop_over_places_is_told_when_it_is_left_with_the_last_one_as_taken(scene: Scene) -> None:
+    location = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk)
+    with Recording().listening() as recording:
+        for place in location:
+            if place.pose.position.x < -1.5:
+                break
+        ((_, offered, taken, considered, _),) = recording.places
+        assert offered[-1] == Candidate(place.pose)
+        assert taken == len(offered) - 1 == considered - 1
+        assert all(each.pose.position.x >= -1.5 for each in offered[:-1])
+
+
+def test_a_loop_that_ends_took_none(scene: Scene) -> None:
+    with Recording().listening() as recording:
+        places = list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk))
+    assert recording.places == [
+        ("SemanticCostmapLocation", tuple(Candidate(each.pose) for each in places), None, len(places), None)
+    ]
+
+
+def test_a_search_that_was_never_asked_is_not_told(scene: Scene) -> None:
+    with Recording().listening() as recording:
+        iter(CostmapLocation(scene.milk, reachable_for=scene.robot)).close()
+    assert recording.places == []
+
+
+def test_a_search_that_is_dropped_is_told_to_the_recorder_it_began_with(scene: Scene) -> None:
+    with Recording().listening() as recording:
+        places = iter(CostmapLocation(scene.milk, reachable_for=scene.robot))
+        next(places)
+        next(places)
+    assert recording.places == []
+    del places
+    ((_, offered, taken, _, _),) = recording.places
+    assert (len(offered), taken) == (2, 1)
+
+
+async def test_the_node_that_asks_is_told(scene: Scene) -> None:
+    class Asking(ActionAbstract):
+        async def perform(self) -> Pose:
+            return Location(Pose([1, 2, 0])).resolve().pose
+
+    with Recording().listening() as recording:
+        assert await Asking().perform() == Pose([1, 2, 0])
+    ((name, offered, taken, considered, node),) = recording.places
+    assert (name, offered, taken, considered) == ("Location", (Candidate(Pose([1, 2, 0])),), 0, 1)
+    assert node is recording.ended[0]
+
+
+# --- the other designators -----------------------------------------------------------------------------------------
+
+
+def test_a_location_is_itself_and_one_beside_an_object_moves_with_it(scene: Scene) -> None:
+    here = Location(Pose([1, 2, 0]), (Arms.LEFT,))
+    assert (here.resolve(), list(here)) == (here, [here])
+    beside = ObjectRelativeLocation(Pose([0, 0.5, 0]), designator_of(scene.milk))
+    assert beside.resolve() == Location(Pose([1.3, 1.5, 0.9]))
+    scene.milk.set_pose(Pose([0, 0, 1], yaw_quaternion(math.pi / 2)))
+    assert beside.resolve().pose.position == pytest.approx((-0.5, 0, 1))
+
+
+def test_things_stand_on_the_surface_wholly_the_middle_first(scene: Scene) -> None:
+    places = list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk))
+    surface = scene.kitchen.bounding_box("kitchen_island_surface")
+    assert places[0].pose.position == pytest.approx((surface.centre.x, surface.centre.y, surface.max.z + 0.088))
+    for place in places:
+        scene.milk.set_pose(place.pose)
+        box = scene.milk.bounding_box()
+        assert box.min.z == pytest.approx(surface.max.z)
+        assert surface.min.x - 1e-9 <= box.min.x
+        assert box.max.x <= surface.max.x + 1e-9
+        assert surface.min.y - 1e-9 <= box.min.y
+        assert box.max.y <= surface.max.y + 1e-9
+    assert len({place.pose.position for place in places}) == len(places) > 1000
+    assert list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk)) == places
+
+
+def test_how_a_thing_is_held_now_does_not_matter_for_where_it_will_stand(scene: Scene) -> None:
+    upright = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.cereal).resolve()
+    scene.cereal.set_pose(Pose([0.5, 0, 1.2], [0.5, 0.1, 0.2, 0.6]))
+    scene.robot.attach(scene.cereal, LEFT_TOOL)
+    assert SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.cereal).resolve() == upright
+
+
+def test_a_place_that_is_taken_is_not_offered(scene: Scene) -> None:
+    location = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk)
+    free = len(list(location))
+    middle = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.cereal).resolve()
+    scene.cereal.set_pose(middle.pose)
+    with Recording().listening() as recording:
+        left = list(location)
+    assert 0 < len(left) < free
+    assert recording.places[0][3] == free
+    for place in left:
+        scene.milk.set_pose(place.pose)
+        milk, cereal = scene.milk.bounding_box(), scene.cereal.bounding_box()
+        assert (
+            milk.max.x <= cereal.min.x + 1e-6
+            or cereal.max.x <= milk.min.x + 1e-6
+            or milk.max.y <= cereal.min.y + 1e-6
+            or cereal.max.y <= milk.min.y + 1e-6
+        )
+
+
+def test_a_surface_without_room_is_a_failure(scene: Scene) -> None:
+    Object("crate", ObjectType.GENERIC_OBJECT, box_urdf("crate", x=(-1, 1), y=(-1, 1), z=(0, 0.5)),
+           Pose([-1.45, 1.0, 0.9]))  # fmt: skip
+    with pytest.raises(ObjectUnavailable, match="no room for milk on kitchen_island_surface"):
+        SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk).resolve()
+
+
+def test_without_a_thing_the_places_are_on_the_surface_itself(scene: Scene) -> None:
+    place = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen).resolve()
+    assert place.pose.position == pytest.approx((-1.45, 1.0, 0.9))
