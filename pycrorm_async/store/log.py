@@ -121,10 +121,9 @@ class EventLog:
         """The episodes of which the tables do not show all; without the parked ones."""
         return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_BEHIND)]
 
-    async def stopped(self) -> dict[str, str]:
-        """Every episode, by id, that the log refused something of or that is parked, and why."""
-        rows = [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_STOPPED)]
-        return {row.id: "; ".join(filter(None, (row.refused, row.parked))) for row in rows}
+    async def stopped(self) -> list[EpisodeRow]:
+        """The episodes that the log refused something of, or that are parked; the rows say why."""
+        return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_STOPPED)]
 
     async def declarations(self) -> list[bytes]:
         """The payloads of all DesignatorTypeDeclared, in the order of their first arrival."""

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError, PycrormError
+from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
 from pycrorm_async.writer.backoff import PATIENT
-from pycrorm_async.writer.drain import Drain, DrainState
+from pycrorm_async.writer.drain import Drain, DrainState, to_the_end
 from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["LiveWriter", "WriterState"]
@@ -160,17 +160,21 @@ class LiveWriter:
 
     async def _adopt_all(self) -> None:
         # Finding and recovering folders reads files: in a thread, so that our own queue does not wait for it.
+        sources: Iterator[Source] = iter(())
         try:
-            sources = await asyncio.to_thread(lambda: iter(self._adopt()))
-            while (source := await asyncio.to_thread(next, sources, None)) is not None:
+            sources = await to_the_end(asyncio.to_thread(lambda: iter(self._adopt())))
+            while (source := await to_the_end(asyncio.to_thread(next, sources, None))) is not None:
                 await self._drain_adopted(source)
-        except PycrormError as error:
+        except Exception as error:  # noqa: BLE001 - shown in the state; another's folder does not stop our own queue
             self._adoption_errors.append(str(error))
+        finally:
+            if isinstance(sources, Generator):
+                sources.close()  # so that it lets go of the folder it is at
 
     async def _drain_adopted(self, source: Source) -> None:
         drain = Drain(source, self._destination, settings=self._settings, on_append=self._news.set)
         self._adopted.append(drain)
         try:
             await drain.run()
-        except PycrormError as error:
+        except Exception as error:  # noqa: BLE001 - shown in the state; the next folder may be in order
             self._adoption_errors.append(f"{source.name}: {error}")

@@ -1,0 +1,21 @@
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+
+
+@pytest.fixture
+def address(tmp_path: Path) -> DatabaseAddress:
+    return DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}")
+
+
+@pytest.fixture
+async def log(address: DatabaseAddress) -> AsyncIterator[EventLog]:
+    opened = await EventLog.open(address, create=True)
+    yield opened
+    await opened.close()

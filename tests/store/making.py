@@ -1,0 +1,60 @@
+"""Records for the tests of the store and the writer, and a second look at the file by the driver alone."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
+
+__all__ = ["episode", "record", "run_of", "declaration", "ask"]
+
+
+def episode(number: int) -> EpisodeId:
+    """An episode id that differs from others in its last digits only."""
+    return EpisodeId(bytes(14) + number.to_bytes(2))
+
+
+def record(
+    of: EpisodeId,
+    sequence: int,
+    *,
+    position: int | None = None,
+    kind: str = "NodeStarted",
+    version: int = 1,
+    wall_ns: int | None = None,
+    monotonic_ns: int | None = None,
+    payload: bytes | None = None,
+) -> Record:
+    return Record(
+        position=sequence if position is None else position,
+        episode=of,
+        sequence=sequence,
+        type=kind,
+        version=version,
+        wall_ns=1_700_000_000_000_000_000 + sequence if wall_ns is None else wall_ns,
+        monotonic_ns=5_000_000 + sequence if monotonic_ns is None else monotonic_ns,
+        payload=b'{"kind":"action","parent":%d}' % sequence if payload is None else payload,
+    )
+
+
+def run_of(of: EpisodeId, first: int, last: int, *, position: int | None = None) -> list[Record]:
+    """Events `first` to `last`, at positions from `position` on."""
+    start = first if position is None else position
+    return [record(of, sequence, position=start + index) for index, sequence in enumerate(range(first, last + 1))]
+
+
+def declaration(payload: bytes, *, position: int = 1) -> Record:
+    return Record(position, None, 0, "DesignatorTypeDeclared", 1, 7, 8, payload)
+
+
+def ask(path: Path, statement: str, parameters: Iterable[Any] = ()) -> list[Any]:
+    """Rows, by a connection of its own that knows nothing of ours."""
+    connection = sqlite3.connect(path)
+    try:
+        return connection.execute(statement, tuple(parameters)).fetchall()
+    finally:
+        connection.close()

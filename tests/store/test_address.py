@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from sqlalchemy import text
+from sqlalchemy.exc import OperationalError
+
+from pycrorm_async.errors import DatabaseUnavailable, UnknownUrl
+from pycrorm_async.store.address import DatabaseAddress
+
+
+def test_three_slashes_name_a_file_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    address = DatabaseAddress.parse("sqlite:///memory.db")
+    monkeypatch.chdir("/")
+    assert address.path == tmp_path / "memory.db"
+    assert address.default_spool == tmp_path / "memory.db.spool"
+
+
+def test_four_slashes_name_a_file_by_its_absolute_path() -> None:
+    address = DatabaseAddress.parse("sqlite:////data/lab 1/memory.db")
+    assert address.path == Path("/data/lab 1/memory.db")
+    assert address.default_spool == Path("/data/lab 1/memory.db.spool")
+    assert str(address) == "sqlite:////data/lab 1/memory.db"
+    assert address.is_sqlite
+    assert not address.is_private
+
+
+def test_a_password_is_in_no_text_of_an_address() -> None:
+    address = DatabaseAddress.parse("postgresql://robot:s3cret@lab:5433/memory?password=s3cret")
+    assert str(address) == "postgresql://robot:***@lab:5433/memory"
+    assert repr(address) == "DatabaseAddress('postgresql://robot:***@lab:5433/memory')"
+    assert not address.is_sqlite
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("mysql://u:s3cret@h/db", "mysql:// is not a database we know"),
+        ("sqlite+aiosqlite:///x.db", "sqlite+aiosqlite:// is not a database we know"),
+        ("postgres://u:s3cret@h/db", "postgres:// is not a database we know"),
+        ("memory.db", "this is not a database URL"),
+        ("", "this is not a database URL"),
+        ("postgresql://u:s3cret@h:port/db", "this is not a database URL"),
+        ("sqlite://memory.db", "a SQLite URL has three slashes, a path and nothing else"),
+        ("sqlite:///memory.db?mode=ro", "a SQLite URL has three slashes, a path and nothing else"),
+        ("sqlite:///", "'' is not a path"),
+        ("sqlite:///:memory:", "':memory:' is not a path"),
+        ("postgresql://u:s3cret@h", "a PostgreSQL URL names its database"),
+    ],
+)
+def test_another_url_is_refused_with_what_works_and_without_its_password(url: str, reason: str) -> None:
+    with pytest.raises(UnknownUrl) as caught:
+        DatabaseAddress.parse(url)
+    message = str(caught.value)
+    assert message.startswith(f"{reason}; what works: sqlite:///memory.db")
+    assert "s3cret" not in message
+
+
+def test_postgresql_is_understood_and_honestly_refused() -> None:
+    address = DatabaseAddress.parse("postgresql://robot:s3cret@lab/memory")
+    with pytest.raises(DatabaseUnavailable) as caught:
+        address.engine()
+    assert str(caught.value) == ("postgresql://robot:***@lab/memory: PostgreSQL is not supported yet by this version")
+
+
+async def test_an_engine_never_makes_a_file_that_is_missing(tmp_path: Path) -> None:
+    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/memory.db")
+    for engine in (address.engine(read_only=True), address.engine()):
+        with pytest.raises(OperationalError, match="unable to open database file"):
+            async with engine.connect():
+                pass
+        await engine.dispose()
+    assert not address.path.exists()
+
+
+async def test_a_path_may_hold_what_a_url_has_to_escape(tmp_path: Path) -> None:
+    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/50%25 of%3F a #memory.db")
+    assert address.path == tmp_path / "50% of? a #memory.db"
+    address.path.touch()
+    engine = address.engine()
+    async with engine.begin() as connection:
+        await connection.execute(text("CREATE TABLE t (a)"))
+    await engine.dispose()
+    assert address.path.read_bytes()[:15] == b"SQLite format 3"
+
+
+async def test_a_commit_waits_for_the_disk_and_a_reader_cannot_write(address: DatabaseAddress) -> None:
+    address.path.touch()
+    writing, reading = address.engine(), address.engine(read_only=True)
+    async with writing.begin() as connection:
+        assert (await connection.execute(text("PRAGMA synchronous"))).scalar_one() == 2  # FULL
+        await connection.execute(text("CREATE TABLE t (a)"))
+    async with reading.connect() as connection:
+        with pytest.raises(OperationalError, match="readonly database"):
+            await connection.execute(text("INSERT INTO t VALUES (1)"))
+    await writing.dispose()
+    await reading.dispose()
+
+
+async def test_a_writing_transaction_rolls_back_tables_as_well(address: DatabaseAddress) -> None:
+    address.path.touch()
+    engine = address.engine()
+    async with engine.begin() as connection:
+        await connection.execute(text("CREATE TABLE t (a)"))
+        await connection.rollback()
+    async with engine.connect() as connection:
+        assert (await connection.execute(text("SELECT count(*) FROM sqlite_master"))).scalar_one() == 0
+    await engine.dispose()

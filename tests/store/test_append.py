@@ -1,0 +1,297 @@
+from __future__ import annotations
+
+import json
+import sqlite3
+
+import pytest
+
+from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged
+from pycrorm_async.events.codec import fingerprint
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_text
+from pycrorm_async.store.log import EventLog
+from tests.store.making import ask, declaration, episode, record, run_of
+
+HEADS = "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode ORDER BY number"
+
+
+def name(number: int) -> str:
+    return f"00000000-0000-0000-0000-{number:012x}"
+
+
+async def test_every_column_is_stored_as_it_was_given(log: EventLog) -> None:
+    given = record(
+        episode(1),
+        1,
+        position=77,
+        kind="ObjectAdded",
+        version=3,
+        wall_ns=1_785_000_000_123_456_789,
+        monotonic_ns=9_007_199_254_740_993,
+        payload=b'{"name":"milk"}',
+    )
+    await log.append([given])
+    assert ask(log.address.path, "SELECT * FROM event") == [
+        (1, 1, "ObjectAdded", 3, 1_785_000_000_123_456_789, 9_007_199_254_740_993, '{"name":"milk"}')
+    ]
+
+
+PAYLOADS = [
+    '{"x":0.1,"y":1e-310,"z":-0.0,"w":123456789012345678,"v":1.0}',
+    '{ "b" : 1,\n\t"a":2 , "b":3 }',
+    r'{"escaped":"\u00e9 \ud83e\udd16 \\ \" \/ \n"}',
+    '{"emoji":"🤖👩‍🍳","line":"\u2028\u2029","bom":"\ufeff","last":"\U0010ffff","rtl":"\u202e"}',
+    '{"deep":' + "[" * 400 + "]" * 400 + "}",
+    '{"long":"' + "ä" * 300_000 + '"}',
+    "'; DROP TABLE event; --",
+    "",
+]
+
+
+async def test_a_payload_is_stored_byte_for_byte(log: EventLog) -> None:
+    await log.append(
+        [record(episode(1), sequence, payload=text.encode()) for sequence, text in enumerate(PAYLOADS, start=1)]
+    )
+    assert [row[0] for row in ask(log.address.path, "SELECT payload FROM event ORDER BY sequence")] == PAYLOADS
+    assert [each.payload for each in await log.events(1)] == [text.encode() for text in PAYLOADS]
+
+
+async def test_times_may_be_as_large_and_as_small_as_64_bits(log: EventLog) -> None:
+    await log.append(
+        [
+            record(episode(1), 1, wall_ns=2**63 - 1, monotonic_ns=-(2**63)),
+            record(episode(1), 2, wall_ns=0, monotonic_ns=2**53 + 1),
+        ]
+    )
+    assert ask(log.address.path, "SELECT wall_ns, monotonic_ns FROM event ORDER BY sequence") == [
+        (9223372036854775807, -9223372036854775808),
+        (0, 9007199254740993),
+    ]
+
+
+async def test_episodes_are_numbered_in_the_order_in_which_they_appear(log: EventLog) -> None:
+    await log.append([*run_of(episode(9), 1, 2), *run_of(episode(3), 1, 1), *run_of(episode(9), 3, 3)])
+    await log.append([*run_of(episode(5), 1, 1), *run_of(episode(3), 2, 2)])
+    assert [row[:3] for row in ask(log.address.path, HEADS)] == [
+        (1, name(9), 3),
+        (2, name(3), 2),
+        (3, name(5), 1),
+    ]
+    assert episode_text(episode(9)) == name(9)
+
+
+async def test_a_batch_of_interleaved_episodes_is_stored_whole(log: EventLog) -> None:
+    given = [record(episode(which), sequence) for sequence in range(1, 41) for which in (1, 2, 3)]
+    assert await log.append(given) == {}
+    stored = ask(log.address.path, "SELECT episode, sequence FROM event ORDER BY episode, sequence")
+    assert stored == [(which, sequence) for which in (1, 2, 3) for sequence in range(1, 41)]
+
+
+async def test_an_episode_knows_when_it_started_and_ended(log: EventLog) -> None:
+    await log.append([record(episode(1), 1, wall_ns=100), record(episode(1), 2, wall_ns=200)])
+    assert ask(log.address.path, HEADS) == [(1, name(1), 2, 0, 100, None, None, None)]
+    await log.append([record(episode(1), 3, wall_ns=300, kind="EpisodeEnded")])
+    assert ask(log.address.path, HEADS) == [(1, name(1), 3, 0, 100, 300, None, None)]
+
+
+async def test_an_empty_batch_is_no_transaction(log: EventLog) -> None:
+    holder = sqlite3.connect(log.address.path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    assert await log.append([]) == {}
+    holder.close()
+
+
+# --- twice ----------------------------------------------------------------------------------------------------
+
+
+async def test_a_batch_appended_twice_is_stored_once(log: EventLog) -> None:
+    given = [declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 5), *run_of(episode(2), 1, 3)]
+    await log.append(given)
+    before = ask(log.address.path, "SELECT * FROM event"), ask(log.address.path, HEADS)
+    assert await log.append(given) == {}
+    assert (ask(log.address.path, "SELECT * FROM event"), ask(log.address.path, HEADS)) == before
+    assert ask(log.address.path, "SELECT count(*) FROM pycrorm_declaration") == [(1,)]
+
+
+async def test_a_batch_that_overlaps_what_is_stored_adds_what_is_new(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 5))
+    assert await log.append([*run_of(episode(1), 3, 8), *run_of(episode(1), 7, 9)]) == {}
+    assert ask(log.address.path, "SELECT sequence FROM event ORDER BY sequence") == [(n,) for n in range(1, 10)]
+    assert ask(log.address.path, "SELECT head FROM episode") == [(9,)]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"payload": b'{"kind":"motion"}'},
+        {"payload": b'{"kind":"action","parent":2} '},
+        {"kind": "NodeEnded"},
+        {"version": 2},
+        {"wall_ns": 1},
+        {"monotonic_ns": 1},
+    ],
+)
+async def test_another_event_under_a_stored_number_is_damage_and_stores_nothing(
+    log: EventLog, change: dict[str, bytes]
+) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    before = ask(log.address.path, "SELECT * FROM event")
+    with pytest.raises(LogDamaged) as caught:
+        await log.append(
+            [
+                *run_of(episode(2), 1, 4),
+                record(episode(1), 2, **change),  # type: ignore[arg-type]
+                *run_of(episode(1), 3, 6),
+            ]
+        )
+    assert (caught.value.episode, caught.value.sequence) == (name(1), 2)
+    assert ask(log.address.path, "SELECT * FROM event") == before
+    assert [row[:3] for row in ask(log.address.path, HEADS)] == [(1, name(1), 3)]
+
+
+async def test_another_event_under_a_number_of_the_same_batch_is_damage(log: EventLog) -> None:
+    with pytest.raises(LogDamaged) as caught:
+        await log.append([*run_of(episode(1), 1, 3), record(episode(1), 3, payload=b"{}")])
+    assert (caught.value.episode, caught.value.sequence) == (name(1), 3)
+    assert ask(log.address.path, "SELECT count(*) FROM event") == [(0,)]
+
+
+async def test_an_event_numbered_zero_is_damage(log: EventLog) -> None:
+    with pytest.raises(LogDamaged):
+        await log.append([record(episode(1), 0)])
+
+
+# --- refused --------------------------------------------------------------------------------------------------
+
+
+async def test_a_gap_stops_its_episode_before_the_gap_and_no_other(log: EventLog) -> None:
+    refused = await log.append(
+        [*run_of(episode(1), 1, 2), *run_of(episode(2), 1, 3), *run_of(episode(1), 5, 6), *run_of(episode(2), 4, 4)]
+    )
+    reason = "events 3 to 4 did not arrive before event 5"
+    assert refused == {episode(1): reason}
+    assert [(row[1], row[2], row[6]) for row in ask(log.address.path, HEADS)] == [
+        (name(1), 2, reason),
+        (name(2), 4, None),
+    ]
+    assert [(row.id, row.refused) for row in await log.stopped()] == [(name(1), reason)]
+
+
+async def test_an_episode_with_a_gap_goes_on_being_refused_with_its_first_reason_shown(log: EventLog) -> None:
+    await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 4)])
+    refused = await log.append([*run_of(episode(1), 5, 9), *run_of(episode(2), 1, 1)])
+    assert refused == {episode(1): "event 3 did not arrive before event 4"}
+    assert ask(log.address.path, "SELECT head FROM episode ORDER BY number") == [(2,), (1,)]
+
+
+async def test_an_episode_that_begins_with_a_gap_is_known_and_refused(log: EventLog) -> None:
+    assert await log.append(run_of(episode(1), 2, 4)) == {episode(1): "event 1 did not arrive before event 2"}
+    assert [row[:3] for row in ask(log.address.path, HEADS)] == [(1, name(1), 0)]
+
+
+async def test_a_refusal_ends_when_the_missing_events_arrive(log: EventLog) -> None:
+    await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 6)])
+    assert await log.append(run_of(episode(1), 3, 6)) == {}
+    assert ask(log.address.path, "SELECT head, refused FROM episode") == [(6, None)]
+    assert await log.stopped() == []
+
+
+async def test_repeating_what_is_stored_says_nothing_about_a_refusal(log: EventLog) -> None:
+    await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 6)])
+    assert await log.append(run_of(episode(1), 1, 2)) == {}
+    assert ask(log.address.path, "SELECT head, refused FROM episode") == [(2, "event 3 did not arrive before event 4")]
+
+
+@pytest.mark.parametrize("payload", [b'{"name":"a\x00b"}', b'{"name":"\xff"}', b'{"name":"\xc3', b'"\xed\xa0\x80"'])
+async def test_what_no_database_holds_as_text_stops_its_episode(log: EventLog, payload: bytes) -> None:
+    refused = await log.append(
+        [
+            *run_of(episode(2), 1, 2),
+            record(episode(1), 1),
+            record(episode(1), 2, payload=payload),
+            record(episode(1), 3),
+        ]
+    )
+    assert refused == {episode(1): "event 2: its payload is not text that a database can hold"}
+    assert [(row[1], row[2]) for row in ask(log.address.path, HEADS)] == [(name(2), 2), (name(1), 1)]
+
+
+async def test_an_episode_number_beyond_the_last_is_refused_and_nothing_else_is(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 1))
+    ask_to_change(log, "INSERT INTO episode (number, id, head, started_wall_ns) VALUES (?, 'x', 0, 0)")
+    refused = await log.append([*run_of(episode(2), 1, 2), *run_of(episode(1), 2, 3)])
+    assert refused == {episode(2): "this memory holds 4,194,303 episodes, the most it can"}
+    assert ask(log.address.path, "SELECT head FROM episode WHERE number = 1") == [(3,)]
+    assert ask(log.address.path, "SELECT count(*) FROM episode") == [(2,)]
+
+
+def ask_to_change(log: EventLog, statement: str) -> None:
+    connection = sqlite3.connect(log.address.path)
+    connection.execute(statement, (EPISODE_NUMBER_MAX,))
+    connection.commit()
+    connection.close()
+
+
+async def test_an_event_number_beyond_the_last_is_refused(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 1))
+    connection = sqlite3.connect(log.address.path)
+    connection.execute("UPDATE episode SET head = ?", (SEQUENCE_MAX - 1,))
+    connection.commit()
+    connection.close()
+    refused = await log.append(run_of(episode(1), SEQUENCE_MAX, SEQUENCE_MAX + 2))
+    assert refused == {episode(1): "event 67108864: an episode holds at most 67,108,863 events"}
+    assert ask(log.address.path, "SELECT head FROM episode") == [(67_108_863,)]
+
+
+# --- declarations ---------------------------------------------------------------------------------------------
+
+
+async def test_declarations_are_kept_once_in_the_order_of_their_first_arrival(log: EventLog) -> None:
+    one, two, three = (json.dumps({"dtype": letter, "ü": "\u2028"}, ensure_ascii=False).encode() for letter in "CAB")
+    await log.append([declaration(one), *run_of(episode(1), 1, 2), declaration(two), declaration(one)])
+    await log.append([declaration(two), declaration(three)])
+    assert await log.declarations() == [one, two, three]
+    assert ask(log.address.path, "SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal") == [
+        (fingerprint(one),),
+        (fingerprint(two),),
+        (fingerprint(three),),
+    ]
+
+
+async def test_a_record_of_the_recorder_that_is_no_declaration_is_damage(log: EventLog) -> None:
+    odd = declaration(b"{}", position=12)._replace(type="Other")
+    with pytest.raises(DamageError, match="record 12 belongs to no episode and is a Other"):
+        await log.append([*run_of(episode(1), 1, 2), odd])
+    assert ask(log.address.path, "SELECT count(*) FROM event") == [(0,)]
+
+
+# --- the database is away -------------------------------------------------------------------------------------
+
+
+async def test_a_database_locked_by_another_writer_is_away_and_takes_the_batch_afterwards(log: EventLog) -> None:
+    impatient = await EventLog.open(log.address, create=True, busy_timeout_s=0.05)
+    holder = sqlite3.connect(log.address.path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    with pytest.raises(DatabaseUnavailable, match="database is locked"):
+        await impatient.append(run_of(episode(1), 1, 3))
+    holder.execute("ROLLBACK")
+    holder.close()
+    await impatient.append(run_of(episode(1), 1, 3))
+    await impatient.close()
+    assert ask(log.address.path, "SELECT count(*) FROM event") == [(3,)]
+
+
+async def test_a_file_removed_below_the_log_is_an_unavailable_database_not_a_success(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    log.address.path.unlink()
+    with pytest.raises(DatabaseUnavailable, match="the file was removed or replaced while it was open"):
+        await log.append(run_of(episode(1), 4, 5))
+
+
+async def test_a_log_replaced_by_garbage_is_reported_as_ours_to_mend(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    await log.close()
+    content = bytearray(log.address.path.read_bytes())
+    content[4096:] = b"\xff" * (len(content) - 4096)
+    log.address.path.write_bytes(content)
+    with pytest.raises(DamageError, match="is damaged: database disk image is malformed"):
+        await log.events(1)

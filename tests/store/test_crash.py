@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.store.making import ask, episode, run_of
+
+PER_BATCH = 300
+
+# Imports once, then forks a process for every line it reads: the child appends batches from that number on, for ever.
+APPENDER = """
+import asyncio, os, sys
+from itertools import count
+from pycrorm_async.store.address import DatabaseAddress
+from tests.store.test_crash import append_all
+
+for line in sys.stdin:
+    child = os.fork()
+    if child == 0:
+        asyncio.run(append_all(DatabaseAddress.parse(sys.argv[1]), count(int(line))))
+    os.write(1, b"running %d\\n" % child)
+    os.waitpid(child, 0)
+    os.write(1, b"dead 0\\n")
+"""
+
+
+def batch(number: int) -> list[Record]:
+    first = number * PER_BATCH + 1
+    last = first + PER_BATCH - 1
+    return [*run_of(episode(1), first, last), *run_of(episode(2), first, last)]
+
+
+async def append_all(address: DatabaseAddress, numbers: Iterable[int]) -> None:
+    log = await EventLog.open(address, create=True)
+    for number in numbers:
+        assert await log.append(batch(number)) == {}
+        print(f"appended {number}", flush=True)
+    await log.close()
+
+
+def test_a_process_killed_while_appending_leaves_whole_batches_and_the_next_one_goes_on(
+    address: DatabaseAddress,
+) -> None:
+    seed = int.from_bytes(os.urandom(4))
+    print(f"seed {seed}")
+    chance = random.Random(seed)
+    known = 0  # how many batches are in the log
+    with subprocess.Popen(
+        [sys.executable, "-c", APPENDER, str(address)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parents[2],
+    ) as appender:
+        assert appender.stdin is not None
+        assert appender.stdout is not None
+        for _ in range(20):
+            appender.stdin.write(f"{max(known - 1, 0)}\n")  # the last one again
+            appender.stdin.flush()
+            child, killed, appended, wanted = 0, False, known, chance.randrange(1, 4)
+            for line in appender.stdout:
+                word, number = line.split()
+                if word == "running":
+                    child = int(number)
+                elif word == "appended":
+                    appended = int(number) + 1
+                    wanted -= 1
+                if child and wanted <= 0 and not killed:
+                    killed = True
+                    time.sleep(chance.uniform(0, 0.02))
+                    os.kill(child, signal.SIGKILL)
+                if word == "dead":
+                    break
+            heads = ask(address.path, "SELECT head FROM episode ORDER BY number")
+            counts = ask(address.path, "SELECT count(*), min(sequence), max(sequence) FROM event GROUP BY episode")
+            known = heads[0][0] // PER_BATCH
+            assert known in (appended, appended + 1)  # the kill may come between the commit and the report of it
+            assert heads == [(known * PER_BATCH,)] * 2
+            assert counts == [(known * PER_BATCH, 1, known * PER_BATCH)] * 2
+
+    asyncio.run(append_all(address, range(known)))
+    assert ask(address.path, "SELECT count(*) FROM event") == [(known * PER_BATCH * 2,)]
+    assert ask(address.path, "PRAGMA integrity_check") == [("ok",)]

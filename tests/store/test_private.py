@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.private import private_folder
+
+HOLD_ONE = """
+import sys
+from pathlib import Path
+from pycrorm_async.store.private import private_folder
+with private_folder(Path(sys.argv[1])) as folder:
+    print(folder, flush=True)
+    sys.stdin.read()
+"""
+
+
+def held_by_another_process(place: Path) -> tuple[subprocess.Popen[str], Path]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD_ONE, str(place)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    return process, Path(process.stdout.readline().strip())
+
+
+def finish(process: subprocess.Popen[str]) -> None:
+    process.communicate()
+
+
+def test_a_private_database_has_a_folder_while_it_is_used_and_none_afterwards() -> None:
+    unlocated = DatabaseAddress.parse("sqlite://")
+    assert unlocated.is_private
+    with unlocated.located() as address:
+        folder = address.path.parent
+        assert folder.is_dir()
+        assert (folder.stat().st_mode & 0o777) == 0o700
+        assert address.default_spool == folder / "memory.db.spool"
+        assert str(address) == "sqlite://"
+        with address.located() as again:
+            assert again.path == address.path
+    assert not folder.exists()
+
+
+def test_two_private_databases_are_not_the_same() -> None:
+    one, two = DatabaseAddress.parse("sqlite://"), DatabaseAddress.parse("sqlite://")
+    with one.located() as first, two.located() as second:
+        assert first.path != second.path
+
+
+def test_an_address_with_a_path_is_located_as_it_is(tmp_path: Path) -> None:
+    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/x.db")
+    with address.located() as located:
+        assert located is address
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_of_a_killed_process_is_swept_and_that_of_a_living_one_is_not(tmp_path: Path) -> None:
+    killed, left_behind = held_by_another_process(tmp_path)
+    living, in_use = held_by_another_process(tmp_path)
+    killed.send_signal(signal.SIGKILL)
+    finish(killed)
+    assert left_behind.is_dir()
+    with private_folder(tmp_path) as mine:
+        assert not left_behind.exists()
+        assert in_use.is_dir()
+        assert mine.is_dir()
+    finish(living)
+    assert not in_use.exists()
+
+
+def test_a_forked_child_that_leaves_the_context_leaves_its_parents_folder(tmp_path: Path) -> None:
+    script = """
+import os, sys
+from pathlib import Path
+from pycrorm_async.store.private import private_folder
+with private_folder(Path(sys.argv[1])) as folder:
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+        print("still there" if folder.is_dir() else "gone", flush=True)
+"""
+    ran = subprocess.run([sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert ran.stdout == "still there\n"
+    assert list(tmp_path.glob("*/")) == []
+
+
+def test_a_place_that_is_not_there_is_an_unavailable_database(tmp_path: Path) -> None:
+    with pytest.raises(DatabaseUnavailable, match="No such file or directory"), private_folder(tmp_path / "no"):
+        pass

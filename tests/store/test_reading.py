@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import sqlite3
+
+import pytest
+
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.progress import advance_folded, park
+from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.sqlite import statements
+from tests.store.making import ask, episode, record, run_of
+
+
+async def test_events_come_in_order_in_pages(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 25))
+    pages, after = [], 0
+    while page := await log.events(1, after=after, limit=10):
+        pages.append([each.sequence for each in page])
+        after = page[-1].sequence
+    assert pages == [list(range(1, 11)), list(range(11, 21)), list(range(21, 26))]
+
+
+async def test_an_event_comes_back_as_it_was_appended(log: EventLog) -> None:
+    await log.append([record(episode(2), 1), record(episode(2), 2, kind="NodeEnded", version=4, payload=b'{"node":1}')])
+    assert await log.events(1, after=1) == [
+        StoredEvent(1, 2, "NodeEnded", 4, 1_700_000_000_000_000_002, 5_000_002, b'{"node":1}')
+    ]
+
+
+async def test_an_episode_nobody_stored_has_no_number_and_no_events(log: EventLog) -> None:
+    await log.append([*run_of(episode(4), 1, 1), *run_of(episode(7), 1, 1)])
+    assert await log.episode_number(episode(7)) == 2
+    assert await log.episode_number(episode(8)) is None
+    assert await log.events(3) == []
+
+
+async def test_what_is_behind_shrinks_as_it_is_folded(log: EventLog) -> None:
+    await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 2)])
+    assert [(row.number, row.folded, row.head) for row in await log.behind()] == [(1, 0, 3), (2, 0, 2)]
+    async with log.engine.begin() as connection:
+        assert await advance_folded(connection, [(1, 0, 2), (2, 0, 2)])
+    assert [(row.number, row.folded, row.head) for row in await log.behind()] == [(1, 2, 3)]
+    assert [(each.number, each.sequence) for each in await log.unfolded()] == [(1, 3)]
+    await log.append(run_of(episode(2), 3, 4))
+    assert [(each.number, each.sequence) for each in await log.unfolded()] == [(1, 3), (2, 3), (2, 4)]
+    assert [(each.number, each.sequence) for each in await log.unfolded(2)] == [(1, 3), (2, 3)]
+
+
+async def test_progress_that_someone_else_made_is_noticed(log: EventLog) -> None:
+    await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 3)])
+    async with log.engine.begin() as connection:
+        assert await advance_folded(connection, [(1, 0, 2)])
+    async with log.engine.begin() as connection:
+        assert not await advance_folded(connection, [(2, 0, 3), (1, 0, 3)])
+        await connection.rollback()
+    assert [(row.number, row.folded) for row in await log.behind()] == [(1, 2), (2, 0)]
+
+
+async def test_the_tables_cannot_be_ahead_of_the_log(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    with pytest.raises(Exception, match="CHECK constraint failed"):
+        async with log.engine.begin() as connection:
+            await advance_folded(connection, [(1, 0, 4)])
+
+
+async def test_a_parked_episode_is_not_behind_but_still_takes_events(log: EventLog) -> None:
+    await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 1)])
+    async with log.engine.begin() as connection:
+        await park(connection, 1, "column height is an integer and a text")
+    assert await log.append(run_of(episode(1), 4, 5)) == {}
+    assert [row.number for row in await log.behind()] == [2]
+    assert [each.number for each in await log.unfolded()] == [2]
+    assert [(row.number, row.refused, row.parked) for row in await log.stopped()] == [
+        (1, None, "column height is an integer and a text")
+    ]
+    async with log.engine.begin() as connection:
+        await park(connection, 1, None)
+    assert [(row.number, row.head) for row in await log.behind()] == [(1, 5), (2, 1)]
+    assert await log.stopped() == []
+
+
+async def test_an_episode_row_says_all_that_is_known(log: EventLog) -> None:
+    await log.append([record(episode(1), 1, wall_ns=10), record(episode(1), 2, wall_ns=20, kind="EpisodeEnded")])
+    assert await log.episodes() == [EpisodeRow(1, "00000000-0000-0000-0000-000000000001", 2, 0, 10, 20, None, None)]
+
+
+async def test_finding_what_is_behind_looks_at_no_other_episode(log: EventLog) -> None:
+    for statement in (statements.SELECT_BEHIND, statements.SELECT_UNFOLDED):
+        plan = " | ".join(row[3] for row in ask(log.address.path, f"EXPLAIN QUERY PLAN {statement.replace('?', '9')}"))
+        assert "episode_behind" in plan
+        assert "TEMP B-TREE" not in plan
+    stopped = ask(log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_STOPPED}")
+    assert "episode_stopped" in stopped[0][3]
+
+
+async def test_a_reader_sees_what_is_committed_while_another_writes(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    reading = await EventLog.open(log.address, create=False)
+    writer = sqlite3.connect(log.address.path, isolation_level=None)
+    writer.execute("BEGIN IMMEDIATE")
+    writer.execute("UPDATE episode SET folded = 1")
+    assert [row.folded for row in await reading.episodes()] == [0]
+    assert [row.folded for row in await log.episodes()] == [0]  # nor does reading wait for the write lock
+    writer.execute("COMMIT")
+    writer.close()
+    assert [row.folded for row in await reading.episodes()] == [1]
+    await reading.close()
+
+
+async def test_a_log_opened_for_reading_takes_nothing(log: EventLog) -> None:
+    reading = await EventLog.open(log.address, create=False)
+    with pytest.raises(DatabaseUnavailable, match="attempt to write a readonly database"):
+        await reading.append(run_of(episode(1), 1, 1))
+    await reading.close()
+    assert ask(log.address.path, "SELECT count(*) FROM episode") == [(0,)]

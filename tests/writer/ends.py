@@ -1,0 +1,161 @@
+"""The two ends of a writer for its tests: a source in memory, and the real log with a fold that only counts."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from functools import partial
+
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.progress import advance_folded
+from pycrorm_async.writer.ports import Destination, Source
+
+__all__ = ["KeptSource", "CountingFold", "Passing", "LosesReplies", "opener"]
+
+
+class KeptSource(Source):
+    """Keeps records until they are acknowledged; filled from one thread, drained in the loop of another."""
+
+    def __init__(self, records: Iterable[Record] = (), *, closed: bool = False, name: str = "robot") -> None:
+        self._name = name
+        self._kept = list(records)
+        self._given = 0  # how many of these were given out
+        self._closed = closed
+        self._lock = threading.Lock()
+        self._wake: Callable[[], object] = lambda: None
+        self.acknowledgements: list[int] = []
+
+    @property
+    def name(self) -> str:
+        return self._name
+
+    def put(self, records: Iterable[Record]) -> None:
+        with self._lock:
+            self._kept += records
+            self._wake()
+
+    def close(self) -> None:
+        with self._lock:
+            self._closed = True
+            self._wake()
+
+    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+        del age_s_max  # what is there is given at once
+        while True:
+            arrived = asyncio.Event()
+            with self._lock:
+                batch = self._next(events_max, bytes_max)
+                if batch or self._closed:
+                    self._given += len(batch)
+                    return batch
+                self._wake = partial(asyncio.get_running_loop().call_soon_threadsafe, arrived.set)
+            try:
+                await arrived.wait()
+            finally:
+                with self._lock:
+                    self._wake = lambda: None
+
+    async def acknowledge(self, position: int) -> None:
+        await asyncio.sleep(0)
+        with self._lock:
+            forgotten = [each for each in self._kept if each.position <= position]
+            self._kept = self._kept[len(forgotten) :]
+            self._given -= len(forgotten)
+            self.acknowledgements.append(position)
+
+    def reopened(self) -> KeptSource:
+        """What the next process finds: everything that was not acknowledged, closed."""
+        with self._lock:
+            return KeptSource(self._kept, closed=True, name=self._name)
+
+    @property
+    def kept(self) -> list[int]:
+        """The positions it still holds."""
+        with self._lock:
+            return [each.position for each in self._kept]
+
+    def _next(self, events_max: int, bytes_max: int) -> list[Record]:
+        batch: list[Record] = []
+        size = 0
+        for each in self._kept[self._given : self._given + events_max]:
+            size += len(each.payload)
+            if batch and size > bytes_max:
+                break
+            batch.append(each)
+        return batch
+
+
+class CountingFold(Destination):
+    """The real log; folding only notes how far it came."""
+
+    def __init__(self, log: EventLog) -> None:
+        self.log = log
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        return await self.log.append(records)
+
+    async def fold(self) -> int:
+        behind = await self.log.behind()
+        if behind:
+            async with self.log.engine.begin() as connection:
+                assert await advance_folded(connection, [(row.number, row.folded, row.head) for row in behind])
+        return sum(row.head - row.folded for row in behind)
+
+    async def stopped(self) -> Mapping[str, str]:
+        return {row.id: row.refused or row.parked or "" for row in await self.log.stopped()}
+
+
+class Passing(Destination):
+    """Does what another destination does; to be overridden in one place."""
+
+    def __init__(self, destination: Destination) -> None:
+        self._destination = destination
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        return await self._destination.append(records)
+
+    async def fold(self) -> int:
+        return await self._destination.fold()
+
+    async def stopped(self) -> Mapping[str, str]:
+        return await self._destination.stopped()
+
+
+class LosesReplies(Passing):
+    """Commits, and then says the database is away: the first time for every batch."""
+
+    lost = False
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        refusals = await super().append(records)
+        self.lost = not self.lost
+        if self.lost:
+            raise DatabaseUnavailable("the connection was closed before the reply came")
+        return refusals
+
+
+def opener(
+    address: DatabaseAddress,
+    *,
+    around: Callable[[Destination], Destination] = lambda destination: destination,
+    busy_timeout_s: float = 5.0,
+    closed: Callable[[], None] = lambda: None,
+) -> Callable[[], AbstractAsyncContextManager[Destination]]:
+    """What opens the log of this address in the loop that enters it."""
+
+    @asynccontextmanager
+    async def opened() -> AsyncIterator[Destination]:
+        log = await EventLog.open(address, create=True, busy_timeout_s=busy_timeout_s)
+        try:
+            yield around(CountingFold(log))
+        finally:
+            await log.close()
+            closed()
+
+    return opened

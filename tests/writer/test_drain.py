@@ -1,0 +1,243 @@
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import sqlite3
+from collections.abc import Mapping, Sequence
+
+import pytest
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import DatabaseUnavailable, LogDamaged
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.backoff import Backoff
+from pycrorm_async.writer.drain import Drain
+from tests.store.making import ask, episode, record, run_of
+from tests.writer.ends import CountingFold, KeptSource, LosesReplies, Passing
+
+TENS = Settings(batch_events_max=10)
+STORED = "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY episode"
+
+
+def name(number: int) -> str:
+    return f"00000000-0000-0000-0000-{number:012x}"
+
+
+async def at_once(_: float) -> None:
+    """A sleep that does not."""
+
+
+async def test_everything_is_stored_and_then_forgotten_by_the_source(log: EventLog) -> None:
+    source = KeptSource(run_of(episode(1), 1, 25), closed=True)
+    drain = Drain(source, CountingFold(log), settings=TENS)
+    await drain.run()
+    assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
+    assert source.acknowledgements == [10, 20, 25]
+    assert drain.state == ("robot", 25, 3, 0, None, None, 25, 25, {})
+
+
+async def test_a_batch_is_acknowledged_after_it_is_committed_and_before_the_next_is_appended(
+    log: EventLog,
+) -> None:
+    seen: list[str] = []
+
+    class Watched(Passing):
+        async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+            seen.append(f"append to {records[-1].position} with {source.acknowledgements} acknowledged")
+            return await super().append(records)
+
+    class Watching(KeptSource):
+        async def acknowledge(self, position: int) -> None:
+            [[stored]] = ask(log.address.path, "SELECT count(*) FROM event")
+            seen.append(f"acknowledge {position} with {stored} stored")
+            await super().acknowledge(position)
+
+    source = Watching(run_of(episode(1), 1, 20), closed=True)
+    await Drain(source, Watched(CountingFold(log)), settings=TENS).run()
+    assert seen == [
+        "append to 10 with [] acknowledged",
+        "acknowledge 10 with 10 stored",
+        "append to 20 with [10] acknowledged",
+        "acknowledge 20 with 20 stored",
+    ]
+
+
+async def test_a_commit_whose_reply_is_lost_is_stored_once(log: EventLog) -> None:
+    source = KeptSource(run_of(episode(1), 1, 25), closed=True)
+    drain = Drain(source, LosesReplies(CountingFold(log)), settings=TENS, sleep=at_once)
+    await drain.run()
+    assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
+    assert source.acknowledgements == [10, 20, 25]
+    assert (drain.state.retries, drain.state.records, drain.state.away) == (3, 25, None)
+    assert drain.state.last_error == "the connection was closed before the reply came"
+
+
+async def test_a_database_locked_by_another_writer_is_asked_again_later_and_nothing_is_lost(
+    log: EventLog,
+) -> None:
+    holder = sqlite3.connect(log.address.path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    source = KeptSource(run_of(episode(1), 1, 25), closed=True)
+    pauses_s: list[float] = []
+    away: list[str | None] = []
+
+    async def sleep(pause_s: float) -> None:
+        pauses_s.append(pause_s)
+        away.append(drain.state.away)
+        if len(pauses_s) == 3:
+            assert source.acknowledgements == []
+            holder.execute("ROLLBACK")
+
+    drain = Drain(
+        source,
+        CountingFold(log),
+        settings=TENS,
+        backoff=Backoff(first_s=1.0, longest_s=60.0),
+        randomness=lambda: 1.0,
+        sleep=sleep,
+    )
+    await drain.run()
+    holder.close()
+    assert pauses_s == [1.0, 2.0, 4.0]
+    assert away == [f"{log.address}: database is locked"] * 3
+    assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
+    assert source.kept == []
+
+
+async def test_a_drain_that_may_give_up_raises_and_its_source_keeps_everything(log: EventLog) -> None:
+    holder = sqlite3.connect(log.address.path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    source = KeptSource(run_of(episode(1), 1, 25), closed=True)
+    backoff = Backoff(first_s=1.0, longest_s=1.0, attempts_max=2)
+    drain = Drain(source, CountingFold(log), settings=TENS, backoff=backoff, sleep=at_once)
+    with pytest.raises(DatabaseUnavailable):
+        await drain.run()
+    holder.close()
+    assert source.kept == list(range(1, 26))
+    assert drain.state.retries == 2
+
+
+async def test_nothing_is_acknowledged_from_the_first_refused_record_on(log: EventLog) -> None:
+    broken = [*run_of(episode(1), 1, 4, position=11), *run_of(episode(1), 6, 9, position=15)]
+    records = [
+        *run_of(episode(2), 1, 10, position=1),
+        *broken,  # positions 11 to 18, in the second batch
+        *run_of(episode(2), 11, 30, position=19),
+    ]
+    source = KeptSource(records, closed=True)
+    drain = Drain(source, CountingFold(log), settings=TENS)
+    await drain.run()
+    reason = "event 5 did not arrive before event 6"
+    assert drain.state.refused == {name(1): reason}
+    assert ask(log.address.path, STORED) == [(1, 30, 1, 30), (2, 4, 1, 4)]
+    assert source.acknowledgements == [10]
+    assert drain.state.appended == 38
+    assert source.kept == list(range(11, 39))
+    assert [(row.id, row.refused) for row in await log.stopped()] == [(name(1), reason)]
+
+    again = source.reopened()
+    await Drain(again, CountingFold(log), settings=TENS).run()
+    assert again.kept == list(range(11, 39))
+
+    await log.append([record(episode(1), 5)])  # the missing event is found after all
+    last = source.reopened()
+    await Drain(last, CountingFold(log), settings=TENS).run()
+    assert last.kept == []
+    assert ask(log.address.path, STORED) == [(1, 30, 1, 30), (2, 9, 1, 9)]
+    assert await log.stopped() == []
+
+
+async def test_damage_ends_the_drain_and_nothing_of_its_batch_is_acknowledged(log: EventLog) -> None:
+    await log.append([record(episode(1), 15, payload=b"{}")._replace(sequence=1)])
+    source = KeptSource([*run_of(episode(2), 1, 10), *run_of(episode(1), 1, 10, position=11)], closed=True)
+    with pytest.raises(LogDamaged):
+        await Drain(source, CountingFold(log), settings=TENS).run()
+    assert source.kept == list(range(11, 21))
+    assert ask(log.address.path, STORED) == [(1, 1, 1, 1), (2, 10, 1, 10)]
+
+
+async def test_whoever_waits_for_a_position_is_told_when_it_is_stored_or_never_will_be(log: EventLog) -> None:
+    source = KeptSource(run_of(episode(1), 1, 10))
+    drain = Drain(source, CountingFold(log), settings=TENS)
+    running = asyncio.create_task(drain.run())
+    assert await drain.reached(10)
+    waiting = asyncio.create_task(drain.reached(12))
+    source.put(run_of(episode(1), 11, 11))
+    source.close()
+    await running
+    assert not await waiting
+    assert await drain.reached(11)
+
+
+class Points:
+    """Where a cancellation may come in: each is a moment at which the drain is suspended."""
+
+    def __init__(self, wanted: str, times: int) -> None:
+        self._wanted, self._times = wanted, times
+        self.reached = asyncio.Event()
+
+    async def pause_at(self, point: str) -> None:
+        if point == self._wanted:
+            self._times -= 1
+            if self._times == 0:
+                self.reached.set()
+        await asyncio.sleep(0)
+
+
+class PausingLog(Passing):
+    def __init__(self, log: EventLog, points: Points) -> None:
+        super().__init__(CountingFold(log))
+        self._points = points
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        await self._points.pause_at("before append")
+        refusals = await super().append(records)
+        await self._points.pause_at("after append")
+        return refusals
+
+
+class PausingSource(KeptSource):
+    points: Points
+
+    async def acknowledge(self, position: int) -> None:
+        await self.points.pause_at("before acknowledge")
+        await super().acknowledge(position)
+        await self.points.pause_at("after acknowledge")
+
+
+@pytest.mark.parametrize("point", ["before append", "after append", "before acknowledge", "after acknowledge"])
+@pytest.mark.parametrize("times", [1, 2])
+async def test_a_drain_cancelled_at_any_point_loses_nothing(log: EventLog, point: str, times: int) -> None:
+    source = PausingSource(run_of(episode(1), 1, 25), closed=True)
+    source.points = Points(point, times)
+    running = asyncio.create_task(Drain(source, PausingLog(log, source.points), settings=TENS).run())
+    await source.points.reached.wait()
+    running.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await running
+    # The batch that was on its way when the drain was cancelled went all the way into the log.
+    assert ask(log.address.path, STORED) == [(1, 10 * times, 1, 10 * times)]
+    rest = source.reopened()
+    assert rest.kept[0] == (10 * times + 1 if point == "after acknowledge" else 10 * (times - 1) + 1)
+    await Drain(rest, CountingFold(log), settings=TENS).run()
+    assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
+    assert rest.kept == []
+
+
+async def test_a_drain_cancelled_at_any_moment_loses_nothing(log: EventLog) -> None:
+    seed = int.from_bytes(os.urandom(4))
+    print(f"seed {seed}")
+    chance = random.Random(seed)
+    source = KeptSource(run_of(episode(1), 1, 400), closed=True)
+    for _ in range(25):
+        running = asyncio.create_task(Drain(source, CountingFold(log), settings=TENS).run())
+        await asyncio.sleep(chance.uniform(0, 0.01))
+        running.cancel()
+        await asyncio.wait([running])
+        source = source.reopened()
+    await Drain(source, CountingFold(log), settings=TENS).run()
+    assert ask(log.address.path, STORED) == [(1, 400, 1, 400)]
+    assert source.kept == []

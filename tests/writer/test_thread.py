@@ -1,0 +1,381 @@
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import (
+    DatabaseForeign,
+    DatabaseUnavailable,
+    EpisodeParked,
+    FlushTimeout,
+    LogDamaged,
+    SpoolDamaged,
+)
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.progress import park
+from pycrorm_async.writer.ports import Destination, Source
+from pycrorm_async.writer.thread import WriterThread
+from tests.store.making import ask, declaration, episode, record, run_of
+from tests.writer.ends import KeptSource, LosesReplies, Passing, opener
+
+HEADS = "SELECT id, head, folded FROM episode ORDER BY number"
+QUICK = Settings(batch_events_max=1000, idle_ms=1)
+NEVER_IDLE = Settings(batch_events_max=1000, idle_ms=10**9)
+
+
+def name(number: int) -> str:
+    return f"00000000-0000-0000-0000-{number:012x}"
+
+
+def writers_alive() -> list[str]:
+    return [each.name for each in threading.enumerate() if each.name.startswith("pycrorm writer")]
+
+
+def nobody() -> Iterable[Source]:
+    return ()
+
+
+def writer_for(
+    source: Source,
+    address: DatabaseAddress,
+    *,
+    settings: Settings = NEVER_IDLE,
+    adopt: Iterable[Source] = (),
+    busy_timeout_s: float = 5.0,
+) -> WriterThread:
+    return WriterThread(
+        source=source,
+        open_destination=opener(address, busy_timeout_s=busy_timeout_s),
+        adopt=lambda: adopt,
+        settings=settings,
+    )
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    """Returns when that holds; the test's own patience ends after a minute."""
+    async with asyncio.timeout(60):
+        while not holds():  # noqa: ASYNC110 - what is waited for happens in another thread
+            await asyncio.sleep(0.005)
+
+
+async def until_asked(path: Path, statement: str, expected: list[tuple[object, ...]]) -> None:
+    """Returns when the database answers that."""
+    await until(lambda: ask(path, statement) == expected)
+
+
+async def test_what_was_put_before_a_flush_is_stored_and_folded_after_it(address: DatabaseAddress) -> None:
+    source = KeptSource()
+    writer = writer_for(source, address)
+    await writer.start()
+    source.put([declaration(b"{}"), *run_of(episode(1), 1, 2500, position=2)])
+    await writer.flush(2501)
+    assert ask(address.path, HEADS) == [(name(1), 2500, 2500)]
+    assert source.kept == []
+    source.put(run_of(episode(1), 2501, 2600, position=2502))
+    source.close()
+    await writer.close()
+    assert ask(address.path, HEADS) == [(name(1), 2600, 2600)]
+    assert source.kept == []
+    assert writers_alive() == []
+
+
+async def test_events_are_stored_beside_a_plan_that_never_suspends(address: DatabaseAddress) -> None:
+    source = KeptSource()
+    writer = writer_for(source, address)
+    await writer.start()
+    patience_ends = time.monotonic() + 60
+    put = 0
+    while writer.state.queue.records < 5000:  # no await anywhere: the loop of the plan never turns
+        assert time.monotonic() < patience_ends
+        if put < 20_000:
+            source.put(run_of(episode(1), put + 1, put + 100))
+            put += 100
+        sum(number * number for number in range(1000))
+    await writer.flush(put)
+    source.close()
+    await writer.close()
+    assert ask(address.path, HEADS) == [(name(1), put, put)]
+    assert ask(address.path, "SELECT count(*), max(sequence) FROM event") == [(put, put)]
+
+
+async def test_an_idle_plan_is_folded_without_being_asked(address: DatabaseAddress) -> None:
+    source = KeptSource()
+    writer = writer_for(source, address, settings=QUICK)
+    await writer.start()
+    source.put(run_of(episode(1), 1, 100))
+    await until_asked(address.path, HEADS, [(name(1), 100, 100)])
+    source.put(run_of(episode(1), 101, 150))
+    await until_asked(address.path, HEADS, [(name(1), 150, 150)])
+    source.close()
+    await writer.close()
+
+
+async def test_what_was_left_unfolded_before_is_folded_when_the_new_plan_is_idle(
+    address: DatabaseAddress,
+) -> None:
+    log = await EventLog.open(address, create=True)
+    await log.append(run_of(episode(1), 1, 7))
+    await log.close()
+    source = KeptSource()
+    writer = writer_for(source, address, settings=QUICK)
+    await writer.start()
+    await until_asked(address.path, HEADS, [(name(1), 7, 7)])
+    source.close()
+    await writer.close()
+
+
+async def test_a_commit_whose_reply_is_lost_beside_a_plan_is_stored_once(address: DatabaseAddress) -> None:
+    source = KeptSource(run_of(episode(1), 1, 1500))
+    writer = WriterThread(
+        source=source, open_destination=opener(address, around=LosesReplies), adopt=nobody, settings=NEVER_IDLE
+    )
+    await writer.start()
+    await writer.flush(1500)
+    assert writer.state.queue.retries == 2
+    source.close()
+    await writer.close()
+    assert ask(address.path, "SELECT count(*), max(sequence) FROM event") == [(1500, 1500)]
+
+
+# --- opening --------------------------------------------------------------------------------------------------
+
+
+async def test_starting_raises_when_the_database_is_not_ours_and_leaves_no_thread(
+    address: DatabaseAddress,
+) -> None:
+    ask(address.path, "CREATE TABLE bookmarks (url)")
+    writer = writer_for(KeptSource(), address)
+    with pytest.raises(DatabaseForeign):
+        await writer.start()
+    assert writers_alive() == []
+
+
+async def test_starting_raises_when_the_database_does_not_answer_in_time(address: DatabaseAddress) -> None:
+    await (await EventLog.open(address, create=True)).close()
+    holder = sqlite3.connect(address.path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    settings = Settings(connect_timeout_s=0.05)
+    writer = writer_for(KeptSource(), address, settings=settings, busy_timeout_s=0.2)
+    with pytest.raises(DatabaseUnavailable):
+        await writer.start()
+    holder.close()
+    assert writers_alive() == []
+
+
+async def test_starting_that_is_cancelled_leaves_no_thread(address: DatabaseAddress) -> None:
+    source = KeptSource()
+    writer = writer_for(source, address)
+    starting = asyncio.create_task(writer.start())
+    await asyncio.sleep(0)
+    starting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await starting
+    await until(lambda: not writers_alive())
+
+
+# --- failing --------------------------------------------------------------------------------------------------
+
+
+async def test_a_gap_is_raised_at_flush_and_at_close_and_other_episodes_are_visible(
+    address: DatabaseAddress,
+) -> None:
+    source = KeptSource()
+    writer = writer_for(source, address)
+    await writer.start()
+    source.put(
+        [*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6, position=4), *run_of(episode(2), 1, 9, position=6)]
+    )
+    reasons = {name(1): "event 4 did not arrive before event 5"}
+    with pytest.raises(EpisodeParked) as caught:
+        await writer.flush(14)
+    assert caught.value.reasons == reasons
+    assert ask(address.path, HEADS) == [(name(1), 3, 3), (name(2), 9, 9)]
+    source.put(run_of(episode(2), 10, 20, position=15))
+    source.close()
+    with pytest.raises(EpisodeParked) as caught:
+        await writer.close()
+    assert caught.value.reasons == reasons
+    assert ask(address.path, HEADS) == [(name(1), 3, 3), (name(2), 20, 20)]
+    assert source.kept == list(range(1, 26))
+    assert writers_alive() == []
+
+
+async def test_an_episode_parked_by_someone_before_is_not_raised_again(address: DatabaseAddress) -> None:
+    log = await EventLog.open(address, create=True)
+    await log.append(run_of(episode(1), 1, 3))
+    async with log.engine.begin() as connection:
+        await park(connection, 1, "an old story")
+    await log.close()
+    source = KeptSource(run_of(episode(2), 1, 3))
+    writer = writer_for(source, address)
+    await writer.start()
+    await writer.flush(3)
+    source.close()
+    await writer.close()
+    assert ask(address.path, HEADS) == [(name(1), 3, 0), (name(2), 3, 3)]
+
+
+async def test_damage_is_raised_at_every_flush_and_at_close_while_the_plan_goes_on(
+    address: DatabaseAddress,
+) -> None:
+    log = await EventLog.open(address, create=True)
+    await log.append([record(episode(1), 1, payload=b"{}")])
+    await log.close()
+    source = KeptSource(run_of(episode(1), 1, 3))
+    writer = writer_for(source, address)
+    await writer.start()
+    for _ in range(2):
+        with pytest.raises(LogDamaged):
+            await writer.flush(3)
+        source.put(run_of(episode(2), 1, 3, position=4))
+    assert writer.state.failure == (f"episode {name(1)}, event 1: another event is stored under this number already")
+    source.close()
+    with pytest.raises(LogDamaged):
+        await writer.close()
+    assert source.kept == [1, 2, 3, 4, 5, 6, 4, 5, 6]
+    assert writers_alive() == []
+
+
+async def test_a_flush_that_takes_too_long_says_why_and_loses_nothing(address: DatabaseAddress) -> None:
+    source = KeptSource()
+    settings = Settings(idle_ms=10**9, flush_timeout_s=0.2)
+    writer = writer_for(source, address, settings=settings, busy_timeout_s=0.01)
+    await writer.start()
+    holder = sqlite3.connect(address.path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    source.put(run_of(episode(1), 1, 5))
+    with pytest.raises(FlushTimeout, match=r"database is locked\); everything recorded is safe in the spool"):
+        await writer.flush(5)
+    source.close()
+    with pytest.raises(FlushTimeout, match=r"database is locked\); everything recorded is safe in the spool"):
+        await writer.close()
+    holder.close()
+    assert writers_alive() == []
+    assert source.kept == [1, 2, 3, 4, 5]
+    assert ask(address.path, "SELECT count(*) FROM event") == [(0,)]
+
+
+async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) -> None:
+    class Unfoldable(Passing):
+        async def fold(self) -> int:
+            raise KeyError("no such column")
+
+    source = KeptSource()
+    writer = WriterThread(
+        source=source, open_destination=opener(address, around=Unfoldable), adopt=nobody, settings=QUICK
+    )
+    await writer.start()
+    source.put(run_of(episode(1), 1, 5))
+    await until(lambda: writer.state.fold_error is not None)
+    with pytest.raises(KeyError, match="no such column"):
+        await writer.flush(5)
+    source.close()
+    with pytest.raises(KeyError, match="no such column"):
+        await writer.close()
+    assert ask(address.path, HEADS) == [(name(1), 5, 0)]
+    assert writers_alive() == []
+
+
+async def test_a_cancelled_flush_stops_the_waiting_and_not_the_work(address: DatabaseAddress) -> None:
+    entered, release = threading.Event(), threading.Event()
+
+    class Slow(Passing):
+        async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+            entered.set()
+            await asyncio.to_thread(release.wait)
+            return await super().append(records)
+
+    source = KeptSource(run_of(episode(1), 1, 5))
+    writer = WriterThread(
+        source=source, open_destination=opener(address, around=Slow), adopt=nobody, settings=NEVER_IDLE
+    )
+    await writer.start()
+    flushing = asyncio.create_task(writer.flush(5))
+    await asyncio.to_thread(entered.wait)
+    flushing.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await flushing
+    release.set()
+    await until_asked(address.path, HEADS, [(name(1), 5, 5)])
+    source.close()
+    await writer.close()
+
+
+async def test_the_database_is_closed_in_the_loop_that_opened_it(address: DatabaseAddress) -> None:
+    threads: list[str] = []
+
+    def around(destination: Destination) -> Destination:
+        threads.append(threading.current_thread().name)
+        return destination
+
+    source = KeptSource()
+    opened = opener(address, around=around, closed=lambda: threads.append(threading.current_thread().name))
+    writer = WriterThread(source=source, open_destination=opened, adopt=nobody, settings=NEVER_IDLE)
+    await writer.start()
+    source.close()
+    await writer.close()
+    assert threads == ["pycrorm writer robot"] * 2
+
+
+# --- adopting -------------------------------------------------------------------------------------------------
+
+
+async def test_what_dead_recorders_left_is_stored_and_folded(address: DatabaseAddress) -> None:
+    dead = [KeptSource(run_of(episode(which), 1, 30), closed=True, name=f"dead {which}") for which in (2, 3)]
+    source = KeptSource(run_of(episode(1), 1, 10))
+    writer = writer_for(source, address, settings=QUICK, adopt=dead)
+    await writer.start()
+    folded = "SELECT id, folded FROM episode ORDER BY id"
+    await until_asked(address.path, folded, [(name(1), 10), (name(2), 30), (name(3), 30)])
+    source.close()
+    await writer.close()
+    assert [each.kept for each in dead] == [[], []]
+    assert [each.source for each in writer.state.adopted] == ["dead 2", "dead 3"]
+
+
+async def test_a_damaged_folder_of_somebody_else_is_shown_and_not_raised(address: DatabaseAddress) -> None:
+    class Damaged(KeptSource):
+        async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+            raise SpoolDamaged(Path("/spool/2/1.seg"), 4096, "a frame does not match its checksum")
+
+    after = KeptSource(run_of(episode(3), 1, 4), closed=True, name="dead 3")
+
+    def found() -> Iterator[Source]:
+        yield Damaged(name="dead 2")
+        yield after
+        raise SpoolDamaged(Path("/spool/4/1.seg"), 0, "no header")
+
+    source = KeptSource(run_of(episode(1), 1, 3))
+    writer = writer_for(source, address, adopt=found())
+    await writer.start()
+    await until(lambda: len(writer.state.adoption_errors) == 2)
+    await writer.flush(3)
+    source.close()
+    await writer.close()
+    assert writer.state.adoption_errors == (
+        "dead 2: /spool/2/1.seg is damaged at byte 4096: a frame does not match its checksum",
+        "/spool/4/1.seg is damaged at byte 0: no header",
+    )
+    assert after.kept == []
+
+
+async def test_closing_does_not_wait_for_somebody_elses_records(address: DatabaseAddress) -> None:
+    endless = KeptSource(run_of(episode(2), 1, 5), name="never closed")
+    source = KeptSource(run_of(episode(1), 1, 3))
+    writer = writer_for(source, address, adopt=[endless])
+    await writer.start()
+    await until_asked(address.path, "SELECT count(*) FROM event", [(8,)])
+    source.close()
+    await writer.close()
+    assert writers_alive() == []
+    assert ask(address.path, "SELECT id, folded FROM episode ORDER BY id") == [(name(1), 3), (name(2), 5)]
