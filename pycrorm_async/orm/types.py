@@ -92,7 +92,9 @@ class KnownClasses:
             self._size = len(mapped)
         found = self._found.get(lineage)
         if found is None:
-            tables = {mapper.local_table.name: identity for identity, mapper in mapped.items() if "@" not in identity}
+            tables = {
+                mapper.local_table.name: identity for identity, mapper in list(mapped.items()) if "@" not in identity
+            }
             known = {name: name for name in mapped} | tables | self.own
             names = lineage.split(" ")
             found = self._found[lineage] = next((known[name] for name in names if name in known), names[-1])

@@ -1,0 +1,1 @@
+"""How it is asked: ordinary sessions, data frames that go around the mapped classes, and questions with a name."""

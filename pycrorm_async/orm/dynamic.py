@@ -1,0 +1,205 @@
+"""Classes for types that have none: made from the declarations in a memory, and belonging to that memory alone.
+
+    classes = DynamicClasses()
+    classes.learn(declarations)
+    classes.use_in(engine)                          # this engine's rows of SayingAction become SayingAction objects
+    SayingAction = classes.of("SayingAction")
+    classes.dispose()
+
+Enum fields are names (text): the enum's class is not here. A type that descends from one with a class has the
+attributes of both. Two memories may have different `SayingAction`s in one process: each class has an identity of its
+own, and only the engines that use it know that identity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+from sqlalchemy import BigInteger, Boolean, Column, Double, ForeignKey, MetaData, Table, Text
+from sqlalchemy.ext.asyncio import AsyncEngine
+from sqlalchemy.orm import registry, relationship, synonym
+from sqlalchemy.types import TypeEngine
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.catalogue import Catalogue, Contradiction
+from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared, FieldType
+from pycrorm_async.orm.base import Base, Pose
+from pycrorm_async.orm.designators import Action, Designator, Motion
+from pycrorm_async.orm.objects import Object
+from pycrorm_async.orm.types import Moment, known_classes
+
+__all__ = ["DynamicClasses"]
+
+_ROOTS: dict[str, type[Designator]] = {"action": Action, "motion": Motion, "language": Designator}
+_TYPES: dict[FieldType, TypeEngine[Any]] = {
+    "integer": BigInteger(),
+    "real": Double(),
+    "text": Text(),
+    "enum": Text(),
+    "boolean": Boolean(),
+    "datetime": Moment(),
+}
+
+
+class DynamicClasses:
+    """The classes of one memory's own types. Used from one thread; `dispose` ends them."""
+
+    def __init__(self) -> None:
+        self._registry = registry()
+        self._metadata = MetaData()
+        self._classes: dict[str, type[Designator]] = {}
+        self._fields: dict[str, set[str]] = {}
+        self._engines: list[AsyncEngine] = []
+        self._catalogue = Catalogue()
+        self._payloads: list[bytes] = []
+
+    def learn(self, payloads: Iterable[bytes]) -> None:
+        """Makes classes for the types in these declarations that have none, and gives known ones their new fields."""
+        given = list(payloads)
+        if given == self._payloads:
+            return
+        self._payloads = given
+        self._catalogue = self._catalogue.with_payloads(given)
+        grown = False
+        for dtype in self._catalogue.dtypes():
+            if _shared_class(self._names(dtype)) is None:
+                grown |= self._make(dtype)
+        if grown:
+            # A statement compiled before knows nothing of new classes and would meet them unfinished.
+            self._registry.configure(cascade=True)
+            for engine in self._engines:
+                self._introduce(engine)
+
+    def use_in(self, engine: AsyncEngine) -> None:
+        """Sessions of this engine make objects of these classes."""
+        self._engines.append(engine)
+        self._introduce(engine)
+
+    def of(self, name: str | type) -> type[Designator]:
+        """The mapped class of a dtype, a table or a designator class, built-in ones too. Raises `CallerError`."""
+        wanted = getattr(name, "dtype", name.__name__) if isinstance(name, type) else name
+        names = [wanted, *(each.dtype for each in self._catalogue.values() if each.table == wanted)]
+        for each in names:
+            found = self._classes.get(each) or _shared_class(self._names(each))
+            if found is not None:
+                return found
+        raise CallerError(f"this memory holds nothing of the type {wanted!r} (it holds: {', '.join(self._types())})")
+
+    def dispose(self) -> None:
+        """Unmaps all of them: what is left of the objects are plain values. The shared classes forget them."""
+        for engine in self._engines:
+            known_classes(engine.dialect).adopt({})
+            engine.sync_engine.clear_compiled_cache()
+        self._engines.clear()
+        identities = Designator.__mapper__.polymorphic_map
+        for made in self._classes.values():
+            identities.pop(made.__mapper__.polymorphic_identity, None)
+        self._classes.clear()
+        self._registry.dispose()
+        # The shared mappers remember paths they ever loaded along, those through our classes too. What they remember
+        # is made again when needed; SQLAlchemy itself forgets it this way whenever a subclass is mapped.
+        for mapper in Base.registry.mappers:
+            vars(mapper).pop("_path_registry", None)
+            mapper._expire_memoizations()  # noqa: SLF001  there is no public way, and classes would never be freed
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    def _types(self) -> Iterator[str]:
+        yield from self._catalogue.dtypes()
+
+    def _names(self, dtype: str) -> list[str]:
+        """The type's name, then its tables: what a shared class may be known by."""
+        return [dtype, *(each.table for each in reversed(self._catalogue.of_dtype(dtype)))]
+
+    def _make(self, dtype: str) -> bool:
+        """Whether the class is new or has grown."""
+        try:
+            fields = self._catalogue.fields_of(dtype)
+        except Contradiction:  # the projector parks what it cannot fold; what it can is asked for without a class
+            return False
+        columned = [each for each in fields if each.type in _TYPES or each.type in ("pose", "object")]
+        known = self._classes.get(dtype)
+        if known is not None:
+            return self._add_fields(dtype, known, columned)
+        declared = self._catalogue.of_dtype(dtype)[-1]
+        base = self._base(declared)
+        table = Table(declared.table, self._metadata, Column("id", ForeignKey(base.__table__.c.id), primary_key=True))
+        made = type(dtype, (base,), {"__abstract__": True, "__doc__": f"{dtype}, as it was declared."})
+        identity = f"{dtype}@{id(self):x}"
+        self._registry.map_imperatively(
+            made,
+            table,
+            inherits=base.__mapper__,
+            polymorphic_identity=identity,
+            polymorphic_load="selectin",
+        )
+        self._classes[dtype] = made
+        self._fields[dtype] = set()
+        self._add_fields(dtype, made, columned)
+        return True
+
+    def _base(self, declared: DesignatorTypeDeclared) -> type[Designator]:
+        """The class of the nearest type it descends from."""
+        for dtype in declared.bases:
+            found = self._classes.get(dtype) or _shared_class(self._names(dtype))
+            if found is None and self._catalogue.of_dtype(dtype):
+                self._make(dtype)
+                found = self._classes.get(dtype)
+            if found is not None:
+                return found
+        return _ROOTS[declared.kind]
+
+    def _add_fields(self, dtype: str, made: type[Designator], fields: Iterable[FieldDeclared]) -> bool:
+        new = [each for each in fields if each.name not in self._fields[dtype]]
+        for field in new:
+            self._fields[dtype].add(field.name)
+            if not hasattr(made, field.name):  # a base's attribute shows the same value
+                self._add_field(made, field)
+        if new:
+            for engine in self._engines:
+                engine.sync_engine.clear_compiled_cache()
+        return bool(new)
+
+    def _add_field(self, made: type[Designator], field: FieldDeclared) -> None:
+        mapper = made.__mapper__
+        table = mapper.local_table
+        assert isinstance(table, Table)
+        if field.type in _TYPES:
+            column = Column(field.column, _TYPES[field.type])
+            table.append_column(column)
+            mapper.add_property(field.name, column)
+            return
+        target = Pose if field.type == "pose" else Object
+        column = Column(field.column, BigInteger(), ForeignKey(target.__table__.c.id))
+        table.append_column(column)
+        mapper.add_property(field.column, column)
+        mapper.add_property(
+            field.name,
+            relationship(
+                target,
+                primaryjoin=column == target.__table__.c.id,
+                foreign_keys=column,
+                viewonly=True,
+                lazy="selectin",
+            ),
+        )
+        if not hasattr(made, field.type):  # the first pose is also `pose`, the first object also `object`
+            mapper.add_property(field.type, synonym(field.name))
+            mapper.add_property(f"{field.type}_id", synonym(field.column))
+
+    def _introduce(self, engine: AsyncEngine) -> None:
+        identities = {dtype: str(made.__mapper__.polymorphic_identity) for dtype, made in self._classes.items()}
+        known_classes(engine.dialect).adopt(identities)
+
+
+def _shared_class(names: Iterable[str]) -> type[Designator] | None:
+    """The class every memory of this process shares, by one of its names: type or table."""
+    wanted = set(names)
+    for mapper in Designator.__mapper__.self_and_descendants:
+        identity = str(mapper.polymorphic_identity)
+        table = mapper.local_table
+        assert isinstance(table, Table)
+        if "@" not in identity and wanted & {identity, table.name}:
+            return mapper.class_
+    return None

@@ -1,0 +1,136 @@
+"""A memory opened for asking: sessions, frames and named questions; nothing is ever written through it.
+
+async with Reading.open("sqlite:///memory.db") as reading:
+    async with reading.session() as session:
+        actions = (await session.scalars(select(Action))).all()
+    frame = await reading.dataframe(select(PickUpWithContextView))
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from typing import TYPE_CHECKING, Any, Self
+
+from sqlalchemy import Select
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.ext.asyncio import AsyncSession, async_sessionmaker
+
+from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.events.ids import parse_episode_id
+from pycrorm_async.orm.designators import Designator
+from pycrorm_async.orm.dynamic import DynamicClasses
+from pycrorm_async.projections.generations import current_generation
+from pycrorm_async.query import questions
+from pycrorm_async.query.frames import dataframe
+from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.sqlite.faults import ours
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Reading"]
+
+
+class Reading:
+    """The asking side of one memory. Belongs to the loop it was opened in."""
+
+    def __init__(self, log: EventLog) -> None:
+        self._log = log
+        self._classes = DynamicClasses()
+        self._classes.use_in(log.engine)
+        self._sessions = async_sessionmaker(log.engine, expire_on_commit=False)
+
+    @classmethod
+    @asynccontextmanager
+    async def open(cls, url: str) -> AsyncIterator[Self]:
+        """The memory at a URL, which must be there.
+
+        Raises `UnknownUrl`; `DatabaseUnavailable` without a memory at that place, `DatabaseForeign` for another
+        program's or a newer version's.
+        """
+        with DatabaseAddress.parse(url).located() as address:
+            async with cls.open_address(address) as reading:
+                yield reading
+
+    @classmethod
+    @asynccontextmanager
+    async def open_address(cls, address: DatabaseAddress) -> AsyncIterator[Self]:
+        """The memory at a located address. Raises as `open` does."""
+        log = await EventLog.open(address, create=False)
+        try:
+            reading = cls(log)
+            try:
+                await reading._recognise()
+                yield reading
+            finally:
+                reading._classes.dispose()
+        finally:
+            await log.close()
+
+    async def refresh(self) -> None:
+        """Learns the designator types that were declared since; every session begins with it."""
+        self._classes.learn(await self._log.declarations())
+
+    @asynccontextmanager
+    async def session(self) -> AsyncIterator[AsyncSession]:
+        """An ordinary session. Its objects stay readable when it is over."""
+        await self.refresh()
+        async with self._sessions() as session:
+            yield session
+
+    async def dataframe(self, statement: Select[Any]) -> pd.DataFrame:
+        """The answer as a pandas DataFrame, see `pycrorm_async.query.frames`. Raises `MissingExtra`."""
+        with self._translated():
+            return await dataframe(self._log.engine, statement)
+
+    def mapped(self, designator: str | type) -> type[Designator]:
+        """The mapped class of a dtype, a table or a designator class, as of the last `refresh`.
+
+        Raises `CallerError` for a type this memory has never seen.
+        """
+        return self._classes.of(designator)
+
+    # --- named questions --------------------------------------------------------------------------------------
+
+    async def episodes(self) -> list[EpisodeSummary]:
+        """Every episode, the oldest first."""
+        with self._translated():
+            return await questions.episodes(self._log.engine)
+
+    async def episode(self, name: str) -> EpisodeSummary:
+        """The episode of that number, or id, or first digits of its id, or `last`. Raises `UnknownEpisode`."""
+        with self._translated():
+            return await questions.episode_named(self._log.engine, name)
+
+    async def tree(self, number: int) -> list[NodeSummary]:
+        """The task tree of an episode, each node before its children."""
+        with self._translated():
+            return await questions.task_tree(self._log.engine, number)
+
+    async def number_of(self, episode: str) -> int:
+        """The number this database gave to the episode of that UUID. Raises `UnknownEpisode`."""
+        number = await self._log.episode_number(parse_episode_id(episode))
+        if number is None:
+            raise UnknownEpisode(f"nothing of the episode {episode} is in this database yet")
+        return number
+
+    # --- inside -----------------------------------------------------------------------------------------------
+
+    async def _recognise(self) -> None:
+        with self._translated():
+            async with self._log.engine.connect() as connection:
+                if await current_generation(connection) is None:
+                    raise DatabaseUnavailable(
+                        f"{self._log.address} has a log and no tables yet: `pycrorm writer --once` makes them"
+                    )
+        await self.refresh()
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except DBAPIError as error:
+            raise ours(error, str(self._log.address)) from error
