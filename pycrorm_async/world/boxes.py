@@ -7,7 +7,6 @@ those of the convex hull that Bullet makes of them.
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -52,6 +51,8 @@ class Solid:
     points: Array
     radius: float = 0.0
     axis: Array | None = None
+    is_box: bool = False
+    """Its points are then in the order of `_CORNERS`."""
 
     def box(self, rotation: Array, position: Array) -> tuple[Array, Array]:
         """Lowest and highest corner where the link's frame is at (rotation matrix, position)."""
@@ -64,27 +65,24 @@ class Solid:
 
     @cached_property
     def inner_points(self) -> Array:
-        """Points spread through the shape, none on its surface, at most about 150; the same every time."""
-        anchors = self.points[:: max(1, len(self.points) // 8)]
-        rim = [np.zeros(3)]
+        """Points spread evenly through the shape, none on its surface; at most 128, the same every time."""
+        middle = self.points.mean(axis=0)
+        if self.is_box:
+            return np.asarray(middle + _GRID @ (self.points[[4, 2, 1]] - self.points[0]) / 2)
         if self.radius:
-            rim += [out if self.axis is None else out - self.axis * (out @ self.axis) for out in _DIRECTIONS]
-        hull = [
-            (first + second) / 2 + self.radius * out
-            for first, second in itertools.combinations_with_replacement(anchors, 2)
-            for out in rim
-        ]
-        middle = anchors.mean(axis=0)
-        return np.concatenate([middle + (np.array(hull) - middle) * inward for inward in (0.9, 0.5)])
+            out = _BALL if self.axis is None else _BALL - np.outer(_BALL @ self.axis, self.axis)
+            along = _ALONG if len(self.points) > 1 else _ALONG[:1]
+            cores = self.points[0] + np.outer(along, self.points[-1] - self.points[0])
+            return np.concatenate([core + self.radius * out for core in cores])
+        anchors = self.points[:: max(1, len(self.points) // 15)][:15]
+        pairs = itertools.combinations_with_replacement(anchors, 2)
+        return np.array([middle + ((first + second) / 2 - middle) * 0.9 for first, second in pairs])
 
 
+_ALONG = np.array([0.125, 0.375, 0.625, 0.875])
+_GRID = np.array(list(itertools.product(2 * _ALONG - 1, repeat=3)))
+_BALL = _GRID[np.linalg.norm(_GRID, axis=1) < 1]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-_DIRECTIONS = tuple(
-    np.array(direction) / math.sqrt(sum(map(abs, direction)))
-    for direction in itertools.product((-1, 0, 1), repeat=3)
-    if any(direction)
-)
-"""Unit vectors to the faces, edges and corners of a cube."""
 
 
 def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> tuple[Solid, ...]:
@@ -110,7 +108,7 @@ def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -
 
 def _primitive(bullet: Any, kind: int, size: Sequence[float], centre: Array, rotation: Array) -> list[Solid]:
     if kind == bullet.GEOM_BOX:
-        return [Solid(_CORNERS * np.array(size) / 2 @ rotation.T + centre)]
+        return [Solid(_CORNERS * np.array(size) / 2 @ rotation.T + centre, is_box=True)]
     if kind == bullet.GEOM_SPHERE:
         return [Solid(centre[None, :], size[0])]
     if kind in (bullet.GEOM_CYLINDER, bullet.GEOM_CAPSULE):
@@ -129,7 +127,7 @@ def _as_bullet_has_it(bullet: Any, client: int, body: int, link: int, inertial: 
         placed = bullet.getLinkState(body, link, physicsClientId=client)
     corners = (np.array(low) + np.array(high)) / 2 + _CORNERS * (np.array(high) - np.array(low)) / 2
     in_inertial = (corners - np.array(placed[0])) @ rotation_matrix(placed[1])
-    return Solid(in_inertial @ rotation_matrix(inertial[1]).T + np.array(inertial[0]))
+    return Solid(in_inertial @ rotation_matrix(inertial[1]).T + np.array(inertial[0]), is_box=True)
 
 
 def box_around(placed: Iterable[tuple[Frame, Iterable[Solid]]]) -> BoundingBox | None:

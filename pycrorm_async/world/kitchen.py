@@ -3,7 +3,7 @@
 Seen from the origin, where the robot starts (x ahead, y to the left, metres):
 
     ahead, front at x 1.05, 0.6 deep    fridge y -1.25..-0.60 | counter -0.55..0.85, top 0.848 | sink area 0.85..1.75,
-                                        top 0.812
+                                        top 0.812; a wall behind all three
     behind, front at x -1.10, 0.7 deep  island y 0.20..1.80, top 0.900
 
 The thesis' cereal (1.3, 0.7, 0.95) and milk (1.3, 1, 0.9) stand on the counter and in the sink area. Surfaces have
@@ -40,6 +40,7 @@ def kitchen_urdf() -> str:
     """The kitchen as URDF text, the same every time."""
     parts = [
         f'<link name="kitchen">{INERTIA}</link>',
+        *_part("kitchen_wall", "kitchen", (1.65, 0.0, 0.0), [_Block((0.0, 0.1), (-1.25, 1.75), (0.0, 2.2), _PALE)]),
         *_cupboard("kitchen_counter", x=(_FRONT, 1.65), y=(-0.55, 0.85), top=0.848),
         *_cupboard("sink_area", x=(_FRONT, 1.65), y=(0.85, 1.75), top=0.812),
         *_tap(),

@@ -1,0 +1,372 @@
+"""A world is entered once, is the current one inside, tells its observers, and goes back to how it was."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, watcher
+from pycrorm_async.world.errors import ObjectNotInWorld, WorldClosed, WorldError, WorldUnavailable
+from tests.world.witness import CRANE, Witness
+
+# --- entering and leaving -------------------------------------------------------------------------------------
+
+
+class Watching:
+    def __init__(self, refusal: Exception | None = None) -> None:
+        self.told: list[tuple[str, BulletWorld, bool]] = []
+        self.refusal = refusal
+
+    def world_entered(self, world: BulletWorld) -> None:
+        self.told.append(("entered", world, current_world.get() is world))
+        if self.refusal is not None:
+            raise self.refusal
+
+    def world_left(self, world: BulletWorld) -> None:
+        self.told.append(("left", world, world.entered))
+
+
+def test_inside_it_is_the_current_world_and_after_it_the_former_one_is() -> None:
+    assert current_world.get() is None
+    with BulletWorld() as outer:
+        assert current_world.get() is outer
+        with BulletWorld() as inner:
+            assert current_world.get() is inner
+            assert Object("bowl", ObjectType.BOWL).world is inner
+        assert current_world.get() is outer
+        assert outer.objects == ()
+        assert (outer.entered, inner.entered) == (True, False)
+    assert current_world.get() is None
+
+
+def test_it_can_be_left_from_another_context_than_it_was_entered_in() -> None:
+    world = BulletWorld()
+    inside = contextvars.copy_context()
+    inside.run(world.__enter__)
+    assert current_world.get() is None
+    world.__exit__(None, None, None)
+    assert not world.entered
+    assert current_world.get() is None
+    with pytest.raises(WorldClosed):
+        inside.run(Object, "bowl", ObjectType.BOWL)
+
+
+def test_the_watcher_of_the_context_learns_of_entering_and_leaving() -> None:
+    watching = Watching()
+    token = watcher.set(watching)
+    try:
+        with BulletWorld() as world:
+            pass
+    finally:
+        watcher.reset(token)
+    assert watching.told == [("entered", world, True), ("left", world, True)]
+    with BulletWorld():
+        pass
+    assert len(watching.told) == 2
+
+
+def test_a_watcher_can_refuse_the_entering() -> None:
+    watching = Watching(refusal=KeyError("an episode is open elsewhere"))
+    token = watcher.set(watching)
+    world = BulletWorld()
+    try:
+        with pytest.raises(KeyError, match="an episode"), world:
+            pytest.fail("entered")
+    finally:
+        watcher.reset(token)
+    assert current_world.get() is None
+    assert not world.entered
+    assert [entry[0] for entry in watching.told] == ["entered"]
+
+
+def test_a_world_that_was_left_can_be_read_and_not_changed() -> None:
+    there = Pose([1, 2, 3])
+    with BulletWorld() as world:
+        crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, there)
+        cup = Object("cup", ObjectType.JEROEN_CUP)
+        crane.set_joint_position("turning", 0.4)
+    assert [thing.name for thing in world.objects] == ["crane", "cup"]
+    assert (crane.pose, crane.object_type) == (there, ObjectType.GENERIC_OBJECT)
+    assert crane.joint_position("turning") == 0.4
+    state = world.save_state()
+    for call in (
+        lambda: crane.set_pose(Pose()),
+        lambda: crane.set_joint_position("turning", 0.0),
+        lambda: crane.attach(cup),
+        lambda: crane.detach(cup),
+        lambda: crane.link_pose("hook"),
+        crane.bounding_box,
+        lambda: Object("bowl", ObjectType.BOWL, world=world),
+        lambda: world.ray_test([(0, 0, 0)], [(1, 0, 0)]),
+        lambda: world.visible(cup, (0, 0, 5)),
+        lambda: world.remove(cup),
+        lambda: world.restore_state(state),
+        crane.reset,
+        world.reset,
+        world.__enter__,
+    ):
+        with pytest.raises(WorldClosed):
+            call()
+    assert crane.pose is there
+
+
+def test_a_world_must_be_entered_before_things_are_put_into_it() -> None:
+    with pytest.raises(WorldClosed, match="with BulletWorld"):
+        Object("bowl", ObjectType.BOWL, world=BulletWorld())
+
+
+def test_a_window_without_a_display_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(WorldUnavailable, match="DISPLAY"), BulletWorld(mode=WorldMode.GUI):
+        pytest.fail("entered")
+    assert current_world.get() is None
+
+
+def test_what_the_world_refuses_is_the_callers_to_change() -> None:
+    assert issubclass(WorldError, CallerError)
+    assert issubclass(WorldClosed, WorldError)
+
+
+# --- several at once ------------------------------------------------------------------------------------------
+
+
+async def test_two_tasks_with_a_world_each_never_mix() -> None:
+    async def act(number: int) -> list[tuple[Any, ...]]:
+        with BulletWorld() as world:
+            witness = Witness()
+            world.observe(witness)
+            thing = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
+            for step in range(20):
+                await asyncio.sleep(0)
+                assert current_world.get() is world
+                thing.set_pose(Pose([number, step, 0]))
+                await asyncio.sleep(0)
+                # also in Bullet itself nothing of the other's is seen
+                assert thing.link_pose("mast").position == pytest.approx((number + 0.1, step, 0.5), abs=1e-9)
+                assert world.ray_test([(number, step, 5)], [(number, step, 0.1)]) == [thing]
+                assert world.ray_test([(1 - number, step, 5)], [(1 - number, step, 0.1)]) == [None]
+            return [entry for entry in witness.told if entry[0] == "moved"]
+
+    first, second = await asyncio.gather(act(0), act(1))
+    assert first == [("moved", "crane", Pose([0, step, 0])) for step in range(20)]
+    assert second == [("moved", "crane", Pose([1, step, 0])) for step in range(20)]
+
+
+def test_threads_have_worlds_of_their_own() -> None:
+    def act(number: int) -> tuple[float, ...]:
+        with BulletWorld() as world:
+            assert current_world.get() is world
+            things = [Object(f"crane {k}", ObjectType.GENERIC_OBJECT, CRANE) for k in range(5)]
+            for step in range(100):
+                things[0].set_pose(Pose([number, step, 0]))
+            return things[0].link_pose("mast").position
+
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(act, range(8)))
+    assert found == [pytest.approx((number + 0.1, 99.0, 0.5), abs=1e-9) for number in range(8)]
+
+
+# --- what is in it --------------------------------------------------------------------------------------------
+
+
+def test_objects_are_found_by_name_and_in_order(world: BulletWorld, witness: Witness) -> None:
+    bowl, robot = Object("bowl", ObjectType.BOWL), Object("mover", ObjectType.ROBOT, CRANE)
+    assert world.objects == (bowl, robot)
+    assert world.object("bowl") is bowl
+    assert world.robot is robot
+    with pytest.raises(ObjectNotInWorld, match="'spoon' is not in the world; there are: bowl, mover"):
+        world.object("spoon")
+    assert world.description == "BulletWorld (DIRECT): bowl (BOWL), mover (ROBOT)"
+    world.remove(robot)
+    assert world.robot is None
+    assert [entry[:2] for entry in witness.told] == [("added", "bowl"), ("added", "mover"), ("removed", "mover")]
+
+
+def test_an_observer_is_told_once_and_not_after_it_left(world: BulletWorld, witness: Witness) -> None:
+    world.observe(witness)
+    Object("bowl", ObjectType.BOWL)
+    world.unobserve(witness)
+    Object("spoon", ObjectType.SPOON)
+    assert witness.names() == [("added", "bowl")]
+
+
+# --- going back -----------------------------------------------------------------------------------------------
+
+HERE, THERE = Pose([0.5, 0.5, 0.5]), Pose([1, 2, 0.5], [0, 0, 1, 1])
+
+
+def scene() -> tuple[Object, Object, Object]:
+    return (
+        Object("crane", ObjectType.GENERIC_OBJECT, CRANE),
+        Object("cup", ObjectType.JEROEN_CUP, pose=HERE),
+        Object("bowl", ObjectType.BOWL, pose=HERE),
+    )
+
+
+def test_reset_brings_back_the_beginning_and_tells_only_what_changed(world: BulletWorld, witness: Witness) -> None:
+    crane, cup, bowl = scene()
+    crane.attach(cup, "hook")
+    crane.set_joint_positions({"turning": 0.5, "lifting": 0.0})
+    witness.told.clear()
+    world.reset()
+    assert witness.told == [
+        ("detached", "crane", "cup", "hook"),
+        ("joints", "crane", {"turning": 0.0}),
+        ("moved", "cup", HERE),
+    ]
+    assert (crane.pose, cup.pose, bowl.pose) == (Pose(), HERE, HERE)
+    assert crane.link_pose("hook") == pytest.approx(crane.link_pose("hook"))
+    witness.told.clear()
+    world.reset()
+    assert witness.told == []
+
+
+def test_a_restored_state_is_the_saved_one_and_tells_only_what_differed(world: BulletWorld, witness: Witness) -> None:
+    crane, cup, bowl = scene()
+    crane.attach(cup, "hook")
+    crane.set_joint_positions({"turning": 0.5, "reaching": 0.3})
+    held_at, hook = cup.pose, crane.link_pose("hook")
+    state = world.save_state()
+
+    crane.detach(cup)
+    crane.attach(bowl)
+    crane.set_joint_positions({"turning": 0.9, "lifting": 0.4})
+    crane.set_pose(THERE)
+    witness.told.clear()
+    world.restore_state(state)
+    assert witness.told == [
+        ("detached", "crane", "bowl", None),
+        ("joints", "crane", {"turning": 0.5, "lifting": 0.0}),
+        ("moved", "crane", Pose()),
+        ("moved", "bowl", HERE),
+        ("attached", "crane", "cup", "hook"),
+    ]
+    assert (crane.attachments, cup.pose) == ({cup: "hook"}, held_at)
+    assert crane.link_pose("hook").position == pytest.approx(hook.position, abs=1e-12)
+    crane.set_joint_position("turning", 0.9)
+    crane.set_joint_position("turning", 0.5)
+    assert cup.pose.position == pytest.approx(held_at.position, abs=1e-9)
+    world.restore_state(state)
+    witness.told.clear()
+    world.restore_state(state)
+    assert witness.told == []
+
+
+def test_a_saved_state_is_a_value_that_later_motions_do_not_change(world: BulletWorld) -> None:
+    crane, _, _ = scene()
+    state = world.save_state()
+    crane.set_joint_position("turning", 0.5)
+    crane.set_pose(THERE)
+    assert state.objects["crane"].joints == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
+    assert state.objects["crane"].pose == Pose()
+    assert state != world.save_state()
+    world.restore_state(state)
+    assert state == world.save_state()
+
+
+def test_what_was_added_since_stays_and_is_let_go(world: BulletWorld) -> None:
+    crane, _, _ = scene()
+    state = world.save_state()
+    spoon = Object("spoon", ObjectType.SPOON, pose=THERE)
+    crane.attach(spoon, "hook")
+    crane.set_joint_position("turning", 0.5)
+    carried_to = spoon.pose
+    world.restore_state(state)
+    assert (spoon.pose, spoon.attached_to) == (carried_to, None)
+
+
+def test_a_state_with_an_object_that_is_gone_is_refused_and_nothing_moves(world: BulletWorld) -> None:
+    crane, cup, _ = scene()
+    state = world.save_state()
+    crane.set_pose(THERE)
+    cup.remove()
+    with pytest.raises(ObjectNotInWorld, match="'cup'"):
+        world.restore_state(state)
+    assert crane.pose is THERE
+
+
+# --- looking --------------------------------------------------------------------------------------------------
+
+
+def cube(name: str, position: tuple[float, float, float]) -> Object:
+    """10 cm along each edge."""
+    return Object(name, ObjectType.GENERIC_OBJECT, pose=Pose(position))
+
+
+def test_a_ray_meets_the_first_object_in_its_way(world: BulletWorld) -> None:
+    near, far = cube("near", (1, 0, 1)), cube("far", (2, 0, 1))
+    starts = [(0, 0, 1), (3, 0, 1), (0, 0.2, 1), (0, 0, 1), (0, 0, 1), (1.5, 0, 1)]
+    ends = [(3, 0, 1), (0, 0, 1), (3, 0.2, 1), (0.9, 0, 1), (0, 0, -1), (1.5, 0, 2)]
+    assert world.ray_test(starts, ends) == [near, far, None, None, None, None]
+    assert world.ray_test(starts[:2], ends[:2], ignore=[near]) == [far, far]
+    assert world.ray_test(starts[:2], ends[:2], ignore=[near, far]) == [None, None]
+
+
+def test_rays_follow_what_moved(world: BulletWorld) -> None:
+    thing = cube("thing", (1, 0, 1))
+    thing.set_pose(Pose([1, 5, 1]))
+    assert world.ray_test([(0, 0, 1), (0, 5, 1)], [(3, 0, 1), (3, 5, 1)]) == [None, thing]
+    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([0, -5, 0]))
+    x, y, z = crane.link_pose("hook").position
+    assert world.ray_test([(x, y, z + 1)], [(x, y, z - 0.09)]) == [crane]
+    crane.set_joint_position("turning", math.pi)
+    assert world.ray_test([(x, y, z + 1)], [(x, y, z - 0.09)]) == [None]
+    x, y, z = crane.link_pose("hook").position
+    assert world.ray_test([(x, y, z + 1)], [(x, y, z - 0.09)]) == [crane]
+
+
+def test_more_rays_than_bullet_takes_at_once(world: BulletWorld) -> None:
+    thing = cube("thing", (0, 0, 1))
+    starts = [(0, 0, 2 + ray / 40_000) for ray in range(20_000)]
+    assert world.ray_test(starts, [(0, 0, 0.5)] * 20_000) == [thing] * 20_000
+
+
+def test_as_many_starts_as_ends_make_rays(world: BulletWorld) -> None:
+    with pytest.raises(ValueError, match="2 starts and 1 ends"):
+        world.ray_test([(0, 0, 1), (0, 0, 2)], [(1, 0, 1)])
+
+
+def test_visibility_is_the_share_that_nothing_hides(world: BulletWorld) -> None:
+    thing, eye = cube("thing", (2, 0, 1)), (0.0, 0.0, 1.0)
+    assert world.visible(thing, eye) == 1.0
+    whole = Object("wall", ObjectType.GENERIC_OBJECT, wall(0.4), Pose([1, 0, 1]))
+    assert world.visible(thing, eye) == 0.0
+    assert world.visible(thing, eye, ignore=[whole]) == 1.0
+    assert world.visible(whole, eye) == 1.0
+    whole.set_pose(Pose([1, 0.2, 1]))
+    assert world.visible(thing, eye) == 0.5
+    whole.set_pose(Pose([3, 0, 1]))
+    assert world.visible(thing, eye) == 1.0
+    assert world.visible(thing, (2, 0, -1)) == 0.0
+
+
+SHAPES = {
+    "box": '<box size="0.3 0.1 0.2"/>',
+    "sphere": '<sphere radius="0.1"/>',
+    "cylinder": '<cylinder radius="0.05" length="0.4"/>',
+    "capsule": '<capsule radius="0.05" length="0.4"/>',
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_what_nothing_hides_is_wholly_visible_from_everywhere(world: BulletWorld, shape: str) -> None:
+    description = (
+        '<robot name="a"><link name="l"><collision><origin xyz="0.1 0 0" rpy="0.3 0.2 0"/><geometry>'
+        f"{SHAPES[shape]}</geometry></collision></link></robot>"
+    )
+    thing = Object("thing", ObjectType.GENERIC_OBJECT, description, Pose([0, 0, 2], [0.1, 0.5, -0.2, 0.7]))
+    eyes = [(2, 0, 2), (-2, 0.1, 3), (0, 2, 1), (0.3, -2, 2), (0, 0, 4), (0.1, 0, 0.5)]
+    assert [world.visible(thing, eye) for eye in eyes] == [1.0] * 6
+
+
+def wall(width: float) -> str:
+    return (
+        '<robot name="wall"><link name="wall"><collision><geometry>'
+        f'<box size="0.02 {width} {width}"/></geometry></collision></link></robot>'
+    )

@@ -1,0 +1,169 @@
+"""The kitchen is where its drawing says, moves as furniture does, and what stands in it can be reached."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+
+from pycrorm_async.world import Arms, BulletWorld, JointType, Object, ObjectType, OccupancyCostmap, Pose
+from pycrorm_async.world.errors import JointLimitExceeded
+from pycrorm_async.world.kinematics import Unreachable, solve
+from pycrorm_async.world.kitchen import kitchen_urdf
+from pycrorm_async.world.pose import rotated, yaw_quaternion
+
+
+@pytest.fixture
+def kitchen(world: BulletWorld) -> Object:
+    return Object("kitchen", ObjectType.ENVIRONMENT)
+
+
+def cereal_and_milk() -> tuple[Object, Object]:
+    return (
+        Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95])),
+        Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9])),
+    )
+
+
+@pytest.mark.parametrize("seed", ["1", "2"])
+def test_it_is_the_same_text_in_every_process(seed: str) -> None:
+    code = "from pycrorm_async.world.kitchen import kitchen_urdf; print(kitchen_urdf(), end='')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env={**os.environ, "PYTHONHASHSEED": seed},
+    )
+    assert done.stdout == kitchen_urdf()
+
+
+@pytest.mark.parametrize(
+    ("surface", "low", "high"),
+    [
+        ("kitchen_counter_surface", (1.05, -0.55, 0.808), (1.65, 0.85, 0.848)),
+        ("sink_area_surface", (1.05, 0.85, 0.772), (1.65, 1.75, 0.812)),
+        ("kitchen_island_surface", (-1.80, 0.20, 0.860), (-1.10, 1.80, 0.900)),
+    ],
+)
+def test_surfaces_are_where_the_drawing_says_with_their_frame_on_top(
+    kitchen: Object, surface: str, low: tuple[float, ...], high: tuple[float, ...]
+) -> None:
+    np.testing.assert_allclose(kitchen.bounding_box(surface), [low, high], atol=1e-9)
+    middle = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2, high[2])
+    np.testing.assert_allclose(kitchen.link_pose(surface).position, middle, atol=1e-9)
+
+
+def test_cereal_and_milk_of_the_thesis_stand_on_the_worktops(kitchen: Object) -> None:
+    cereal, milk = cereal_and_milk()
+    for thing, surface in ((cereal, "kitchen_counter_surface"), (milk, "sink_area_surface")):
+        box, top = thing.bounding_box(), kitchen.bounding_box(surface)
+        assert box.min.z == pytest.approx(top.max.z, abs=1e-9)
+        assert top.min[:2] < box.min[:2]
+        assert box.max[:2] < top.max[:2]
+
+
+def test_the_floor_is_free_where_the_robot_starts_and_where_the_thesis_sends_it(
+    world: BulletWorld, kitchen: Object
+) -> None:
+    cereal_and_milk()
+    for place in ([0.0, 0.0, 0.0], [0.6, 0.4, 0.0]):
+        middle = OccupancyCostmap(world, Pose(place), size_cells=2).map
+        np.testing.assert_array_equal(middle, np.ones((2, 2)))
+
+
+DRAWERS = (
+    "kitchen_counter_upper_drawer",
+    "kitchen_counter_lower_drawer",
+    "sink_area_drawer",
+    "kitchen_island_upper_drawer",
+    "kitchen_island_lower_drawer",
+)
+
+
+@pytest.mark.parametrize("drawer", DRAWERS)
+def test_a_drawer_slides_out_towards_who_stands_before_it(kitchen: Object, drawer: str) -> None:
+    joint, handle = f"{drawer}_joint", f"{drawer}_handle"
+    assert kitchen.joint_type(joint) is JointType.PRISMATIC
+    assert kitchen.joint_limits(joint) == (0.0, 0.35)
+    assert kitchen.joints_above(handle) == (joint,)
+    closed = kitchen.link_pose(handle)
+    into = rotated(closed.orientation, (1, 0, 0))
+    assert into.x == pytest.approx(-1.0 if "island" in drawer else 1.0)
+    kitchen.set_joint_position(joint, 0.35)
+    opened = kitchen.link_pose(handle)
+    np.testing.assert_allclose(opened.position, np.array(closed.position) - 0.35 * np.array(into), atol=1e-9)
+    assert opened.orientation == pytest.approx(closed.orientation)
+    for beyond in (-0.01, 0.36):
+        with pytest.raises(JointLimitExceeded, match=joint):
+            kitchen.set_joint_position(joint, beyond)
+
+
+def test_a_thing_in_an_open_drawer_is_seen_from_above_and_comes_along(world: BulletWorld, kitchen: Object) -> None:
+    kitchen.set_joint_position("kitchen_counter_upper_drawer_joint", 0.35)
+    inside = kitchen.link_pose("kitchen_counter_upper_drawer").position
+    spoon = Object("spoon", ObjectType.SPOON, pose=Pose([inside.x + 0.15, inside.y, inside.z + 0.03]))
+    eye = (inside.x, inside.y, 1.4)
+    assert world.visible(spoon, eye) == 1.0
+    kitchen.attach(spoon, "kitchen_counter_upper_drawer")
+    kitchen.set_joint_position("kitchen_counter_upper_drawer_joint", 0.0)
+    assert spoon.pose.position == pytest.approx((inside.x + 0.5, inside.y, inside.z + 0.03), abs=1e-9)
+    assert world.visible(spoon, eye) == 0.0
+
+
+def test_the_fridge_door_swings_towards_the_room_about_its_right_edge(kitchen: Object) -> None:
+    joint, handle = "fridge_door_joint", "fridge_door_handle"
+    assert kitchen.joint_type(joint) is JointType.REVOLUTE
+    assert kitchen.joint_limits(joint) == (0.0, 1.9)
+    assert kitchen.link_pose(handle).position == pytest.approx((0.95, -0.66, 0.95), abs=1e-9)
+    kitchen.set_joint_position(joint, math.pi / 2)
+    assert kitchen.link_pose(handle).position == pytest.approx((1.05 - 0.59, -1.25 - 0.10, 0.95), abs=1e-9)
+
+
+def reachable_from(world: BulletWorld, robot: Object, targets: Iterable[Pose]) -> bool:
+    """Whether one arm reaches all the targets from one of the free places around the first one, facing it."""
+    targets = list(targets)
+    goal = targets[0].position
+    for place in OccupancyCostmap(world, Pose([goal.x, goal.y, 0])).best(600)[::20]:
+        heading = math.atan2(goal.y - place.position.y, goal.x - place.position.x)
+        robot.set_pose(Pose(place.position, yaw_quaternion(heading)))
+        for arm in (Arms.LEFT, Arms.RIGHT):
+            try:
+                for target in targets:
+                    solve(robot, arm, target)
+            except Unreachable:
+                continue
+            return True
+    return False
+
+
+@pytest.fixture
+def robot(world: BulletWorld, kitchen: Object) -> Object:
+    robot = Object("pr2", ObjectType.ROBOT)
+    robot.set_joint_position("torso_lift_joint", 0.3)
+    return robot
+
+
+def test_cereal_and_milk_can_be_picked_up_from_free_floor(world: BulletWorld, robot: Object) -> None:
+    for thing in cereal_and_milk():
+        x, y, z = thing.pose.position
+        assert reachable_from(world, robot, [Pose([x, y, z]), Pose([x - 0.07, y, z]), Pose([x, y, z + 0.03])])
+
+
+def test_a_thing_can_be_placed_on_the_island_from_free_floor(world: BulletWorld, robot: Object) -> None:
+    facing_it = yaw_quaternion(math.pi)
+    assert reachable_from(world, robot, [Pose([-1.30, 1.0, 1.0], facing_it), Pose([-1.30, 1.0, 1.05], facing_it)])
+
+
+@pytest.mark.parametrize("drawer", DRAWERS)
+def test_every_drawer_can_be_pulled_open_from_free_floor(
+    world: BulletWorld, kitchen: Object, robot: Object, drawer: str
+) -> None:
+    closed = kitchen.link_pose(f"{drawer}_handle")
+    assert reachable_from(world, robot, [closed, closed @ Pose([-0.30, 0, 0])])

@@ -1,0 +1,220 @@
+"""An object is where it was put, its links are where its description says, and what cannot be is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from pycrorm_async.world import BulletWorld, JointType, Object, ObjectType, Pose
+from pycrorm_async.world.errors import (
+    DuplicateName,
+    JointLimitExceeded,
+    NoWorld,
+    ObjectNotInWorld,
+    PoseRefused,
+    UnknownJoint,
+    UnknownLink,
+)
+from tests.world.witness import CRANE, Witness, crane_links, matrix
+
+LEANING = Pose([0.3, -1.2, 0.7], [0.2, -0.4, 0.1, 0.8])
+
+
+def crane(pose: Pose | None = None) -> Object:
+    return Object("crane", ObjectType.GENERIC_OBJECT, CRANE, pose)
+
+
+def test_the_pose_read_is_the_very_pose_set(world: BulletWorld) -> None:
+    milk = Object("milk", ObjectType.MILK, pose=LEANING)
+    assert milk.pose is LEANING
+    there = Pose([1.3, 1.0, 0.9], [0, 0, 0.3, 0.7])
+    milk.set_pose(there)
+    assert milk.pose is there
+    assert milk.link_pose() is there
+
+
+def test_without_a_pose_an_object_is_at_the_origin(world: BulletWorld) -> None:
+    assert Object("bowl", ObjectType.BOWL).pose == Pose([0, 0, 0], [0, 0, 0, 1])
+
+
+@pytest.mark.parametrize("base", [Pose(), LEANING])
+@pytest.mark.parametrize(
+    ("turning", "lifting", "reaching"), [(0, 0, 0), (0.4, -0.5, 0.6), (-9.0, 1.2, 0.25), (2.5, 0.3, 0)]
+)
+def test_every_link_is_where_the_description_says(
+    world: BulletWorld, base: Pose, turning: float, lifting: float, reaching: float
+) -> None:
+    thing = crane(base)
+    thing.set_joint_positions({"turning": turning, "lifting": lifting, "reaching": reaching})
+    expected = crane_links(base, turning=turning, lifting=lifting, reaching=reaching)
+    assert set(thing.links) == set(expected)
+    for link, where in expected.items():
+        np.testing.assert_allclose(matrix(thing.link_pose(link)), where, atol=1e-9)
+
+
+def test_links_follow_a_base_that_is_set_after_the_joints(world: BulletWorld) -> None:
+    thing = crane()
+    thing.set_joint_positions({"turning": 0.4, "reaching": 0.6})
+    thing.set_pose(LEANING)
+    expected = crane_links(LEANING, turning=0.4, lifting=0, reaching=0.6)
+    np.testing.assert_allclose(matrix(thing.link_pose("hook")), expected["hook"], atol=1e-9)
+
+
+def test_joints_and_links_have_the_names_kinds_and_limits_of_the_description(world: BulletWorld) -> None:
+    thing = crane()
+    assert thing.links[0] == "foot"
+    assert set(thing.joints) == {"turning", "lifting", "reaching"}
+    assert thing.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
+    assert thing.joint_limits("lifting") == (-0.5, 1.2)
+    assert thing.joint_limits("reaching") == (0.0, 0.6)
+    assert thing.joint_limits("turning") == (-math.inf, math.inf)
+    assert [thing.joint_type(joint) for joint in ("turning", "lifting", "reaching", "pole")] == [
+        JointType.CONTINUOUS,
+        JointType.REVOLUTE,
+        JointType.PRISMATIC,
+        JointType.FIXED,
+    ]
+    assert thing.joints_above("hook") == ("reaching", "lifting", "turning")
+    assert thing.joints_above("flag") == ("turning",)
+    assert thing.joints_above("foot") == ()
+
+
+def test_one_motion_of_joints_is_told_once_with_all_of_them(world: BulletWorld, witness: Witness) -> None:
+    thing = crane()
+    witness.told.clear()
+    thing.set_joint_positions({"turning": 1.5, "reaching": 0.1})
+    thing.set_joint_position("reaching", 0.1)
+    assert witness.told == [
+        ("joints", "crane", {"turning": 1.5, "reaching": 0.1}),
+        ("joints", "crane", {"reaching": 0.1}),
+    ]
+    assert thing.joint_positions() == {"turning": 1.5, "lifting": 0.0, "reaching": 0.1}
+
+
+def test_a_motion_of_no_joints_is_none(world: BulletWorld, witness: Witness) -> None:
+    thing = crane()
+    witness.told.clear()
+    thing.set_joint_positions({})
+    assert witness.told == []
+
+
+def test_a_base_motion_is_told_once_even_to_where_it_was(world: BulletWorld, witness: Witness) -> None:
+    thing = crane()
+    witness.told.clear()
+    thing.set_pose(LEANING)
+    thing.set_pose(LEANING)
+    assert witness.told == [("moved", "crane", LEANING)] * 2
+
+
+@pytest.mark.parametrize(
+    ("joint", "value", "limits"),
+    [
+        ("lifting", 1.2001, (-0.5, 1.2)),
+        ("lifting", -0.50001, (-0.5, 1.2)),
+        ("reaching", 5.0, (0.0, 0.6)),
+        ("reaching", math.nan, (0.0, 0.6)),
+        ("turning", math.inf, (-math.inf, math.inf)),
+    ],
+)
+def test_a_joint_outside_its_limits_is_refused_and_nothing_moves(
+    world: BulletWorld, witness: Witness, joint: str, value: float, limits: tuple[float, float]
+) -> None:
+    thing = crane()
+    witness.told.clear()
+    with pytest.raises(JointLimitExceeded) as refused:
+        thing.set_joint_positions({"turning": 0.5, "lifting": 0.5, joint: value})
+    assert (refused.value.object_name, refused.value.joint, refused.value.limits) == ("crane", joint, limits)
+    assert refused.value.value == value or math.isnan(value)
+    assert thing.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
+    assert witness.told == []
+
+
+def test_rounding_past_a_limit_is_let_through_and_never_clamped(world: BulletWorld) -> None:
+    thing = crane()
+    thing.set_joint_position("lifting", 1.2 + 9e-7)
+    assert thing.joint_position("lifting") == 1.2 + 9e-7
+
+
+def test_unknown_names_are_refused_with_those_that_exist(world: BulletWorld) -> None:
+    thing = crane()
+    for call in (
+        lambda: thing.set_joint_position("elbow", 0.0),
+        lambda: thing.joint_position("elbow"),
+        lambda: thing.joint_limits("elbow"),
+        lambda: thing.joint_type("elbow"),
+    ):
+        with pytest.raises(UnknownJoint, match=r"'crane' has no movable joint 'elbow'.*turning"):
+            call()
+    for look in (thing.link_pose, thing.bounding_box, thing.joints_above):
+        with pytest.raises(UnknownLink, match=r"'crane' has no link 'claw'.*hook"):
+            look("claw")
+
+
+@pytest.mark.parametrize(
+    "pose", [Pose([0, 0, math.nan]), Pose([math.inf, 0, 0]), Pose([1, 2, 3], frame="pr2/base_link")]
+)
+def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(world: BulletWorld, pose: Pose) -> None:
+    thing = crane(LEANING)
+    with pytest.raises(PoseRefused):
+        thing.set_pose(pose)
+    assert thing.pose is LEANING
+    with pytest.raises(PoseRefused):
+        Object("milk", ObjectType.MILK, pose=pose)
+    assert [present.name for present in world.objects] == ["crane"]
+
+
+def test_a_name_is_given_once_in_a_world(world: BulletWorld) -> None:
+    crane()
+    with pytest.raises(DuplicateName, match="'crane'"):
+        Object("crane", ObjectType.MILK)
+    world.remove(world.object("crane"))
+    assert Object("crane", ObjectType.MILK).object_type is ObjectType.MILK
+
+
+def test_an_object_needs_a_world() -> None:
+    with pytest.raises(NoWorld, match="'milk'"):
+        Object("milk", ObjectType.MILK)
+
+
+def test_reset_of_an_object_tells_only_what_it_changed(world: BulletWorld, witness: Witness) -> None:
+    thing, cup = crane(LEANING), Object("cup", ObjectType.JEROEN_CUP, pose=Pose([1, 0, 0]))
+    thing.attach(cup, "hook")
+    thing.set_joint_positions({"turning": 0.4, "lifting": 0.0})
+    kept = cup.pose
+    witness.told.clear()
+    thing.reset()
+    assert witness.told == [("detached", "crane", "cup", "hook"), ("joints", "crane", {"turning": 0.0})]
+    assert thing.pose is LEANING
+    assert cup.pose is kept
+    witness.told.clear()
+    thing.reset()
+    assert witness.told == []
+
+
+def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, witness: Witness) -> None:
+    thing = crane(LEANING)
+    thing.set_joint_position("turning", 0.4)
+    thing.remove()
+    assert witness.told[-1] == ("removed", "crane", LEANING)
+    assert (thing.name, thing.pose, thing.joint_position("turning")) == ("crane", LEANING, 0.4)
+    assert world.objects == ()
+    for call in (
+        lambda: thing.set_pose(Pose()),
+        lambda: thing.set_joint_position("turning", 0.0),
+        lambda: thing.link_pose("hook"),
+        thing.bounding_box,
+        thing.reset,
+        thing.remove,
+    ):
+        with pytest.raises(ObjectNotInWorld, match="'crane'"):
+            call()
+
+
+def test_a_colour_is_seen_on_every_link(world: BulletWorld) -> None:
+    from pycrorm_async.world.engine import engine
+
+    milk = Object("milk", ObjectType.MILK, color=(1.0, 0.0, 0.5, 1.0))
+    shapes = engine().getVisualShapeData(milk.body.number, physicsClientId=world.client)
+    assert [shape[7] for shape in shapes] == [(1.0, 0.0, 0.5, 1.0)]

@@ -1,0 +1,184 @@
+"""What is attached moves rigidly with the link it hangs on, and is told of once for every motion that carries it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world.errors import AttachmentRefused, ObjectNotInWorld, UnknownLink
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.world.witness import CRANE, Witness, crane_links, matrix
+
+BASE = Pose([0.5, 1.0, 0.2], [0.1, 0.2, -0.3, 0.9])
+CUP_AT = Pose([1.1, 0.6, 0.9], [0.5, 0.1, 0.0, 0.8])
+SPOON_AT = Pose([1.2, 0.7, 1.1], yaw_quaternion(0.4))
+JOINTS = {"turning": 0.8, "lifting": -0.3, "reaching": 0.4}
+
+
+@pytest.fixture
+def crane(world: BulletWorld) -> Object:
+    return Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
+
+
+@pytest.fixture
+def cup(world: BulletWorld) -> Object:
+    return Object("cup", ObjectType.JEROEN_CUP, pose=CUP_AT)
+
+
+@pytest.fixture
+def spoon(world: BulletWorld) -> Object:
+    return Object("spoon", ObjectType.SPOON, pose=SPOON_AT)
+
+
+def carried(before: np.ndarray, after: np.ndarray, pose: Pose) -> np.ndarray:
+    """Where something at `pose` is after its carrier went from one matrix to the other."""
+    return np.asarray(after @ np.linalg.inv(before) @ matrix(pose))
+
+
+def test_joints_and_base_carry_a_chain_rigidly(crane: Object, cup: Object, spoon: Object) -> None:
+    crane.attach(cup, "hook")
+    cup.attach(spoon)
+    before = crane_links(Pose(), turning=0, lifting=0, reaching=0)["hook"]
+    crane.set_joint_positions(JOINTS)
+    crane.set_pose(BASE)
+    after = crane_links(BASE, **JOINTS)["hook"]
+    np.testing.assert_allclose(matrix(cup.pose), carried(before, after, CUP_AT), atol=1e-9)
+    np.testing.assert_allclose(matrix(spoon.pose), carried(before, after, SPOON_AT), atol=1e-9)
+
+
+def test_a_thousand_motions_do_not_let_it_slip(crane: Object, cup: Object) -> None:
+    crane.attach(cup, "hook")
+    for step in range(1000):
+        crane.set_joint_position("turning", 0.01 * step)
+    crane.set_joint_position("turning", 0.0)
+    np.testing.assert_allclose(matrix(cup.pose), matrix(CUP_AT), atol=1e-9)
+
+
+def test_one_motion_is_told_once_for_each_that_it_carries(
+    crane: Object, cup: Object, spoon: Object, witness: Witness
+) -> None:
+    crane.attach(cup, "hook")
+    cup.attach(spoon)
+    witness.told.clear()
+    crane.set_joint_positions(JOINTS)
+    assert witness.told == [
+        ("joints", "crane", JOINTS),
+        ("moved", "cup", cup.pose),
+        ("moved", "spoon", spoon.pose),
+    ]
+    witness.told.clear()
+    crane.set_pose(BASE)
+    assert witness.told == [("moved", "crane", BASE), ("moved", "cup", cup.pose), ("moved", "spoon", spoon.pose)]
+    witness.told.clear()
+    cup.set_pose(CUP_AT)
+    assert witness.told == [("moved", "cup", CUP_AT), ("moved", "spoon", spoon.pose)]
+
+
+def test_observers_are_told_when_the_whole_motion_is_done(world: BulletWorld, crane: Object, cup: Object) -> None:
+    crane.attach(cup, "hook")
+    seen: list[tuple[Pose, Pose]] = []
+
+    class Looking(Witness):
+        def object_moved(self, moved: Object) -> None:
+            seen.append((crane.pose, cup.pose))
+
+    world.observe(Looking())
+    crane.set_pose(BASE)
+    assert seen == [(BASE, cup.pose)] * 2
+    assert cup.pose != CUP_AT
+
+
+def test_joints_that_do_not_move_the_link_carry_nothing(crane: Object, cup: Object, witness: Witness) -> None:
+    crane.attach(cup, "flag")
+    witness.told.clear()
+    crane.set_joint_positions({"lifting": 0.5, "reaching": 0.2})
+    assert witness.names() == [("joints", "crane")]
+    assert cup.pose is CUP_AT
+    crane.set_joint_position("turning", 0.5)
+    assert witness.names() == [("joints", "crane"), ("joints", "crane"), ("moved", "cup")]
+
+
+def test_without_a_link_it_hangs_on_the_base(crane: Object, cup: Object, witness: Witness) -> None:
+    crane.attach(cup)
+    crane.set_joint_positions(JOINTS)
+    assert cup.pose is CUP_AT
+    crane.set_pose(BASE)
+    np.testing.assert_allclose(matrix(cup.pose), matrix(BASE) @ matrix(CUP_AT), atol=1e-9)
+    assert ("attached", "crane", "cup", None) in witness.told
+
+
+def test_an_attached_object_that_is_moved_stays_attached_at_its_new_place(crane: Object, cup: Object) -> None:
+    crane.attach(cup, "hook")
+    moved = Pose([0.9, 0.9, 0.9], yaw_quaternion(1.0))
+    cup.set_pose(moved)
+    assert cup.attached_to is crane
+    crane.set_joint_positions(JOINTS)
+    before = crane_links(Pose(), turning=0, lifting=0, reaching=0)["hook"]
+    after = crane_links(Pose(), **JOINTS)["hook"]
+    np.testing.assert_allclose(matrix(cup.pose), carried(before, after, moved), atol=1e-9)
+
+
+def test_attaching_moves_nothing_and_can_be_read_from_both_ends(
+    crane: Object, cup: Object, spoon: Object, witness: Witness
+) -> None:
+    witness.told.clear()
+    crane.attach(cup, "hook")
+    crane.attach(spoon)
+    assert (cup.pose, spoon.pose) == (CUP_AT, SPOON_AT)
+    assert crane.attachments == {cup: "hook", spoon: None}
+    assert cup.attached_to is crane
+    assert crane.attached_to is None
+    assert witness.told == [("attached", "crane", "cup", "hook"), ("attached", "crane", "spoon", None)]
+
+
+def test_what_is_detached_stays_where_it_is(crane: Object, cup: Object, witness: Witness) -> None:
+    crane.attach(cup, "hook")
+    crane.set_joint_positions(JOINTS)
+    held_at = cup.pose
+    crane.detach(cup)
+    assert witness.told[-1] == ("detached", "crane", "cup", "hook")
+    crane.set_pose(BASE)
+    assert cup.pose is held_at
+    assert (crane.attachments, cup.attached_to) == ({}, None)
+
+
+def test_what_cannot_be_attached_or_detached_is_refused(crane: Object, cup: Object, spoon: Object) -> None:
+    crane.attach(cup, "hook")
+    cup.attach(spoon)
+    with pytest.raises(AttachmentRefused, match="'cup' is attached to 'crane' already"):
+        crane.attach(cup, "hook")
+    with pytest.raises(AttachmentRefused, match="'spoon' is attached to 'cup' already"):
+        crane.attach(spoon)
+    with pytest.raises(AttachmentRefused, match="'crane' cannot hang on itself"):
+        crane.attach(crane, "hook")
+    with pytest.raises(AttachmentRefused, match="'crane' cannot hang on itself \\(by way of 'spoon'\\)"):
+        spoon.attach(crane)
+    with pytest.raises(AttachmentRefused, match="'spoon' is not attached to 'crane'"):
+        crane.detach(spoon)
+    with pytest.raises(UnknownLink, match="'claw'"):
+        crane.attach(spoon, "claw")
+    assert (crane.attachments, cup.attachments) == ({cup: "hook"}, {spoon: None})
+
+
+def test_objects_of_two_worlds_are_not_attached(crane: Object) -> None:
+    with BulletWorld() as other:
+        bowl = Object("bowl", ObjectType.BOWL, world=other)
+        with pytest.raises(AttachmentRefused, match="different worlds"):
+            crane.attach(bowl)
+
+
+def test_removing_detaches_both_ways_first(crane: Object, cup: Object, spoon: Object, witness: Witness) -> None:
+    crane.attach(cup, "hook")
+    cup.attach(spoon)
+    witness.told.clear()
+    cup.remove()
+    assert witness.told == [
+        ("detached", "cup", "spoon", None),
+        ("detached", "crane", "cup", "hook"),
+        ("removed", "cup", CUP_AT),
+    ]
+    with pytest.raises(ObjectNotInWorld, match="'cup'"):
+        crane.attach(cup)
+    crane.set_pose(BASE)
+    assert (cup.pose, spoon.pose) == (CUP_AT, SPOON_AT)

@@ -1,0 +1,97 @@
+"""What the tests of the world share: an observer that notes all it is told, a crane, and matrices of our own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.world import Object, Pose
+
+Matrix = NDArray[np.float64]
+
+
+class Witness:
+    """An observer: `told` is the list of all that it was told, with the poses as they were at that moment."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[Any, ...]] = []
+
+    def object_added(self, added: Object) -> None:
+        self.told.append(("added", added.name, added.pose))
+
+    def object_removed(self, removed: Object) -> None:
+        self.told.append(("removed", removed.name, removed.pose))
+
+    def object_moved(self, moved: Object) -> None:
+        self.told.append(("moved", moved.name, moved.pose))
+
+    def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
+        self.told.append(("joints", moved.name, dict(positions)))
+
+    def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
+        self.told.append(("attached", parent.name, child.name, link))
+
+    def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
+        self.told.append(("detached", parent.name, child.name, link))
+
+    def names(self) -> list[tuple[Any, ...]]:
+        """What happened to whom, without the poses."""
+        return [entry[:2] for entry in self.told]
+
+
+_INERTIAL = (
+    '<inertial><origin xyz="0.11 -0.07 0.23" rpy="0.4 -0.3 0.9"/><mass value="2"/>'
+    '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+CRANE = f"""<?xml version="1.0"?>
+<robot name="crane">
+  <link name="foot">{_INERTIAL}<collision><origin xyz="0 0 0.1"/><geometry><box size="0.4 0.6 0.2"/></geometry></collision></link>
+  <link name="mast">{_INERTIAL}<collision><origin xyz="0.1 0 0.2" rpy="0.5 0 0"/><geometry><box size="0.1 0.2 0.4"/></geometry></collision></link>
+  <link name="boom">{_INERTIAL}</link>
+  <link name="hook">{_INERTIAL}<collision><origin xyz="0 0 -0.1"/><geometry><sphere radius="0.05"/></geometry></collision></link>
+  <link name="flag"><collision><geometry><cylinder radius="0.03" length="0.2"/></geometry></collision></link>
+  <joint name="turning" type="continuous"><parent link="foot"/><child link="mast"/><origin xyz="0.1 0 0.5"/><axis xyz="0 0 1"/></joint>
+  <joint name="lifting" type="revolute"><parent link="mast"/><child link="boom"/><origin xyz="0 0.2 0.3" rpy="0 0 0.7"/><axis xyz="0 1 0"/><limit lower="-0.5" upper="1.2" effort="1" velocity="1"/></joint>
+  <joint name="reaching" type="prismatic"><parent link="boom"/><child link="hook"/><origin xyz="0.4 0 0" rpy="0.2 0 0"/><axis xyz="1 0 0"/><limit lower="0" upper="0.6" effort="1" velocity="1"/></joint>
+  <joint name="pole" type="fixed"><parent link="mast"/><child link="flag"/><origin xyz="0 0 1"/></joint>
+</robot>
+"""  # noqa: E501 a table of links and joints
+
+
+def matrix(pose: Pose) -> Matrix:
+    """The 4 by 4 matrix of a pose, by way of its axis and angle."""
+    x, y, z, w = pose.orientation
+    length = math.sqrt(x * x + y * y + z * z)
+    axis = (x / length, y / length, z / length) if length else (0.0, 0.0, 1.0)
+    return shifted(*pose.position) @ turned(axis, 2 * math.atan2(length, w))
+
+
+def shifted(x: float, y: float, z: float) -> Matrix:
+    result = np.eye(4)
+    result[:3, 3] = x, y, z
+    return result
+
+
+def turned(axis: Sequence[float], angle: float) -> Matrix:
+    """Rodrigues' formula."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    result = np.eye(4)
+    result[:3, :3] = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return result
+
+
+X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+def crane_links(base: Pose, *, turning: float, lifting: float, reaching: float) -> dict[str, Matrix]:
+    """Where the crane's links are, from the numbers in its description."""
+    foot = matrix(base)
+    mast = foot @ shifted(0.1, 0, 0.5) @ turned(Z, turning)
+    boom = mast @ shifted(0, 0.2, 0.3) @ turned(Z, 0.7) @ turned(Y, lifting)
+    hook = boom @ shifted(0.4, 0, 0) @ turned(X, 0.2) @ shifted(reaching, 0, 0)
+    return {"foot": foot, "mast": mast, "boom": boom, "hook": hook, "flag": mast @ shifted(0, 0, 1)}
