@@ -53,7 +53,7 @@ from pycrorm_async.plan.objects import (
     ObjectDesignatorDescription,
     ObjectPart,
 )
-from pycrorm_async.plan.process_modules import ProcessModules, Robot, simulated_robot
+from pycrorm_async.plan.process_modules import ChosenRobot, ProcessModules, simulated_robot
 from pycrorm_async.plan.task_tree import CollectedTree, TaskStatus, TaskTreeNode, collected_tree
 
 __all__ = [
@@ -64,7 +64,7 @@ __all__ = [
     "IKError",
     "simulated_robot",
     "ProcessModules",
-    "Robot",
+    "ChosenRobot",
     "collected_tree",
     "CollectedTree",
     "TaskStatus",

@@ -26,6 +26,7 @@ from pycrorm_async.plan.motions import (
     MoveTCPMotion,
 )
 from pycrorm_async.plan.objects import ObjectDesignator, in_world
+from pycrorm_async.plan.properties import check_properties
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, yaw_quaternion
@@ -43,8 +44,15 @@ __all__ = [
 ]
 
 
+class _Action(ActionAbstract):
+    """Its fields are checked when it is built, as a motion's are. Raises `ResolutionError`."""
+
+    def __post_init__(self) -> None:
+        check_properties(self)
+
+
 @dataclass
-class MoveTorsoActionPerformable(ActionAbstract):
+class MoveTorsoActionPerformable(_Action):
     """Lift or lower the torso to `position` (m). Raises `TorsoGoalUnreachable`."""
 
     concept: ClassVar[str | None] = "MoveTorso"
@@ -56,7 +64,7 @@ class MoveTorsoActionPerformable(ActionAbstract):
 
 
 @dataclass
-class SetGripperActionPerformable(ActionAbstract):
+class SetGripperActionPerformable(_Action):
     """Open or close a gripper."""
 
     concept: ClassVar[str | None] = "SettingGripper"
@@ -69,7 +77,7 @@ class SetGripperActionPerformable(ActionAbstract):
 
 
 @dataclass
-class ParkArmsActionPerformable(ActionAbstract):
+class ParkArmsActionPerformable(_Action):
     """Fold an arm, or both, out of the way."""
 
     concept: ClassVar[str | None] = "ParkingArms"
@@ -84,7 +92,7 @@ class ParkArmsActionPerformable(ActionAbstract):
 
 
 @dataclass
-class NavigateActionPerformable(ActionAbstract):
+class NavigateActionPerformable(_Action):
     """Drive to a place."""
 
     concept: ClassVar[str | None] = "Navigating"
@@ -96,7 +104,7 @@ class NavigateActionPerformable(ActionAbstract):
 
 
 @dataclass
-class LookAtActionPerformable(ActionAbstract):
+class LookAtActionPerformable(_Action):
     """Turn the head to a point."""
 
     concept: ClassVar[str | None] = "LookingAt"
@@ -108,7 +116,7 @@ class LookAtActionPerformable(ActionAbstract):
 
 
 @dataclass
-class PickUpActionPerformable(ActionAbstract):
+class PickUpActionPerformable(_Action):
     """Take an object with one arm and lift it by 3 cm; the object is attached to the gripper afterwards.
 
     The gripper is turned as `grasp` says in the object's own axes. It opens 0.1 m before the object, seen
@@ -128,7 +136,7 @@ class PickUpActionPerformable(ActionAbstract):
     async def perform(self) -> None:
         robot = robot_here()
         wanted = in_world(self.object_designator)
-        tool_frame = robot.description.arms[self.arm].tool_frame
+        tool_frame = robot.one_arm(self.arm).tool_frame
         before, at, above = pick_up_poses(wanted.pose, self.grasp, robot.body.link_pose(tool_frame))
         await MoveTCPMotion(before, self.arm, allow_gripper_collision=True).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
@@ -141,7 +149,7 @@ class PickUpActionPerformable(ActionAbstract):
 
 
 @dataclass
-class PlaceActionPerformable(ActionAbstract):
+class PlaceActionPerformable(_Action):
     """Put the held object down: it ends at `target_location`, the gripper 7 cm behind.
 
     Raises:
@@ -157,9 +165,9 @@ class PlaceActionPerformable(ActionAbstract):
     target_location: Pose
 
     async def perform(self) -> None:
-        body, description = robot_here()
-        held = in_world(self.object_designator)
-        tool_frame = description.arms[self.arm].tool_frame
+        robot = robot_here()
+        body, held = robot.body, in_world(self.object_designator)
+        tool_frame = robot.one_arm(self.arm).tool_frame
         if body.attachments.get(held) != tool_frame:
             raise ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
         goal = place_pose(self.target_location, held.pose, body.link_pose(tool_frame))
@@ -170,7 +178,7 @@ class PlaceActionPerformable(ActionAbstract):
 
 
 @dataclass
-class FaceAtPerformable(ActionAbstract):
+class FaceAtPerformable(_Action):
     """Turn on the spot to face a point, and look at it."""
 
     pose: Pose
@@ -184,7 +192,7 @@ class FaceAtPerformable(ActionAbstract):
 
 
 @dataclass
-class MoveAndPickUpPerformable(ActionAbstract):
+class MoveAndPickUpPerformable(_Action):
     """Drive to a place, face the object there, and pick it up."""
 
     standing_position: Pose

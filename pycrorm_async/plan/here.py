@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.plan.errors import NoWorldHere
-from pycrorm_async.world.robot import RobotDescription
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.robot import ArmDescription, RobotDescription
 from pycrorm_async.world.watch import current_world
 
 if TYPE_CHECKING:
@@ -20,6 +22,13 @@ class RobotHere(NamedTuple):
 
     body: Object
     description: RobotDescription
+
+    def one_arm(self, arm: Arms) -> ArmDescription:
+        """The arm's description. Raises `CallerError` for `Arms.BOTH`."""
+        found = self.description.arms.get(arm)
+        if found is None:
+            raise CallerError(f"this is done with one arm, LEFT or RIGHT, not with {arm.name}")
+        return found
 
 
 def world_here() -> BulletWorld:

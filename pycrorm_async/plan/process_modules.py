@@ -2,7 +2,7 @@
 context.
 
 The choice nests, ends with the block however it is left, and is inherited by tasks that start inside. A
-robot of one's own is a class with these methods: `with Robot("mine", MyModules()):`.
+robot of one's own is a class with these methods: `with ChosenRobot("mine", MyModules()):`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
         MoveTCPMotion,
     )
 
-__all__ = ["ProcessModules", "Robot", "simulated_robot", "chosen_robot"]
+__all__ = ["ProcessModules", "ChosenRobot", "simulated_robot", "chosen_robot"]
 
 
 class ProcessModules(Protocol):
@@ -47,7 +47,7 @@ class ProcessModules(Protocol):
 _chosen: ContextVar[tuple[ProcessModules, ...]] = ContextVar("_chosen", default=())
 
 
-class Robot:
+class ChosenRobot:
     """A choice of process modules; `with` it, motions of this context are carried out by them."""
 
     def __init__(self, name: str, modules: ProcessModules) -> None:
@@ -67,7 +67,7 @@ class Robot:
         return f"<{self.name} robot>"
 
 
-simulated_robot = Robot("simulated", SimulatedModules())
+simulated_robot = ChosenRobot("simulated", SimulatedModules())
 """The robot in the world of this context, moved kinematically: at once, exactly, without physics."""
 
 

@@ -7,6 +7,7 @@ from dataclasses import fields
 
 import pytest
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import (
     BelieveObject,
     FaceAtPerformable,
@@ -20,6 +21,7 @@ from pycrorm_async.plan import (
     ParkArmsActionPerformable,
     PickUpActionPerformable,
     PlaceActionPerformable,
+    ResolutionError,
     SetGripperActionPerformable,
     TaskStatus,
     collected_tree,
@@ -256,3 +258,21 @@ async def test_gripper_and_look_at_are_one_motion_each(scene: Scene) -> None:
         "LookAtActionPerformable",
         "  LookingMotion",
     ]
+
+
+async def test_one_arm_at_a_time(scene: Scene) -> None:
+    for action in (
+        PickUpActionPerformable(scene.milk, Arms.BOTH, Grasp.FRONT),
+        PlaceActionPerformable(scene.milk, Arms.BOTH, Pose()),
+    ):
+        with pytest.raises(CallerError, match="one arm, LEFT or RIGHT, not with BOTH"):
+            await action.perform()
+
+
+def test_an_action_is_built_from_what_its_fields_say(scene: Scene) -> None:
+    with pytest.raises(ResolutionError, match="grasp: expected Grasp, got str 'front'"):
+        PickUpActionPerformable(scene.milk, Arms.LEFT, "front")  # type: ignore[arg-type]  # the fault here
+    with pytest.raises(ResolutionError, match="missing: target_location"):
+        NavigateActionPerformable(None)  # type: ignore[arg-type]  # the fault here
+    with pytest.raises(ResolutionError, match="object_designator: expected"):
+        PickUpActionPerformable("milk", Arms.LEFT, Grasp.FRONT)  # type: ignore[arg-type]  # the fault here

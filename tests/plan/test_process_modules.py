@@ -8,6 +8,7 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import (
+    ChosenRobot,
     LookingMotion,
     MoveArmJointsMotion,
     MoveGripperMotion,
@@ -18,7 +19,6 @@ from pycrorm_async.plan import (
     NoRobotChosen,
     NoWorldHere,
     PlanFailure,
-    Robot,
     TaskStatus,
     collected_tree,
     simulated_robot,
@@ -79,10 +79,10 @@ async def test_without_a_world_or_a_robot_the_caller_is_told() -> None:
 
 async def test_a_choice_nests_and_ends_with_its_block_also_by_an_exception(scene: Scene) -> None:
     outer, inner = Noting(), Noting()
-    with Robot("outer", outer):
-        with pytest.raises(PlanFailure), Robot("inner", inner):
+    with ChosenRobot("outer", outer):
+        with pytest.raises(PlanFailure), ChosenRobot("inner", inner):
             await MoveGripperMotion(GripperState.OPEN, Arms.LEFT).perform()
-        with Robot("inner", inner), simulated_robot:
+        with ChosenRobot("inner", inner), simulated_robot:
             await MoveMotion(THERE).perform()
         await NavigateActionPerformable(THERE).perform()
     assert (outer.asked, inner.asked) == (["navigate"], ["move_gripper"])
@@ -91,7 +91,7 @@ async def test_a_choice_nests_and_ends_with_its_block_also_by_an_exception(scene
 
 async def test_a_choice_belongs_to_its_context() -> None:
     async def alone(name: str, modules: Noting) -> None:
-        with Robot(name, modules):
+        with ChosenRobot(name, modules):
             await both_inside.wait()
             await MoveMotion(THERE).perform()
             await both_inside.wait()
