@@ -168,8 +168,8 @@ class BulletWorld:
     def restore_state(self, saved: WorldState) -> None:
         """Make the objects of `saved` as they were then; tells what differed, and nothing else.
 
-        An object that was added since stays where it is, detached from the others. Raises `ObjectNotInWorld` with
-        nothing touched if one of the state's objects is gone.
+        An object that was added since stays where it is, detached from the others. Raises `ObjectNotInWorld` if one
+        of the state's objects is gone, `UnknownJoint` if another one has its name now; then nothing was touched.
         """
         _ = self.client
         state.restore(self, saved)

@@ -44,7 +44,7 @@ class Costmap:
     """
 
     def __init__(self, values: Map, origin: Pose, *, resolution_m: float) -> None:
-        self.map = values
+        self.map = np.array(values, dtype=np.float64)
         self.map.setflags(write=False)
         self.origin = origin
         self.resolution_m = resolution_m
@@ -187,7 +187,7 @@ def _obstacles(world: BulletWorld, ignore: Iterable[Object] | None) -> Iterator[
         if thing not in ignored:
             for link in thing.links:
                 box = thing.bounding_box(link)
-                if box.size > (0.0, 0.0, 0.0) and box.max.z > 0.0 and box.min.z < _TALLEST_M:
+                if any(box.size) and box.max.z > 0.0 and box.min.z < _TALLEST_M:
                     yield box
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["first_met", "visible_share"]
 
 _RAYS_AT_ONCE = 16_000  # Bullet takes 16,384
-_SHAPES_LOOKED_THROUGH = 64
+_SHAPES_LOOKED_THROUGH = 64  # in one ray's way; it meets a convex shape once
 
 
 def first_met(

@@ -56,10 +56,13 @@ def saved(world: BulletWorld) -> WorldState:
 def restore(world: BulletWorld, state: WorldState) -> None:
     """Make the objects of `state` as they were; tells what differed, after all of it is done.
 
-    An object that was added since stays where it is, and is detached from the others. Raises `ObjectNotInWorld`,
-    with nothing touched, if one of the state's objects is gone.
+    An object that was added since stays where it is, and is detached from the others. Raises `ObjectNotInWorld` if
+    one of the state's objects is gone, `UnknownJoint` if another one has its name now; then nothing was touched.
     """
     then = {world.object(name): was for name, was in state.objects.items()}
+    for thing, was in then.items():
+        for joint in was.joints:
+            thing.joint_position(joint)
     for each in world.attachments:
         if each.child in then or each.parent in then:
             wanted = then[each.child].attached_to if each.child in then else None

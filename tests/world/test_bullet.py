@@ -12,7 +12,7 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, watcher
-from pycrorm_async.world.errors import ObjectNotInWorld, WorldClosed, WorldError, WorldUnavailable
+from pycrorm_async.world.errors import ObjectNotInWorld, UnknownJoint, WorldClosed, WorldError, WorldUnavailable
 from tests.world.witness import CRANE, Witness
 
 # --- entering and leaving -------------------------------------------------------------------------------------
@@ -289,6 +289,17 @@ def test_a_state_with_an_object_that_is_gone_is_refused_and_nothing_moves(world:
     with pytest.raises(ObjectNotInWorld, match="'cup'"):
         world.restore_state(state)
     assert crane.pose is THERE
+
+
+def test_a_state_is_not_put_upon_another_object_of_the_same_name(world: BulletWorld) -> None:
+    crane, cup, _ = scene()
+    state = world.save_state()
+    crane.remove()
+    cup.set_pose(THERE)
+    Object("crane", ObjectType.MILK)
+    with pytest.raises(UnknownJoint, match="'crane' has no movable joint 'turning'"):
+        world.restore_state(state)
+    assert cup.pose is THERE
 
 
 # --- looking --------------------------------------------------------------------------------------------------
