@@ -16,7 +16,7 @@ from sqlalchemy import select
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_table, stdout
-from pycrorm_async.cli.tree import print_tree, tree_rows
+from pycrorm_async.cli.tree import print_tree
 from pycrorm_async.memory import Memory
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, ProcessMetaData
 from pycrorm_async.orm import Pose as PoseRow
@@ -39,6 +39,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan import (
     PlaceAction as Place,
 )
+from pycrorm_async.query.questions import NodeSummary
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 
@@ -91,7 +92,7 @@ class Answers:
     """What the demo asked, and what it was told."""
 
     episode: int
-    tree: list[dict[str, Any]]
+    tree: list[NodeSummary]
     questions: list[tuple[str, Sequence[str], list[tuple[Any, ...]]]]
 
     def print(self) -> None:
@@ -130,7 +131,7 @@ async def _remembered(url: str, spool: Path | None) -> Answers:
 
         await memory.flush()
         number = await memory.number_of(episode)
-        tree = await tree_rows(memory.reading, number)
+        tree = await memory.reading.tree(number)
         return Answers(number, tree, await _asked(memory, number, memory.mapped(SayingActionPerformable)))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Sequence
+from datetime import datetime
 from typing import Any
 
 import msgspec
@@ -11,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "duration"]
+__all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "duration", "moment"]
 
 stdout = Console(highlight=False, soft_wrap=True)
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -58,6 +59,11 @@ def duration(nanoseconds: int | None) -> str:
     if nanoseconds >= 10**6:
         return f"{nanoseconds / 1e6:.1f} ms"
     return f"{nanoseconds / 1e3:.0f} µs"
+
+
+def moment(when: datetime) -> str:
+    """A moment in UTC, to the second."""
+    return when.strftime("%Y-%m-%d %H:%M:%S")
 
 
 def _cell(value: object) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, print_json, print_table
+from pycrorm_async.cli.output import duration, moment, print_json, print_table
 from pycrorm_async.cli.tree import print_tree
 from pycrorm_async.cli.waiting import note_what_waits
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
@@ -38,6 +38,15 @@ def show(
     print_table(
         f"Episode {found.number}",
         ("id", "started", "by", "took", "status", "description"),
-        [(found.id, found.started_at, found.created_by, duration(found.duration_ns), found.status, found.description)],
+        [
+            (
+                found.id,
+                moment(found.started_at),
+                found.created_by,
+                duration(found.duration_ns),
+                found.status,
+                found.description,
+            )
+        ],
     )
     print_tree(tree)
