@@ -83,12 +83,16 @@ class Designator(Base):
             `await action.awaitable_attrs.parameters`.
     """
 
-    @declared_attr.directive
-    def __tablename__(cls) -> str:  # noqa: N805  SQLAlchemy calls it with the class
-        return "designator" if cls.__name__ == "Designator" else cls.__name__
+    __tablename__ = "designator"
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        # A class of one's own has a table of its own, named like the class unless it says otherwise.
+        if not vars(cls).keys() & {"__tablename__", "__table__", "__abstract__"}:
+            cls.__tablename__ = cls.__name__
+        super().__init_subclass__(**arguments)
 
     @declared_attr.directive
-    def __mapper_args__(cls) -> dict[str, Any]:  # noqa: N805
+    def __mapper_args__(cls) -> dict[str, Any]:  # noqa: N805  SQLAlchemy calls it with the class
         # "selectin" at every level: a query for a base loads what the leaves add without a join for each of them.
         arguments = {"polymorphic_identity": cls.__name__, "polymorphic_load": "selectin"}
         return {"polymorphic_on": "_lineage", **arguments} if cls.__name__ == "Designator" else arguments
