@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -12,9 +12,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "duration", "moment"]
+__all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "print_facts", "duration", "moment"]
 
-stdout = Console(highlight=False, soft_wrap=True)
+_WIDTH_PIPED = 160
+"""A pipe has no width; tables are then as wide as this, so that lines stay whole."""
+
+stdout = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH_PIPED)
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
@@ -44,6 +47,14 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     for row in rows:
         table.add_row(*(_cell(value) for value in row))
     stdout.print(table)
+
+
+def print_facts(title: str, facts: Mapping[str, object]) -> None:
+    """A title, then a line for each fact that is known."""
+    stdout.print(f"[bold]{escape(title)}[/]")
+    for name, value in facts.items():
+        if value not in (None, ""):
+            stdout.print(f"  [dim]{name:<8}[/] {_cell(value)}")
 
 
 def duration(nanoseconds: int | None) -> str:

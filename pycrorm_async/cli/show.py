@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, moment, print_json, print_table
+from pycrorm_async.cli.output import duration, moment, print_facts, print_json
 from pycrorm_async.cli.tree import print_tree
 from pycrorm_async.cli.waiting import note_what_waits
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
@@ -35,18 +35,14 @@ def show(
     if as_json:
         print_json({"episode": found, "tree": tree})
         return
-    print_table(
-        f"Episode {found.number}",
-        ("id", "started", "by", "took", "status", "description"),
-        [
-            (
-                found.id,
-                moment(found.started_at),
-                found.created_by,
-                duration(found.duration_ns),
-                found.status,
-                found.description,
-            )
-        ],
+    print_facts(
+        f"Episode {found.number}: {found.description}",
+        {
+            "id": found.id,
+            "started": f"{moment(found.started_at)} UTC",
+            "by": found.created_by,
+            "took": duration(found.duration_ns),
+            "status": found.status,
+        },
     )
     print_tree(tree)
