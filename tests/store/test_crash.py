@@ -91,3 +91,26 @@ def test_a_process_killed_while_appending_leaves_whole_batches_and_the_next_one_
     asyncio.run(append_all(address, range(known)))
     assert ask(address.path, "SELECT count(*) FROM event") == [(known * PER_BATCH * 2,)]
     assert ask(address.path, "PRAGMA integrity_check") == [("ok",)]
+
+
+def test_an_append_cancelled_at_any_moment_leaves_a_whole_batch_or_nothing(address: DatabaseAddress) -> None:
+    seed = int.from_bytes(os.urandom(4))
+    print(f"seed {seed}")
+    chance = random.Random(seed)
+
+    async def append_and_be_cancelled(number: int) -> None:
+        log = await EventLog.open(address, create=True)
+        appending = asyncio.create_task(log.append(batch(number)))
+        await asyncio.sleep(chance.uniform(0, 0.008))
+        appending.cancel()
+        await asyncio.wait([appending])
+        await log.close()
+
+    known = 0
+    for _ in range(30):
+        asyncio.run(append_and_be_cancelled(known))  # the loop is gone at once, whatever the driver's thread still does
+        heads = ask(address.path, "SELECT head FROM episode ORDER BY number")
+        assert heads in ([(known * PER_BATCH,)] * 2 if known else [], [((known + 1) * PER_BATCH,)] * 2)
+        known = heads[0][0] // PER_BATCH if heads else 0
+    asyncio.run(append_all(address, range(known + 1)))
+    assert ask(address.path, "SELECT count(*) FROM event") == [((known + 1) * PER_BATCH * 2,)]

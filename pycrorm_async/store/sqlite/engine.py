@@ -37,6 +37,7 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
         hide_parameters=True,
     )
     event.listen(engine.sync_engine, "begin", _begin)
+    event.listen(engine.sync_engine, "invalidate", _roll_back)
     if not read_only:
         event.listen(engine.sync_engine, "connect", _set_write_pragmas)
     return engine
@@ -53,3 +54,10 @@ def _set_write_pragmas(connection: Any, _record: Any) -> None:
     for pragma in _WRITE_PRAGMAS:
         cursor.execute(pragma)
     cursor.close()
+
+
+def _roll_back(connection: Any, _record: Any, _fault: BaseException | None) -> None:
+    # When a task is cancelled in the middle of a statement its connection is thrown away. SQLite keeps a connection
+    # that is closed with a statement open until that is gone, together with its transaction and the write lock:
+    # nobody could write until the garbage collector came by.
+    connection.rollback()

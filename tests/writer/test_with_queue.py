@@ -1,0 +1,76 @@
+"""The writer between the real queue and the real log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.config import Settings
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.queue.recorder import RecorderQueue
+from pycrorm_async.queue.recovery import open_dead
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.once import drain_once
+from pycrorm_async.writer.thread import WriterThread
+from tests.store.making import ask, episode
+from tests.writer.ends import CountingFold, opener
+
+SETTINGS = Settings(segment_bytes=2**17, batch_events_max=700, sync_interval_ms=5, idle_ms=10**9)
+STORED = "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY episode"
+
+
+def queue_in(spool: Path) -> RecorderQueue:
+    return RecorderQueue.create(
+        spool, settings=SETTINGS, clock=SYSTEM_CLOCK, recorder=episode_id(1_700_000_000_000_000_000, bytes(10))
+    )
+
+
+def kind(of: EpisodeId, number: int) -> Heading:
+    return Heading(of, "EpisodeStarted" if number == 1 else "NodeStarted", 1)
+
+
+def payload(number: int) -> bytes:
+    return b'{"kind":"action","parent":%d,"text":"%s"}' % (number, "é🤖\\u0007".encode() * 20)
+
+
+async def test_what_is_put_into_the_queue_is_in_the_log_byte_for_byte(tmp_path: Path, address: DatabaseAddress) -> None:
+    queue = queue_in(tmp_path / "spool")
+    writer = WriterThread(source=queue, open_destination=opener(address), adopt=tuple, settings=SETTINGS)
+    await writer.start()
+    queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), b'{"dtype":"SayingAction"}')
+    for number in range(1, 2001):
+        assert queue.put_nowait(kind(episode(1), number), payload(number)) == number
+        if number % 10 == 0:
+            queue.put_nowait(kind(episode(2), number // 10), payload(number))
+    await queue.synced_to(queue.written)
+    await writer.flush(queue.written)
+    assert ask(address.path, STORED) == [(1, 2000, 1, 2000), (2, 200, 1, 200)]
+    assert queue.stored == queue.written == 2201
+    queue.put_nowait(Heading(episode(1), "EpisodeEnded", 1), b'{"status":"SUCCEEDED"}')
+    queue.close()
+    await writer.close()
+    queue.release()
+    rows = ask(address.path, "SELECT payload FROM event WHERE episode = 1 ORDER BY sequence")
+    assert [row[0].encode() for row in rows] == [payload(number) for number in range(1, 2001)] + [
+        b'{"status":"SUCCEEDED"}'
+    ]
+    assert ask(address.path, "SELECT payload FROM pycrorm_declaration") == [('{"dtype":"SayingAction"}',)]
+    assert ask(address.path, "SELECT head, folded FROM episode ORDER BY number") == [(2001, 2001), (200, 200)]
+
+
+async def test_what_a_dead_recorder_left_is_stored_in_one_round(tmp_path: Path, log: EventLog) -> None:
+    queue = queue_in(tmp_path / "spool")
+    for number in range(1, 501):
+        queue.put_nowait(kind(episode(1), number), payload(number))
+    queue.close()
+    queue.release()  # nothing drained it
+    recovered = open_dead(queue.folder)
+    assert recovered is not None
+    report = await drain_once([recovered], CountingFold(log), settings=SETTINGS)
+    recovered.release()
+    assert (report.failed, report.stopped, report.folded) == ({}, {}, 501)
+    assert ask(log.address.path, STORED) == [(1, 501, 1, 501)]  # recovery added that the episode was LOST
+    [[last]] = ask(log.address.path, "SELECT payload FROM event WHERE sequence = 501")
+    assert last == '{"status":"LOST"}'
