@@ -31,7 +31,7 @@ class UserView:
     """
 
     name: str
-    meaning: Select[Any]
+    meaning: Select[*tuple[Any, ...]]
 
     @cached_property
     def table(self) -> TableClause:
@@ -57,7 +57,7 @@ def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> d
     return texts
 
 
-def _pick_up_with_context() -> Select[Any]:
+def _pick_up_with_context() -> Select[*tuple[Any, ...]]:
     # Joined at the ids themselves: a node, its designator and its leaf row have the same one.
     picked = PickUpAction.__table__
     node = TaskTreeNode.__table__

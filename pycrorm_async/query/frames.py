@@ -30,7 +30,7 @@ class _Asked(NamedTuple):
     moment: bool
 
 
-async def dataframe(engine: AsyncEngine, statement: Select[Any]) -> pd.DataFrame:
+async def dataframe(engine: AsyncEngine, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
     """The rows of a select over columns, mapped classes, views, or a mix.
 
     >>> frame = await dataframe(engine, select(PickUpWithContextView))
@@ -55,7 +55,7 @@ async def dataframe(engine: AsyncEngine, statement: Select[Any]) -> pd.DataFrame
     )
 
 
-def _asked(statement: Select[Any]) -> Iterator[_Asked]:
+def _asked(statement: Select[*tuple[Any, ...]]) -> Iterator[_Asked]:
     for each in statement.column_descriptions:
         found = inspect(each["expr"], raiseerr=False)
         if not (getattr(found, "is_mapper", False) or getattr(found, "is_aliased_class", False)):

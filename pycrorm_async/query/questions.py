@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from typing import Any
 
 from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.errors import UnknownEpisode
-from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
+from pycrorm_async.events.ids import SLOT_NODE, row_id
+from pycrorm_async.orm import Designator, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
 
 __all__ = ["EpisodeSummary", "NodeSummary", "episodes", "episode_named", "task_tree"]
@@ -46,6 +48,7 @@ class NodeSummary:
         depth: 0 at the root.
         dtype: what was performed; None at the root.
         duration_ns: None while it runs, and if it was LOST.
+        parameters: as they were recorded, empty at the root; a reference to an object of the world has its name too.
         reason, failure_message: the class and the text of the failure it ended with.
     """
 
@@ -54,6 +57,7 @@ class NodeSummary:
     depth: int
     dtype: str | None
     kind: str
+    parameters: dict[str, Any]
     status: str
     started_at: datetime
     duration_ns: int | None
@@ -125,10 +129,17 @@ async def episode_named(engine: AsyncEngine, name: str) -> EpisodeSummary:
 
 async def task_tree(engine: AsyncEngine, number: int) -> list[NodeSummary]:
     """The nodes of an episode, each before its children, children in the order they started; empty without any."""
-    table = TaskTreeNode.__table__
-    question = select(TaskTreeNode.__table__).where(table.c.process_metadata_id == number).order_by(table.c.id)
+    table, designator, thing = TaskTreeNode.__table__, Designator.__table__, Object.__table__
+    question = (
+        select(table, designator.c.parameters)
+        .outerjoin(designator, designator.c.id == table.c.id)
+        .where(table.c.process_metadata_id == number)
+        .order_by(table.c.id)
+    )
+    named = select(thing.c.id, thing.c.name).where(thing.c.process_metadata_id == number)
     children: dict[int | None, list[NodeSummary]] = {}
     async with engine.connect() as connection:
+        names = {row.id: row.name for row in await connection.execute(named)}
         for row in await connection.execute(question):
             children.setdefault(row.parent_id, []).append(
                 NodeSummary(
@@ -137,6 +148,9 @@ async def task_tree(engine: AsyncEngine, number: int) -> list[NodeSummary]:
                     depth=0,
                     dtype=row.dtype,
                     kind=row.kind,
+                    parameters={
+                        name: _with_name(value, number, names) for name, value in (row.parameters or {}).items()
+                    },
                     status=row.status.name if isinstance(row.status, TaskStatus) else row.status,
                     started_at=row.start_time,
                     duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
@@ -154,6 +168,13 @@ def _depth_first(children: dict[int | None, list[NodeSummary]]) -> Iterator[Node
         node, depth = waiting.pop()
         yield replace(node, depth=depth)
         waiting.extend((child, depth + 1) for child in reversed(children.get(node.id, [])))
+
+
+def _with_name(value: Any, number: int, names: Mapping[int, str]) -> Any:
+    """A reference to an object with the object's name; anything else as it is."""
+    if isinstance(value, dict) and value.keys() == {"object", "row"}:
+        return {**value, "name": names.get(row_id(number, value["row"], SLOT_NODE))}
+    return value
 
 
 def _nanoseconds(start: datetime, end: datetime | None) -> int | None:

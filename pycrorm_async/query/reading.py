@@ -81,7 +81,7 @@ class Reading:
         async with self._sessions() as session:
             yield session
 
-    async def dataframe(self, statement: Select[Any]) -> pd.DataFrame:
+    async def dataframe(self, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
         """The answer as a pandas DataFrame, see `pycrorm_async.query.frames`. Raises `MissingExtra`."""
         with self._translated():
             return await dataframe(self._log.engine, statement)

@@ -78,9 +78,7 @@ class Script:
     def put_payload(self, type_: str, payload: bytes, version: int = 1) -> int:
         sequence = len(self.records) + 1
         wall_ns, monotonic_ns = T0_NS + sequence * 10**9, sequence * 10**9 + 5
-        self.records.append(
-            Record(sequence, self.episode, sequence, type_, version, wall_ns, monotonic_ns, payload)
-        )
+        self.records.append(Record(sequence, self.episode, sequence, type_, version, wall_ns, monotonic_ns, payload))
         return sequence
 
     def stored(self, number: int = 1) -> list[StoredEvent]:

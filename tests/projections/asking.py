@@ -1,0 +1,30 @@
+"""What a test asks of a database, past every class of ours: plain SQL, plain tuples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.log import EventLog
+
+
+async def ask(log: EventLog, question: str, *parameters: Any) -> list[tuple[Any, ...]]:
+    async with log.engine.connect() as connection:
+        return [tuple(row) for row in await connection.exec_driver_sql(question, parameters)]
+
+
+async def stored_and_folded(log: EventLog, records: Sequence[Record]) -> Projector:
+    """A projector that has shown all of these."""
+    projector = Projector(log)
+    await projector.open()
+    await log.append(records)
+    await projector.fold_behind()
+    return projector
+
+
+async def all_rows(log: EventLog) -> dict[str, list[tuple[Any, ...]]]:
+    """Every table of the first generation, ordered."""
+    names = await ask(log, "SELECT name FROM sqlite_master WHERE type = 'table' AND name LIKE '%\\_\\_1' ESCAPE '\\'")
+    return {name: sorted(await ask(log, f'SELECT * FROM "{name}"'), key=repr) for (name,) in names}

@@ -1,0 +1,375 @@
+"""Events in, rows out: every expected row is written here by hand, column by column as in `tables.CORE`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pycrorm_async.events.happenings import (
+    CandidateValue,
+    DesignatorTypeDeclared,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    JointsMoved,
+    LocationResolved,
+    MissingValue,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    ObjectValue,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.projections.fold import CannotFold, fold
+from pycrorm_async.projections.parameters import Designators
+from pycrorm_async.projections.rows import Rows
+from pycrorm_async.projections.tables import COLUMNS
+from tests.projections.script import (
+    NAVIGATE,
+    PICK_UP,
+    POSE_US,
+    SAYING,
+    Script,
+    declared,
+    field,
+    name_of,
+    pose,
+    row,
+    time_us,
+)
+
+EVERYTHING = declared(
+    "EverythingAction",
+    "everything_action",
+    field("count", "integer", 2),
+    field("speed", "real", 3),
+    field("text", "text", 4),
+    field("flag", "boolean", 5),
+    field("due", "datetime", 6),
+    field("arm", "enum", 7),
+    field("there", "pose", 8),
+    field("thing", "object", 9),
+    field("via", "list", 10, item="pose"),
+    field("joints", "dict", 11, item="real"),
+    field("things", "list", 12, item="object"),
+    field("names", "list", 13, item="text"),
+)
+
+
+def rows_of(script: Script, *types: DesignatorTypeDeclared, number: int = 1) -> dict[str, list[tuple[Any, ...]]]:
+    """Every row, by table; the columns of leaf tables go with their name."""
+    rows = folded(script, *types, number=number)
+    made = rows.to_insert()
+    return {
+        table if columns == COLUMNS.get(table) else f"{table}({','.join(columns)})": values
+        for (table, columns), values in made.items()
+    }
+
+
+def folded(script: Script, *types: DesignatorTypeDeclared, number: int = 1) -> Rows:
+    rows = Rows()
+    designators = Designators({name_of(each): each for each in types})
+    for event in script.stored(number):
+        fold(event, designators, rows)
+    return rows
+
+
+def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:
+    script = Script()
+    script.put(EpisodeStarted("why", "me", "host", "1.2", "3.11.7", plan="breakfast", world="a kitchen", seed=42))
+    script.put(EpisodeEnded("FAILED", FailureValue("plans.IKError", "too far")))
+    assert rows_of(script, number=7) == {
+        "process_metadata": [
+            (
+                7, time_us(1), "me", "why", "1.2", "host", "3.11.7", "breakfast", "a kitchen", 42,
+                "FAILED", time_us(2), "plans.IKError", "too far",
+            )
+        ]
+    }  # fmt: skip
+
+
+def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
+    script = Script()
+    robot_row = script.put(ObjectAdded("pr2", "ROBOT", pose(), {"torso_lift_joint": 0.25, "wheel": -1.5}))
+    root = script.put(NodeStarted("root"))
+    robot = RobotValue(pose(1.5, -2.0, 0.0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot_row, robot_row))
+    node = script.put(
+        NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(3, 4, 5)}, robot, simulated=True)
+    )
+    assert (robot_row, root, node) == (1, 2, 3)
+    assert rows_of(script, NAVIGATE) == {
+        "object": [
+            (
+                row(1), 1, "Object", "pr2", "ROBOT", row(1), None, row(1), time_us(1), None,
+                '{"torso_lift_joint":0.25,"wheel":-1.5}',
+            ),
+        ],
+        "pose": [
+            (row(1), 1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US),
+            (row(3, 1), 1, 1.5, -2.0, 0.0, 0.0, 0.0, 0.6, 0.8, "map", POSE_US),
+            (row(3, 2), 1, 3.0, 4.0, 5.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US),
+        ],
+        "navigate_action(id,target_location_id)": [(row(3), row(3, 2))],
+        "task_tree_node": [
+            (
+                row(2), 1, None, "root", None, "RUNNING", time_us(2), None, 2_000_000_005, None,
+                None, None, None, None, None, None, None, None, False,
+            ),
+            (
+                row(3), 1, row(2), "action", "NavigateAction", "RUNNING", time_us(3), None, 3_000_000_005, None,
+                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), True,
+            ),
+        ],
+    }  # fmt: skip
+
+
+def test_a_node_that_ends_in_the_batch_it_started_in_is_one_insert() -> None:
+    script = Script()
+    node = script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
+    failure = FailureValue("plans.failures.IKError", "no way", ["left", 1])
+    script.put(NodeEnded(node, "FAILED", failure, {"said": [1, None]}))
+    rows = folded(script, SAYING)
+    assert rows.node_ends == []
+    assert list(rows.nodes.values()) == [
+        [
+            row(1), 1, None, "action", "SayingAction", "FAILED", time_us(1), time_us(2), 1_000_000_005, 2_000_000_005,
+            "IKError", "no way", '["left",1]', '{"said":[1,null]}', None, None, None, None, False,
+        ]
+    ]  # fmt: skip
+
+
+def test_the_end_of_a_node_from_an_earlier_batch_is_an_update() -> None:
+    script = Script()
+    script.put(NodeEnded(77, "SUCCEEDED"))
+    rows = folded(script)
+    assert rows.to_insert() == {}
+    assert rows.node_ends == [(row(77), "SUCCEEDED", time_us(1), 1_000_000_005, None, None, None, None)]
+
+
+def test_a_node_that_is_lost_has_no_end_time() -> None:
+    script = Script()
+    script.put(NodeEnded(77, "LOST"))
+    assert folded(script).node_ends == [(row(77), "LOST", None, None, None, None, None, None)]
+
+
+def test_an_episode_that_is_lost_takes_its_running_nodes_with_it() -> None:
+    script = Script()
+    root = script.put(NodeStarted("root"))
+    done = script.put(NodeStarted("action", root, name_of(SAYING), {"text": "a"}))
+    script.put(NodeEnded(done, "SUCCEEDED"))
+    script.put(EpisodeEnded("LOST"))
+    rows = folded(script, SAYING, number=3)
+    assert [(each[0], each[5]) for each in rows.nodes.values()] == [
+        (row(1, number=3), "LOST"),
+        (row(2, number=3), "SUCCEEDED"),
+    ]
+    assert rows.lost == [3]
+
+
+def test_every_type_of_field_has_its_column_and_its_rows() -> None:
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    node = script.put(
+        NodeStarted(
+            "action",
+            None,
+            name_of(EVERYTHING),
+            {
+                "count": 3,
+                "speed": 0.1,
+                "text": "Käse",
+                "flag": True,
+                "due": "2026-01-02T03:04:05.000006+00:00",
+                "arm": "LEFT",
+                "there": pose(1, 0, 0),
+                "thing": ObjectReference(milk, milk),
+                "via": [pose(5, 6, 7), pose(8, 9, 10)],
+                "joints": {"b": 2.5, "a": -1.0},
+                "things": [
+                    ObjectReference(milk, milk),
+                    ObjectValue("BelieveObject", "cup", "JEROEN_CUP", pose(4, 4, 4)),
+                ],
+                "names": ["x", MissingValue("too long", "'y'")],
+            },
+        )
+    )
+    assert (milk, node) == (1, 2)
+    made = rows_of(script, EVERYTHING)
+    leaf = "everything_action(id,count,speed,text,flag,due,arm,there_id,thing_id)"
+    # 2026-01-02 03:04:05.000006 UTC
+    assert made[leaf] == [(row(2), 3, 0.1, "Käse", True, 1_767_323_045_000_006, "LEFT", row(2, 8), row(1))]
+    assert made["pose"][1:] == [(row(2, 8), 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
+    nothing = (None,) * 5
+    nowhere = (None,) * 8
+    assert made["parameter_item"] == [
+        (row(2), "via", 0, 1, None, *nothing, 5.0, 6.0, 7.0, 0.0, 0.0, 0.0, 1.0, "map", None, None, None),
+        (row(2), "via", 1, 1, None, *nothing, 8.0, 9.0, 10.0, 0.0, 0.0, 0.0, 1.0, "map", None, None, None),
+        (row(2), "joints", 0, 1, "b", None, 2.5, None, None, None, *nowhere, None, None, None),
+        (row(2), "joints", 1, 1, "a", None, -1.0, None, None, None, *nowhere, None, None, None),
+        (row(2), "things", 0, 1, None, *nothing, *nowhere, row(1), None, None),
+        (
+            row(2), "things", 1, 1, None, *nothing, 4.0, 4.0, 4.0, 0.0, 0.0, 0.0, 1.0, "map",
+            None, "cup", "JEROEN_CUP",
+        ),
+        (row(2), "names", 0, 1, None, None, None, "x", None, None, *nowhere, None, None, None),
+        (row(2), "names", 1, 1, None, *nothing, *nowhere, None, None, None),
+    ]  # fmt: skip
+
+
+def test_a_part_and_a_believed_object_have_rows_of_their_own() -> None:
+    opening = declared("OpenAction", "open_action", field("object_designator", "object", 2), field("cup", "object", 3))
+    script = Script()
+    fridge = script.put(ObjectAdded("fridge", "ENVIRONMENT", pose()))
+    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1, 1, 1), ObjectReference(fridge, fridge))
+    cup = ObjectValue("BelieveObject", "cup")
+    script.put(NodeStarted("action", None, name_of(opening), {"object_designator": handle, "cup": cup}))
+    made = rows_of(script, opening)
+    assert made["object"][1:] == [
+        (
+            row(2, 2), 1, "ObjectPart", "handle", "GENERIC_OBJECT", row(2, 2), row(1), None, time_us(2), row(2), None,
+        ),
+        (row(2, 3), 1, "BelieveObject", "cup", None, None, None, None, time_us(2), row(2), None),
+    ]  # fmt: skip
+    assert made["pose"][1:] == [(row(2, 2), 1, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
+    assert made["open_action(id,object_designator_id,cup_id)"] == [(row(2), row(2, 2), row(2, 3))]
+
+
+def test_what_was_recorded_as_missing_or_left_out_is_null() -> None:
+    script = Script()
+    script.put(NodeStarted("action", None, name_of(PICK_UP), {"arm": MissingValue("no member", "<x>")}))
+    assert rows_of(script, PICK_UP)["pick_up_action(id,object_designator_id,arm,grasp)"] == [(row(1), None, None, None)]
+
+
+def test_the_world_as_it_changes_is_one_row_a_change() -> None:
+    script = Script()
+    table = script.put(ObjectAdded("table", "GENERIC_OBJECT", pose()))
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    root = script.put(NodeStarted("root"))
+    moved = script.put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), root))
+    there = ObjectReference(milk, moved)
+    script.put(ObjectAttached(ObjectReference(table, table), there, "top", root))
+    script.put(ObjectDetached(ObjectReference(table, table), there))
+    script.put(JointsMoved(ObjectReference(table, table), {"leaf": 0.5, "drawer": 0.25}, root))
+    script.put(ObjectRemoved(there, root))
+    made = rows_of(script)
+    assert made["object"][2] == (
+        row(4), 1, "Object", "milk", "MILK", row(4), None, row(2), time_us(4), row(3), None,
+    )  # fmt: skip
+    assert made["pose"][2] == (row(4), 1, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)
+    assert made["attachment"] == [
+        (row(5), 1, "attached", row(1), row(4), "top", time_us(5), row(3)),
+        (row(6), 1, "detached", row(1), row(4), None, time_us(6), None),
+    ]
+    assert made["joint_change"] == [
+        (row(7), "leaf", 1, row(1), 0.5, time_us(7), row(3)),
+        (row(7), "drawer", 1, row(1), 0.25, time_us(7), row(3)),
+    ]
+    assert made["object_removal"] == [(row(8), 1, row(4), row(2), time_us(8), row(3))]
+
+
+def test_a_resolved_location_keeps_what_was_offered_and_what_was_taken() -> None:
+    script = Script()
+    root = script.put(NodeStarted("root"))
+    offered = (CandidateValue(pose(1, 1), ("LEFT", "RIGHT")), CandidateValue(pose(2, 2), ("LEFT",)))
+    script.put(LocationResolved("CostmapLocation", offered, taken=1, considered=600, node=root))
+    script.put(LocationResolved("AccessingLocation", considered=3))
+    made = rows_of(script)
+    assert made["location_resolution"] == [
+        (row(2), 1, row(1), "CostmapLocation", 600, 2, 1, row(2), time_us(2)),
+        (row(3), 1, None, "AccessingLocation", 3, 0, None, None, time_us(3)),
+    ]
+    assert made["location_candidate"] == [
+        (row(2), 0, 1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT,RIGHT", False),
+        (row(2), 1, 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT", True),
+    ]
+    assert made["pose"] == [(row(2), 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
+
+
+def test_nodes_of_the_language_have_their_table_too() -> None:
+    repeat = declared("Repeat", "repeat", field("times", "integer", 2), kind="language")
+    script = Script()
+    script.put(NodeStarted("language", None, name_of(repeat), {"times": 3}))
+    made = rows_of(script, repeat)
+    assert made["repeat(id,times)"] == [(row(1), 3)]
+    assert made["task_tree_node"][0][3:5] == ("language", "Repeat")
+
+
+@pytest.mark.parametrize(
+    ("event", "reason"),
+    [
+        (NodeStarted("action", None, "0" * 32), "the designator type " + "0" * 32 + " was never declared"),
+        (
+            NodeStarted("action", None, name_of(SAYING), {"text": 5}),
+            "text: 5 stands where text is declared",
+        ),
+        (
+            NodeStarted("action", None, name_of(NAVIGATE), {"target_location": {"position": [1, 2]}}),
+            "target_location: no pose: Expected `array` of length 3, got 2 - at `$.position`",
+        ),
+        (NodeEnded(2**26, "SUCCEEDED"), "no row can have the sequence 67108864 and the slot 0"),
+        (
+            LocationResolved("CostmapLocation", (), taken=0),
+            "candidate 0 was taken of 0",
+        ),
+    ],
+    ids=["undeclared", "another type", "no pose", "no sequence", "no candidate"],
+)
+def test_an_event_that_cannot_be_folded_says_why_and_leaves_no_row(event: Any, reason: str) -> None:
+    script = Script()
+    script.put(event)
+    rows = Rows()
+    with pytest.raises(CannotFold) as raised:
+        fold(script.stored()[0], Designators({name_of(each): each for each in (SAYING, NAVIGATE)}), rows)
+    assert str(raised.value) == reason
+    assert rows.to_insert() == {}
+    assert rows.node_ends == []
+
+
+@pytest.mark.parametrize(
+    ("type_", "payload", "version", "reason"),
+    [
+        ("RobotDanced", b"{}", 1, "RobotDanced is not an event this version knows"),
+        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 2, "NodeEnded has version 2, this version knows 1"),
+        ("NodeEnded", b"{", 1, "NodeEnded cannot be decoded: Input data was truncated"),
+    ],
+)
+def test_an_event_of_another_time_cannot_be_folded(type_: str, payload: bytes, version: int, reason: str) -> None:
+    script = Script()
+    script.put_payload(type_, payload, version)
+    with pytest.raises(CannotFold) as raised:
+        fold(script.stored()[0], Designators(), Rows())
+    assert str(raised.value) == reason
+
+
+def test_a_dict_with_text_may_have_a_key_called_missing_beside_others() -> None:
+    notes = declared("NoteAction", "note_action", field("notes", "dict", 2, item="text"))
+    script = Script()
+    script.put(NodeStarted("action", None, name_of(notes), {"notes": {"missing": "milk", "bought": "bread"}}))
+    assert [each[2:8] for each in rows_of(script, notes)["parameter_item"]] == [
+        (0, 1, "missing", None, None, "milk"),
+        (1, 1, "bought", None, None, "bread"),
+    ]
+
+
+def test_a_pose_keeps_every_bit_of_its_numbers() -> None:
+    script = Script()
+    odd = PoseValue((0.1 + 0.2, -0.0, 5e-324), (1 / 3, 1e300, -1.7976931348623157e308, 0.0), "map", 1999)
+    script.put(ObjectAdded("milk", "MILK", odd))
+    made = rows_of(script)["pose"][0]
+    assert [value.hex() for value in made[2:9]] == [
+        "0x1.3333333333334p-2",
+        "-0x0.0p+0",
+        "0x0.0000000000001p-1022",
+        "0x1.5555555555555p-2",
+        "0x1.7e43c8800759cp+996",
+        "-0x1.fffffffffffffp+1023",
+        "0x0.0p+0",
+    ]
+    assert made[10] == 1

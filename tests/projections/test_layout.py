@@ -1,0 +1,91 @@
+"""What declarations add to the tables, and which of them cannot be added."""
+
+from __future__ import annotations
+
+import pytest
+
+from pycrorm_async.events.happenings import DesignatorTypeDeclared
+from pycrorm_async.projections.layout import Contradictory, Layout, Leaf
+from tests.projections.script import PICK_UP, SAYING, declared, field
+
+
+def layout_of(*types: DesignatorTypeDeclared) -> Layout:
+    layout = Layout()
+    for each in types:
+        layout = layout.with_declaration(each)
+    return layout
+
+
+def test_columns_of_one_type_unite_in_the_order_they_came() -> None:
+    louder = declared("SayingAction", "saying_action", field("volume", "real", 2), field("text", "text", 3))
+    layout = layout_of(SAYING, louder)
+    assert layout.leaves == {"saying_action": {"text": "text", "volume": "real"}}
+    assert layout_of(SAYING, louder, SAYING) == layout
+
+
+def test_lists_and_dicts_have_no_column() -> None:
+    joints = declared("MoveJointsMotion", "move_joints_motion", field("names", "list", 2, item="text"), kind="motion")
+    assert layout_of(joints).leaves == {"move_joints_motion": {}}
+
+
+@pytest.mark.parametrize(
+    ("second", "reason"),
+    [
+        (
+            declared("SayingAction", "saying_action", field("text", "integer", 2)),
+            (
+                "SayingAction.text is declared as text and as integer (types that share a name must agree:"
+                " rename one field or set another dtype)"
+            ),
+        ),
+        (
+            declared("SayingAction", "saying_action", field("Text", "text", 2)),
+            "SayingAction is declared with the column text and with Text: rename one",
+        ),
+        (declared("SayingAction", "saying_action", kind="motion"), "SayingAction is declared as action and as motion"),
+        (
+            declared("PoseAction", "pose", field("x", "real", 2)),
+            "PoseAction asks for the table pose, whose name is taken",
+        ),
+        (
+            declared("Saying", "Saying_Action", field("text", "text", 2)),
+            "Saying asks for the table Saying_Action, whose name is taken",
+        ),
+    ],
+    ids=["another type", "another case", "another kind", "a table of ours", "a table in another case"],
+)
+def test_what_cannot_share_the_tables_is_refused_with_both_named(second: DesignatorTypeDeclared, reason: str) -> None:
+    with pytest.raises(Contradictory) as raised:
+        layout_of(SAYING, second)
+    assert str(raised.value) == reason
+
+
+def test_a_contradiction_with_another_table_of_the_type_is_one_too() -> None:
+    with pytest.raises(Contradictory):
+        layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
+
+
+def test_a_view_shows_the_type_all_its_tables_and_its_descendants() -> None:
+    careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
+    gentle = declared("GentlePickUpAction", "gentle", bases=("CarefulPickUpAction", "PickUpAction"))
+    other_name = declared("PickUpAction", "ORMPickUp")
+    layout = layout_of(gentle, careful, PICK_UP, other_name)
+    assert layout.members("pick_up_action") == ("pick_up_action", "gentle", "careful", "ORMPickUp")
+    assert layout.members("careful") == ("careful", "gentle")
+    assert layout.members("gentle") == ("gentle",)
+
+
+def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_a_class_that_exists() -> None:
+    careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
+    layout = layout_of(PICK_UP, careful, SAYING, declared("MoveMotion", "move_motion", kind="motion"))
+    assert layout.lineage("SayingAction") == "SayingAction Action"
+    assert layout.lineage("MoveMotion") == "MoveMotion Motion"
+    assert layout.lineage("CarefulPickUpAction") == "CarefulPickUpAction careful PickUpAction Action"
+
+
+def test_mapped_classes_add_what_is_missing_and_never_change_what_is_declared() -> None:
+    layout = layout_of(SAYING).with_leaves(
+        [Leaf("saying_action", {"text": "integer", "volume": "real"}, "SayingAction", "action"), Leaf("ORMLog", {})]
+    )
+    assert layout.leaves == {"saying_action": {"text": "text", "volume": "real"}, "ORMLog": {}}
+    assert layout.types["SayingAction"].tables == ("saying_action",)

@@ -1,0 +1,288 @@
+"""Live folding on real SQLite: what is shown, what stops, what several projectors do to one memory."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+
+import pytest
+
+from pycrorm_async.errors import DatabaseForeign
+from pycrorm_async.events.happenings import (
+    CandidateValue,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.log import EventLog
+from tests.projections.asking import all_rows, ask, stored_and_folded
+from tests.projections.script import (
+    NAVIGATE,
+    PICK_UP,
+    SAYING,
+    Script,
+    declarations,
+    declared,
+    field,
+    mixed,
+    name_of,
+    pose,
+    row,
+    time_us,
+)
+
+VIA = declared("ViaAction", "via_action", field("via", "list", 2, item="pose"))
+
+
+def rich_episode(number: int) -> Script:
+    """Everything that can happen, so that every table is filled."""
+    script = Script(number)
+    put = script.put
+    put(EpisodeStarted(f"episode {number}", "me", "host", "1.0", "3.11"))
+    root = put(NodeStarted("root"))
+    robot = put(ObjectAdded("pr2", "ROBOT", pose(), {"torso": 0.1}))
+    milk = put(ObjectAdded("milk", "MILK", pose(number, 2, 3)))
+    state = RobotValue(pose(0.1, 0.2, 0), "ROBOT", 0.1, ObjectReference(robot, robot))
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(1, 1)}, state))
+    put(LocationResolved("CostmapLocation", (CandidateValue(pose(1, 1), ("LEFT",)),), 0, 10, drive))
+    moved = put(ObjectMoved(robot, "pr2", "ROBOT", pose(1, 1), drive))
+    put(NodeEnded(drive, "SUCCEEDED"))
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", root, name_of(PICK_UP), parameters, state))
+    put(JointsMoved(ObjectReference(robot, moved), {"torso": 0.2}, pick))
+    put(ObjectAttached(ObjectReference(robot, moved), ObjectReference(milk, milk), "tool", pick))
+    put(NodeEnded(pick, "FAILED", FailureValue("a.IKError", "far", [1])))
+    via = put(NodeStarted("action", root, name_of(VIA), {"via": [pose(1), pose(2)]}, state))
+    put(NodeEnded(via, "SUCCEEDED", result={"length": 2}))
+    put(ObjectRemoved(ObjectReference(milk, milk), root))
+    put(NodeEnded(root, "SUCCEEDED"))
+    put(EpisodeEnded("SUCCEEDED"))
+    return script
+
+
+async def test_every_table_is_filled_by_what_happens(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records])
+    filled = {name for name, rows in (await all_rows(log)).items() if rows}
+    assert filled == {
+        "process_metadata__1", "task_tree_node__1", "pose__1", "object__1", "object_removal__1", "attachment__1",
+        "parameter_item__1", "joint_change__1", "location_resolution__1", "location_candidate__1",
+        "navigate_action__1", "pick_up_action__1", "via_action__1",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("batch_events", [1, 2, 3, 7, 10_000])
+async def test_batches_of_any_size_show_the_same_rows(log: EventLog, batch_events: int) -> None:
+    episodes = [rich_episode(1), rich_episode(2)]
+    lost = Script(3)
+    lost.put(NodeStarted("action", lost.put(NodeStarted("root")), name_of(SAYING), {"text": "oh"}))
+    lost.put(EpisodeEnded("LOST"))
+    records = [*declarations(NAVIGATE, PICK_UP, VIA, SAYING), *mixed(*episodes, lost)]
+    await log.append(records)
+    projector = Projector(log, batch_events=batch_events)
+    await projector.open()
+    assert await projector.fold_behind() == len(records) - 4
+    nodes = await ask(log, "SELECT id, status, end_time FROM task_tree_node ORDER BY id")
+    expected = []
+    for number in (1, 2):
+        expected += [
+            (row(2, number=number), "SUCCEEDED", time_us(16)),
+            (row(5, number=number), "SUCCEEDED", time_us(8)),
+            (row(9, number=number), "FAILED", time_us(12)),
+            (row(13, number=number), "SUCCEEDED", time_us(14)),
+        ]
+    assert nodes == [*expected, (row(1, number=3), "LOST", None), (row(2, number=3), "LOST", None)]
+    counts = {name.removesuffix("__1"): len(rows) for name, rows in (await all_rows(log)).items() if rows}
+    assert counts == {
+        "process_metadata": 2, "task_tree_node": 10, "pose": 16, "object": 6, "object_removal": 2,
+        "parameter_item": 4, "attachment": 2, "joint_change": 2, "location_resolution": 2, "location_candidate": 2,
+        "navigate_action": 2, "pick_up_action": 2, "via_action": 2, "saying_action": 1,
+    }  # fmt: skip
+
+
+async def test_one_batch_and_event_by_event_give_the_same_tables(log: EventLog, tmp_path: object) -> None:
+    records = [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records]
+    await stored_and_folded(log, records)
+    at_once = await all_rows(log)
+    other = await EventLog.open(type(log.address).parse(f"sqlite:///{tmp_path}/other.db"), create=True)
+    try:
+        projector = Projector(other)
+        await projector.open()
+        for record in records:
+            await other.append([record])
+            await projector.fold_behind()
+        assert await all_rows(other) == at_once
+    finally:
+        await other.close()
+
+
+async def test_nothing_behind_is_nothing_to_do(log: EventLog) -> None:
+    projector = await stored_and_folded(log, rich_episode(1).records[:2])
+    assert await projector.fold_behind() == 0
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        ("undeclared", "event 3: the designator type 00000000000000000000000000000000 was never declared"),
+        ("undecodable", "event 3: NodeEnded cannot be decoded: JSON is malformed: invalid character (byte 0)"),
+        ("unknown", "event 3: RobotDanced is not an event this version knows"),
+        ("newer", "event 3: NodeEnded has version 2, this version knows 1"),
+        (
+            "contradicting",
+            (
+                "event 3: SayingAction.text is declared as text and as integer (types that share a name must agree:"
+                " rename one field or set another dtype)"
+            ),
+        ),
+        (
+            "refused by the database",
+            "event 3: the database refuses it: Python int too large to convert to SQLite INTEGER",
+        ),
+    ],
+)
+async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_go_on(
+    log: EventLog, bad: str, reason: str
+) -> None:
+    numeric = declared("SayingAction", "saying_action", field("text", "integer", 2))
+    first, second = Script(1), Script(2)
+    for script in (first, second):
+        script.put(EpisodeStarted("why", "me", "host", "1.0", "3.11"))
+        script.put(NodeStarted("root"))
+    match bad:
+        case "undeclared":
+            first.put(NodeStarted("action", 2, "0" * 32))
+        case "undecodable":
+            first.put_payload("NodeEnded", b"?")
+        case "unknown":
+            first.put_payload("RobotDanced", b"{}")
+        case "newer":
+            first.put(NodeEnded(2, "SUCCEEDED"), version=2)
+        case "contradicting":
+            first.put(NodeStarted("action", 2, name_of(numeric), {"text": 1}))
+        case _:
+            nothing = ("description", "created_by", "host", "software", "python")
+            started = "{" + "".join(f'"{name}":"",' for name in nothing) + '"seed":18446744073709551615}'
+            first.put_payload("EpisodeStarted", started.encode())
+    first.put(NodeEnded(2, "SUCCEEDED"))
+    second.put(NodeStarted("action", 2, name_of(SAYING), {"text": "hi"}))
+    projector = await stored_and_folded(log, [*declarations(SAYING, numeric), *mixed(first, second)])
+    assert [(each.number, each.parked) for each in await log.stopped()] == [(1, reason)]
+    assert await ask(log, "SELECT number, folded, head FROM episode") == [(1, 2, 4), (2, 3, 3)]
+    assert await ask(log, "SELECT id, status FROM task_tree_node ORDER BY id") == [
+        (row(2), "RUNNING"),
+        (row(2, number=2), "RUNNING"),
+        (row(3, number=2), "RUNNING"),
+    ]
+    assert await ask(log, "SELECT * FROM saying_action") == [(row(3, number=2), "hi")]
+    assert await projector.fold_behind() == 0
+
+
+async def test_a_type_that_grows_gets_a_column_and_older_rows_stay(log: EventLog) -> None:
+    louder = declared("SayingAction", "saying_action", field("text", "text", 2), field("volume", "real", 3))
+    script = Script()
+    script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
+    projector = await stored_and_folded(log, [*declarations(SAYING), *script.records])
+    script.put(NodeStarted("action", None, name_of(louder), {"text": "HI", "volume": 0.5}))
+    script.put(NodeStarted("action", None, name_of(SAYING), {"text": "ho"}))
+    await log.append([*declarations(louder), *script.records])
+    await projector.fold_behind()
+    assert await ask(log, "SELECT id, text, volume FROM saying_action ORDER BY id") == [
+        (row(1), "hi", None),
+        (row(2), "HI", 0.5),
+        (row(3), "ho", None),
+    ]
+
+
+async def test_a_descendant_is_among_its_base_also_when_the_base_came_later(log: EventLog) -> None:
+    fields = (field("object_designator", "object", 2), field("arm", "enum", 3))
+    base = declared("GrabAction", "grab_action", *fields)
+    careful = declared(
+        "CarefulGrabAction", "careful_grab_action", *fields, field("speed", "real", 4), bases=("GrabAction",)
+    )
+    script = Script()
+    script.put(NodeStarted("action", None, name_of(careful), {"arm": "LEFT", "speed": 0.5}))
+    projector = await stored_and_folded(log, [*declarations(careful), *script.records])
+    script.put(NodeStarted("action", None, name_of(base), {"arm": "RIGHT"}))
+    await log.append([*declarations(base), *script.records])
+    await projector.fold_behind()
+    assert await ask(log, "SELECT * FROM grab_action ORDER BY id") == [
+        (row(1), None, "LEFT"),
+        (row(2), None, "RIGHT"),
+    ]
+    assert await ask(log, "SELECT * FROM careful_grab_action") == [(row(1), None, "LEFT", 0.5)]
+
+
+async def test_several_projectors_show_every_event_once(log: EventLog) -> None:
+    projectors = [Projector(log, batch_events=5) for _ in range(4)]
+    for each in projectors:
+        await each.open()
+    episodes = [rich_episode(number) for number in range(1, 9)]
+    await log.append([*declarations(NAVIGATE, PICK_UP, VIA), *mixed(*episodes)])
+    counts = await asyncio.gather(*(each.fold_behind() for each in projectors))
+    assert sum(counts) == 8 * 17
+    assert await ask(log, "SELECT count(*), sum(status = 'SUCCEEDED') FROM task_tree_node") == [(32, 24)]
+    assert await ask(log, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
+
+
+async def test_a_projector_that_knows_older_tables_learns_of_the_new_ones(log: EventLog) -> None:
+    first, second = Projector(log), Projector(log)
+    await first.open()
+    await second.open()
+    script = Script()
+    script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
+    await log.append([*declarations(SAYING), *script.records])
+    assert await first.fold_behind() == 1
+    script.put(NodeStarted("action", None, name_of(SAYING), {"text": "ho"}))
+    await log.append(script.records)
+    assert await second.fold_behind() == 1
+    assert await ask(log, "SELECT text FROM saying_action ORDER BY id") == [("hi",), ("ho",)]
+
+
+async def test_doubles_arrive_in_the_tables_bit_by_bit(log: EventLog) -> None:
+    chance = random.Random(11)
+    special = [0.1 + 0.2, 0.0, 5e-324, 1.7976931348623157e308, 2.0**53 + 1, 1 / 3]
+    numbers = [*special, *(chance.uniform(-1, 1) * 10.0 ** chance.randint(-300, 300) for _ in range(2_994))]
+    script = Script()
+    for x, y, z in zip(numbers[0::3], numbers[1::3], numbers[2::3], strict=True):
+        script.put(ObjectAdded("milk", "MILK", PoseValue((x, y, z), (0.0, 0.0, 0.0, 1.0), "map", 0)))
+    await stored_and_folded(log, script.records)
+    stored = [value for values in await ask(log, "SELECT x, y, z FROM pose ORDER BY id") for value in values]
+    assert [value.hex() for value in stored] == [value.hex() for value in numbers]
+
+
+async def test_text_of_any_kind_arrives_as_it_was(log: EventLog) -> None:
+    texts = ["", "Käse 🧀", "'; DROP TABLE pose__1; --", '"%s" ?1 :x', "a\nb\t\\", "\ud7ff\uffff"]
+    script = Script()
+    for text in texts:
+        script.put(NodeStarted("action", None, name_of(SAYING), {"text": text}))
+    await stored_and_folded(log, [*declarations(SAYING), *script.records])
+    assert [text for (text,) in await ask(log, "SELECT text FROM saying_action ORDER BY id")] == texts
+
+
+async def test_opening_again_changes_nothing(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(SAYING), *rich_episode(1).records[:2]])
+    before = await ask(log, "SELECT * FROM pycrorm_generation")
+    schema = await ask(log, "SELECT name, sql FROM sqlite_master ORDER BY name")
+    await Projector(log).open()
+    assert await ask(log, "SELECT * FROM pycrorm_generation") == before
+    assert await ask(log, "SELECT name, sql FROM sqlite_master ORDER BY name") == schema
+
+
+async def test_tables_of_another_version_are_refused(log: EventLog) -> None:
+    await Projector(log).open()
+    async with log.engine.begin() as connection:
+        await connection.exec_driver_sql("UPDATE pycrorm_generation SET version = 2")
+    with pytest.raises(DatabaseForeign, match=r"made by version 2 of the fold, this is version 1: use a newer pycrorm"):
+        await Projector(log).open()

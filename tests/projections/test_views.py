@@ -1,0 +1,107 @@
+"""Views that join what learning asks for, and those that users register."""
+
+from __future__ import annotations
+
+import pytest
+from sqlalchemy import func, select
+from sqlalchemy.ext.asyncio import AsyncSession
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.happenings import (
+    FailureValue,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectReference,
+    RobotValue,
+)
+from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextView, TaskTreeNode
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.views import UserView
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from tests.projections.asking import ask, stored_and_folded
+from tests.projections.script import PICK_UP, Script, declarations, declared, field, name_of, pose, row
+
+
+def two_pick_ups() -> Script:
+    """The milk stands at (1, 2) and is picked up from (0.25, 2.5); then it is moved to (5, 5)."""
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 0.9)))
+    robot = RobotValue(pose(0.25, 2.5, 0, turned=0.6), "ROBOT", 0.3)
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+    node = script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, robot))
+    script.put(NodeEnded(node, "FAILED", FailureValue("a.IKError", "far")))
+    moved = script.put(ObjectMoved(milk, "milk", "MILK", pose(5, 5, 0.9)))
+    robot = RobotValue(pose(4, 4), "ROBOT", None)
+    parameters = {"object_designator": ObjectReference(milk, moved), "arm": "RIGHT", "grasp": "FRONT"}
+    node = script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, robot))
+    script.put(NodeEnded(node, "SUCCEEDED"))
+    return script
+
+
+async def test_the_view_of_pick_ups_has_the_columns_of_the_thesis_and_the_pose_at_execution(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    async with log.engine.connect() as connection:
+        answer = await connection.exec_driver_sql('SELECT * FROM "PickUpWithContextView" ORDER BY id')
+        assert list(answer.keys()) == [
+            "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
+            "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
+        ]  # fmt: skip
+        assert [tuple(each) for each in answer] == [
+            (row(2), "LEFT", "TOP", 0.3, -0.75, 0.5, 0.0, 0.0, 0.6, 0.8, "MILK", "FAILED", 1, row(2)),
+            (row(5), "RIGHT", "FRONT", None, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, "MILK", "SUCCEEDED", 1, row(5)),
+        ]
+
+
+async def test_the_mapped_view_gives_and_takes_members(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    async with AsyncSession(log.engine) as session:
+        view = PickUpWithContextView
+        won = (await session.scalars(select(view).where(view.status == TaskStatus.SUCCEEDED))).all()
+        assert [(each.arm, each.grasp, each.obj_type) for each in won] == [(Arms.RIGHT, Grasp.FRONT, ObjectType.MILK)]
+
+
+async def test_a_careful_pick_up_is_in_the_view_too(log: EventLog) -> None:
+    careful = declared(
+        "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5),
+        bases=("PickUpAction",),
+    )  # fmt: skip
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2)))
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP", "speed": 0.5}
+    script.put(NodeStarted("action", None, name_of(careful), parameters, RobotValue(pose(), "ROBOT", 0.0)))
+    await stored_and_folded(log, [*declarations(careful), *script.records])
+    assert await ask(log, 'SELECT id, relative_x, relative_y FROM "PickUpWithContextView"') == [(row(2), -1.0, -2.0)]
+
+
+async def test_a_view_of_a_user_is_made_beside_the_tables_and_changed_with_its_meaning(log: EventLog) -> None:
+    node = TaskTreeNode
+    reasons = UserView(
+        "reasons",
+        select(node.reason, func.count().label("times")).where(node.status == TaskStatus.FAILED).group_by(node.reason),
+    )
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    await Projector(log, views=[reasons]).open()
+    assert await ask(log, "SELECT * FROM reasons") == [("IKError", 1)]
+    async with AsyncSession(log.engine) as session:
+        asked = await session.execute(select(reasons.table.c.times).where(reasons.table.c.reason == "IKError"))
+        assert asked.scalars().all() == [1]
+    await Projector(log, views=[UserView("reasons", select(node.reason).where(node.reason.is_not(None)))]).open()
+    assert await ask(log, "SELECT * FROM reasons") == [("IKError",)]
+
+
+async def test_a_view_of_a_user_stays_when_another_process_opens_the_memory_without_it(log: EventLog) -> None:
+    await Projector(log, views=[UserView("arms", select(PickUpAction.arm))]).open()
+    await Projector(log).open()
+    assert await ask(log, "SELECT * FROM arms") == []
+
+
+@pytest.mark.parametrize(
+    "name", ["pose", "Action", "event", "episode", "pycrorm_x", "park_arms_action", "pickupWithContextView"]
+)
+async def test_a_view_cannot_take_a_name_that_is_taken(log: EventLog, name: str) -> None:
+    with pytest.raises(CallerError, match=f"a view cannot be called '{name}'"):
+        await Projector(log, views=[UserView(name, select(ParkArmsAction.arm))]).open()
