@@ -135,7 +135,7 @@ async def _remembered(url: str, spool: Path | None) -> Answers:
         return Answers(number, tree, await _asked(memory, number, memory.mapped(SayingActionPerformable)))
 
 
-async def _asked(memory: Memory, number: int, saying: type[Action]) -> list[tuple[str, Sequence[str], list[Any]]]:
+async def _asked(memory: Memory, number: int, saying: Any) -> list[tuple[str, Sequence[str], list[Any]]]:
     """The thesis' five questions, about this episode."""
     mine = number
     async with memory.session() as session:

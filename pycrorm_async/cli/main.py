@@ -12,10 +12,11 @@
 
 from __future__ import annotations
 
+import functools
 import logging
-import sys
+from collections.abc import Callable
+from typing import Any
 
-import click
 import typer
 from rich.logging import RichHandler
 
@@ -33,20 +34,6 @@ from pycrorm_async.errors import (
 
 __all__ = ["main", "app", "exit_code"]
 
-app = typer.Typer(
-    name="pycrorm",
-    help="Episodic memory for robots: plans remembered as events, asked about as tables.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command("demo")(demo.demo)
-app.command("run")(run.run)
-app.command("writer")(writer.writer)
-app.command("episodes")(episodes.episodes)
-app.command("show")(show.show)
-
 
 def exit_code(error: PycrormError) -> int:
     """The documented code of an error, by who is at fault."""
@@ -62,23 +49,45 @@ def exit_code(error: PycrormError) -> int:
     return 1
 
 
+def _told_in_a_line(verb: Callable[..., int | None]) -> Callable[..., None]:
+    """The verb, with what it raises as one line and an exit code, and with the code it returns."""
+
+    @functools.wraps(verb)
+    def told(*arguments: Any, **options: Any) -> None:
+        try:
+            code = verb(*arguments, **options) or 0
+        except PycrormError as error:
+            problem(str(error))
+            code = exit_code(error)
+        except KeyboardInterrupt:
+            problem("interrupted; what was recorded up to here is kept")
+            code = 130
+        raise typer.Exit(code)
+
+    return told
+
+
+app = typer.Typer(
+    name="pycrorm",
+    help="Episodic memory for robots: plans remembered as events, asked about as tables.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+_VERBS: dict[str, Callable[..., int | None]] = {
+    "demo": demo.demo,
+    "run": run.run,
+    "episodes": episodes.episodes,
+    "show": show.show,
+    "writer": writer.writer,
+}
+for _name, _verb in _VERBS.items():
+    app.command(_name)(_told_in_a_line(_verb))
+
+
 def main() -> None:
     """The console script."""
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[RichHandler(console=stderr)])
-    try:
-        code = app(standalone_mode=False)
-    except PycrormError as error:
-        problem(str(error))
-        code = exit_code(error)
-    except click.exceptions.Exit as leaving:
-        code = leaving.exit_code
-    except click.ClickException as error:
-        error.show()
-        code = 2
-    except (KeyboardInterrupt, click.exceptions.Abort):
-        problem("interrupted; what was recorded so far is kept")
-        code = 130
-    except BrokenPipeError:
-        sys.stderr.close()
-        code = 1
-    sys.exit(code if isinstance(code, int) else 0)
+    handler = RichHandler(console=stderr, show_time=False, show_path=False)
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    app()

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from rich.markup import escape
 from rich.text import Text
@@ -11,7 +12,9 @@ from rich.tree import Tree
 from pycrorm_async.cli.output import duration, stdout
 from pycrorm_async.query.questions import NodeSummary
 
-__all__ = ["print_tree"]
+__all__ = ["print_tree", "parameters_text"]
+
+_TEXT_MAX = 60
 
 _STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED": "yellow", "INTERRUPTED": "yellow"}
 
@@ -33,9 +36,35 @@ def print_tree(nodes: Sequence[NodeSummary]) -> None:
 
 def _line(node: NodeSummary) -> Text:
     line = Text.from_markup(escape(node.dtype or "root"))
+    if node.parameters:
+        line.append(f"  {parameters_text(node.parameters)}", style="dim")
     line.append(f"  {node.status}", style=_STYLES.get(node.status, "red"))
     line.append(f"  {duration(node.duration_ns)}", style="dim")
     if node.reason:
         message = " ".join((node.failure_message or "").split())
         line.append(f"  {node.reason}{': ' if message else ''}{message[:100]}", style="red")
     return line
+
+
+def parameters_text(parameters: Mapping[str, Any]) -> str:
+    """Parameters in a few words.
+
+    >>> parameters_text({"arm": "LEFT", "target": {"position": [0.6, 0.4, 0.0], "orientation": [0, 0, 0, 1]}})
+    'arm=LEFT target=(0.60, 0.40, 0.00)'
+    """
+    return " ".join(f"{name}={_value_text(value)}" for name, value in parameters.items())
+
+
+def _value_text(value: Any) -> str:
+    if isinstance(value, dict) and "position" in value:
+        return "(" + ", ".join(f"{each:.2f}" for each in value["position"]) + ")"
+    if isinstance(value, dict) and value.get("name"):
+        return str(value["name"])
+    if isinstance(value, dict) and "missing" in value:
+        return "?"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict | list):
+        return f"{len(value)} entries"
+    text = " ".join(str(value).split())
+    return text if len(text) <= _TEXT_MAX else f"{text[:_TEXT_MAX]}…"

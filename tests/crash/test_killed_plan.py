@@ -40,7 +40,9 @@ async def plan():
 
 def killed(folder: Path, seconds: float) -> tuple[set[int], set[int]]:
     """Runs the plan, kills it that long after its first step; the steps that said they started, and ended."""
-    process = subprocess.Popen([*COMMAND, "run", "walk.py"], cwd=folder, env=environment(), stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [*COMMAND, "run", "walk.py"], cwd=folder, env=environment(), stdout=subprocess.PIPE, bufsize=0
+    )
     assert process.stdout is not None
     output = process.stdout.readline()
     assert output == b"started 0\n"

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.errors import DescriptionNotLoadable
 from pycrorm_async.world.robot import PR2
@@ -121,11 +120,7 @@ def test_the_built_in_robot_is_the_pr2(world: BulletWorld) -> None:
 
 
 def test_the_mesh_model_of_the_extra_loads_and_fills_the_same_room(world: BulletWorld) -> None:
-    try:
-        path = pr2_mesh_urdf_path()
-    except MissingExtra as missing:
-        pytest.skip(str(missing))
-    by_mesh = Object("pr2", ObjectType.ROBOT, path)
+    by_mesh = Object("pr2", ObjectType.ROBOT, pr2_mesh_urdf_path())
     by_shape = Object("built in", ObjectType.ROBOT, pr2_urdf())
     assert by_mesh.robot_description is PR2
     np.testing.assert_allclose(by_mesh.bounding_box(), by_shape.bounding_box(), atol=0.03)
