@@ -58,7 +58,6 @@ class RecorderQueue:
         self._closed = False
         self._gone = False
         self._safe_number = 0
-        self._disk_was_full = False
         self._syncer = Syncer(name=folder.name, interval_s=settings.sync_interval_ms / 1000, turn=self._turn)
         with available(folder):
             self._appender = Appender(
@@ -69,10 +68,10 @@ class RecorderQueue:
                 wake=self._syncer.wake,
                 hurry=self._syncer.hurry,
             )
+            self._disk_was_full = self._appender.prepare()
         self._reader = Reader(recorder=recorder, start=Cursor(1, header_bytes(0), 0), load=self._load)
         in_forked_child(self._forked)
         self._syncer.start()
-        self._syncer.hurry()  # makes the second segment ahead
 
     @classmethod
     def create(cls, spool: Path, *, settings: Settings, clock: Clock, recorder: EpisodeId) -> RecorderQueue:

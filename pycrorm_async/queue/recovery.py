@@ -52,7 +52,10 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
 
 
 class RecoveredQueue:
-    """The records of a dead recorder, in order, then the computed ends. Made by `open_dead`; nothing waits."""
+    """The records of a dead recorder, in order, then the computed ends. Made by `open_dead`; nothing waits.
+
+    `lost` are these ends, one for each episode left open; `stored` is the position acknowledged last.
+    """
 
     def __init__(self, folder: Path, recorder: EpisodeId, kept: Kept, locks: tuple[FileLock, ...]) -> None:
         self.folder = folder
@@ -62,7 +65,7 @@ class RecoveredQueue:
         self._locks = locks
         self._reader = Reader(recorder=recorder, start=kept.start, load=self._load)
         self._given = kept.start.position
-        self._acknowledged = kept.start.position
+        self.stored = kept.start.position
 
     @property
     def last(self) -> int:
@@ -97,7 +100,7 @@ class RecoveredQueue:
         The last one stays, because the ends are computed from it. Raises `SpoolUnavailable`.
         """
         assert position <= self._given, "only what was given can be acknowledged"
-        self._acknowledged = max(self._acknowledged, position)
+        self.stored = max(self.stored, position)
         with available(self.folder):
             for number in sorted(self._kept.bases):
                 following = self._kept.bases.get(number + 1)
@@ -126,7 +129,7 @@ class RecoveredQueue:
 
     def remove(self) -> None:
         """Deletes the folder, all of which is stored, and gives up the locks. Raises `SpoolUnavailable`."""
-        assert self._acknowledged == self.last, "what is not acknowledged is not deleted"
+        assert self.stored == self.last, "what is not acknowledged is not deleted"
         self._reader.close()
         try:
             with available(self.folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -76,7 +77,7 @@ class Spool:
 
     def _note(self, log_id: str) -> None:
         """Writes the note whole or not at all; of two at once the first stays."""
-        unfinished = self.path / f"{BINDING}.{os.getpid()}{MAKING}"
+        unfinished = self.path / f"{BINDING}.{os.getpid()}.{threading.get_ident()}{MAKING}"
         with unfinished.open("wb") as file:
             file.write(f"{log_id}\n".encode())
             file.flush()

@@ -2,12 +2,16 @@
 
 It sleeps while nobody has work for it. The first record after a turn wakes it, and it lets further ones gather for the
 sync interval, so that they share one sync; whoever waits for the disk calls `hurry` and the turn begins at once.
+
+It is woken through a `SimpleQueue` and not an `Event`: a KeyboardInterrupt in the middle of `Event.set` leaves a lock
+behind that nobody will ever open, and the plan's next event would hang.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from queue import Empty, SimpleQueue
 
 __all__ = ["Syncer"]
 
@@ -18,8 +22,7 @@ class Syncer:
     def __init__(self, *, name: str, interval_s: float, turn: Callable[[], bool]) -> None:
         self._interval_s = interval_s
         self._turn = turn
-        self._work = threading.Event()
-        self._hurry = threading.Event()
+        self._calls: SimpleQueue[float] = SimpleQueue()  # how long further work may gather
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=f"pycrorm sync {name}", daemon=True)
 
@@ -27,13 +30,12 @@ class Syncer:
         self._thread.start()
 
     def wake(self) -> None:
-        """There is work: a turn will come within the interval."""
-        self._work.set()
+        """There is work: a turn begins within the interval. From any thread, at any moment."""
+        self._calls.put(self._interval_s)
 
     def hurry(self) -> None:
         """There is work and somebody waits for it: a turn begins at once, or after the one that runs now."""
-        self._hurry.set()
-        self._work.set()
+        self._calls.put(0.0)
 
     def stop(self, *, timeout_s: float) -> bool:
         """Takes the last turn and ends the thread; False if it has not ended in time."""
@@ -43,12 +45,14 @@ class Syncer:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
-        again = False
         while not self._stopping:
-            if not again:
-                self._work.wait()
-            self._work.clear()
-            self._hurry.wait(self._interval_s)
-            self._hurry.clear()
-            again = self._turn()
+            gather_s = self._calls.get()
+            try:
+                self._calls.get(timeout=gather_s)
+                while True:  # the turn that begins now is for all who have called
+                    self._calls.get_nowait()
+            except Empty:
+                pass
+            if self._turn():
+                self.wake()
         self._turn()

@@ -1,0 +1,70 @@
+"""A process to be killed: records without end, and says on its output what it was told.
+
+Every line is written at once, so the pipe holds it when the process dies: `put EPISODE SEQUENCE` when putting returned,
+`stored POSITION EPISODE SEQUENCE PAYLOAD` for each record of a batch before the batch is acknowledged.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import sys
+import threading
+import time
+from pathlib import Path
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.config import Settings
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.ids import episode_id, episode_text
+from pycrorm_async.queue import RecorderQueue
+
+SETTINGS = Settings(
+    sync_interval_ms=2, segment_bytes=2**14, spool_bytes_max=2**26, spool_reserve_bytes=0, record_bytes_max=2**12
+)
+
+
+def say(*words: object) -> None:
+    os.write(1, (" ".join(map(str, words)) + "\n").encode())
+
+
+def record_without_end(queue: RecorderQueue, rng: random.Random) -> None:
+    while True:
+        episode = episode_id(time.time_ns(), rng.randbytes(10))
+        name = episode_text(episode)
+        kinds = ["EpisodeStarted", *["NodeStarted"] * rng.randrange(1, 40), "EpisodeEnded"]
+        for index, kind in enumerate(kinds, start=1):
+            payload = f"{name}/{index}/".encode() + b"x" * rng.randrange(0, 1200)
+            sequence = queue.put_nowait(Heading(episode, kind, 1), payload)
+            say("put", name, sequence)
+
+
+async def store_without_end(queue: RecorderQueue, rng: random.Random) -> None:
+    while batch := await queue.get_batch(events_max=rng.randrange(1, 50), bytes_max=2**16, age_s_max=0.001):
+        for each in batch:
+            assert each.episode is not None
+            said = each.payload.rstrip(b"x").decode()
+            say("stored", each.position, episode_text(each.episode), each.sequence, said)
+        await queue.acknowledge(batch[-1].position)
+
+
+def main() -> None:
+    seed, threads, storing = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "storing"
+    rng = random.Random(seed)
+    queue = RecorderQueue.create(
+        Path(sys.argv[1]),
+        settings=SETTINGS,
+        clock=SYSTEM_CLOCK,
+        recorder=episode_id(time.time_ns(), rng.randbytes(10)),
+    )
+    for number in range(threads):
+        own = random.Random(seed * 100 + number)
+        threading.Thread(target=record_without_end, args=(queue, own), daemon=True).start()
+    if storing:
+        asyncio.run(store_without_end(queue, rng))
+    threading.Event().wait()
+
+
+if __name__ == "__main__":
+    main()

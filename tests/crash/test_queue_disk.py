@@ -1,0 +1,129 @@
+"""A disk that refuses: a failed sync is not believed a second time, a full disk is an error and not a signal."""
+
+import asyncio
+import contextlib
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import SpoolFull, SpoolUnavailable
+from pycrorm_async.queue import RecorderQueue
+from tests.queue.writing import RECORDER, SMALL, drain, lost, make, node, record, recover, started
+
+SLOW = Settings(
+    sync_interval_ms=3_600_000,
+    segment_bytes=SMALL.segment_bytes,
+    spool_bytes_max=SMALL.spool_bytes_max,
+    spool_reserve_bytes=SMALL.spool_reserve_bytes,
+)
+
+
+def break_syncing(queue: RecorderQueue) -> None:
+    """The next sync of the current segment fails: its descriptor leads to a pipe, which cannot be synced."""
+    read, write = os.pipe()
+    os.dup2(write, queue._appender._current.descriptor)
+    os.close(read)
+    os.close(write)
+
+
+async def test_a_failed_sync_refuses_everything_but_what_was_synced_before(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=SLOW)
+    queue.put_nowait(started(), b"{}")
+    await queue.synced_to()
+    queue.put_nowait(node(), b"not synced")
+    break_syncing(queue)
+    waiters = [asyncio.ensure_future(queue.synced_to()) for _ in range(3)]
+    for waiter in waiters:
+        with pytest.raises(SpoolUnavailable, match="Invalid argument"):
+            await waiter
+    for _ in range(2):
+        with pytest.raises(SpoolUnavailable, match="Invalid argument"):
+            queue.put_nowait(node(), b"{}", reserved=True)
+        with pytest.raises(SpoolUnavailable, match="Invalid argument"):
+            await queue.synced_to()
+    await queue.room()
+    assert queue.block_until_room(1000.0)
+    batch = await queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=1000.0)
+    assert batch == [record(1, started(), 1, b"{}")]
+    await queue.acknowledge(1)
+    for _ in range(2):
+        with pytest.raises(SpoolUnavailable, match="Invalid argument"):
+            await queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=1000.0)
+    assert (queue.written, queue.synced, queue.stored) == (2, 1, 1)
+    queue.release()
+    assert await recover(queue.folder) == [
+        record(1, started(), 1, b"{}"),
+        record(2, node(), 2, b"not synced"),
+        lost(3, 1, 3),
+    ]
+
+
+async def test_a_failed_sync_ends_the_waiting_of_the_writer(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=SLOW)
+    waiting = asyncio.ensure_future(queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=1000.0))
+    await asyncio.sleep(0)
+    queue.put_nowait(started(), b"{}")
+    break_syncing(queue)
+    with pytest.raises(SpoolUnavailable):
+        await queue.synced_to()
+    with pytest.raises(SpoolUnavailable):
+        await waiting
+    queue.release()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of its own of 256 KiB; mounting one takes a privilege that not every machine gives."""
+    mounted = tmp_path / "disk"
+    mounted.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(mounted)], capture_output=True, check=False
+    )
+    if done.returncode:
+        pytest.skip(f"cannot mount: {done.stderr.decode().strip()}")
+    yield mounted
+    subprocess.run(["umount", str(mounted)], check=True)
+
+
+ON_A_SMALL_DISK = Settings(sync_interval_ms=5, segment_bytes=2**15, spool_bytes_max=2**30, spool_reserve_bytes=2**16)
+
+
+async def test_a_full_disk_is_a_full_spool_and_goes_on_when_there_is_room(small_disk: Path) -> None:
+    queue = RecorderQueue.create(small_disk / "spool", settings=ON_A_SMALL_DISK, clock=SYSTEM_CLOCK, recorder=RECORDER)
+    queue.put_nowait(started(), b"{}")
+    put = 1
+    with contextlib.suppress(SpoolFull):
+        while True:
+            put = queue.put_nowait(node(), b"x" * 1000, reserved=True)
+    with pytest.raises(SpoolFull, match="No space left on device"):  # the disk is full, and not the spool
+        queue.put_nowait(node(), b"x" * 1000, reserved=True)
+    assert queue.full
+    assert put > 150
+    assert queue.block_until_room(0.02) is False
+    await queue.synced_to()
+    records = await queue.get_batch(events_max=10_000, bytes_max=2**22, age_s_max=0.0)
+    assert [each.sequence for each in records] == list(range(1, put + 1))
+    await queue.acknowledge(put)
+    assert await asyncio.to_thread(queue.block_until_room, 30.0)
+    await asyncio.wait_for(queue.room(), 30)
+    assert queue.put_nowait(node(), b"x" * 1000) == put + 1
+    queue.close()
+    assert [each.sequence for each in await drain(queue)] == [put + 1]
+    queue.release()
+
+
+def test_a_queue_that_does_not_fit_on_the_disk_is_one_clear_line_and_leaves_nothing(small_disk: Path) -> None:
+    with pytest.raises(SpoolUnavailable, match="No space left on device") as refused:
+        RecorderQueue.create(
+            small_disk / "spool",
+            settings=Settings(segment_bytes=2**20),
+            clock=SYSTEM_CLOCK,
+            recorder=RECORDER,
+        )
+    assert "\n" not in str(refused.value)
+    assert list((small_disk / "spool").iterdir()) == []

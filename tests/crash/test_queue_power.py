@@ -1,0 +1,169 @@
+"""A power cut before and after every sync, on a disk that keeps any subset of what it was not yet told to keep.
+
+The queue and its files are real; only its thread is not started, the test takes its turns, and each `fdatasync` is
+watched. A cut mixes, sector by sector, what the last sync of a file made safe with all its states since; a file deleted
+since the power was last sure may be there again.
+"""
+
+import random
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import SpoolDamaged
+from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.queue import RecorderQueue, open_dead
+from pycrorm_async.queue.appender import Appender, Span
+from pycrorm_async.queue.frame import EVENT
+from pycrorm_async.queue.segment import Segment, salt_of
+from pycrorm_async.queue.syncer import Syncer
+from tests.queue.writing import RECORDER, SMALL, ended, lost, make, node, overwrite, record, recover, started
+
+SECTOR = 512
+ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
+
+
+class Machine:
+    """A queue on a disk that forgets, and the truth about what was put."""
+
+    def __init__(self, place: Path, rng: random.Random) -> None:
+        self.queue: RecorderQueue = make(place / "running", settings=ROOMY)
+        self.put_so_far: list[Record] = []
+        self.cuts: list[tuple[Path, int, int, int]] = []
+        self._place = place
+        self._rng = rng
+        self._sequences: dict[int, int] = {}
+        self._safe: dict[Path, bytes] = {}
+        self._since: dict[Path, list[bytes]] = {}
+        self._deleted: list[tuple[Path, bytes]] = []
+
+    def put(self, number: int, heading: Heading, payload: bytes) -> None:
+        sequence = self._sequences[number] = self._sequences.get(number, 0) + 1
+        assert self.queue.put_nowait(heading, payload, reserved=True) == sequence
+        self.put_so_far.append(record(len(self.put_so_far) + 1, heading, sequence, payload))
+        for path in self._files():
+            self._since.setdefault(path, []).append(path.read_bytes())
+
+    def synced(self, path: Path) -> None:
+        self._safe[path], self._since[path] = path.read_bytes(), []
+
+    def turn(self) -> None:
+        """What the sync thread does when it is woken."""
+        before = {path: self._mixed(path) for path in self._files()}
+        self.queue._turn()
+        self._deleted += [(path, before[path]) for path in before if not path.exists()]
+
+    def cut(self) -> None:
+        """Keeps the files as they may be found when power is back, with what is known at this moment."""
+        folder = self._place / str(len(self.cuts)) / self.queue.name
+        folder.mkdir(parents=True)
+        (folder / "alive").touch()
+        for path in self._files():
+            (folder / path.name).write_bytes(self._mixed(path))
+        for path, content in self._deleted[self._rng.randrange(len(self._deleted) + 1) :]:
+            (folder / path.name).write_bytes(content)
+        self.cuts.append((folder, self.queue.synced, self.queue.stored, len(self.put_so_far)))
+
+    def _files(self) -> list[Path]:
+        return sorted(self.queue.folder.glob("*.segment"))
+
+    def _mixed(self, path: Path) -> bytes:
+        now = path.read_bytes()
+        states = [self._safe.get(path, bytes(len(now))), *self._since.get(path, []), now]
+        if self._rng.random() < 0.2:
+            states = [self._rng.choice(states)]
+        return b"".join(self._rng.choice(states)[at : at + SECTOR] for at in range(0, len(now), SECTOR))
+
+
+def ends_of(records: list[Record]) -> list[Record]:
+    last: dict[int, int] = {}
+    for each in records:
+        number = next(n for n in (1, 2, 3) if started(n).episode == each.episode)
+        last[number] = each.sequence
+        if each.type == "EpisodeEnded":
+            del last[number]
+    return [lost(len(records) + 1 + index, number, last[number] + 1) for index, number in enumerate(sorted(last))]
+
+
+def spoil(folder: Path, position: int) -> None:
+    """Changes one bit of the record at this position."""
+    for path in folder.glob("*.segment"):
+        content = path.read_bytes()
+        salt = salt_of(RECORDER, int(path.stem)).to_bytes(4, "little")
+        for at in range(0, len(content) - 64, 8):
+            here = int.from_bytes(content[at + 8 : at + 16], "little")
+            if content[at] == EVENT and here == position and content[at + 56 : at + 60] == salt:
+                overwrite(path, at + 20, bytes([content[at + 20] ^ 1]))
+                return
+    raise AssertionError(position)
+
+
+@pytest.fixture
+def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> Iterator[Machine]:
+    monkeypatch.setattr(Syncer, "start", lambda self: None)
+    machine = Machine(tmp_path, random.Random(seed))
+    sync = Segment.sync
+
+    def watched(segment: Segment) -> None:
+        machine.cut()
+        if machine._rng.random() < 0.5:
+            machine.put(1, node(1), b"s" * machine._rng.choice([10, 10, 3000]))
+        machine.cut()
+        sync(segment)
+        machine.synced(segment.path)
+        machine.cut()
+
+    begin_sync = Appender.begin_sync
+
+    def begun(appender: Appender) -> Span:
+        span = begin_sync(appender)
+        if machine._rng.random() < 0.3:
+            machine.put(1, node(1), b"z" * 3000)
+        return span
+
+    monkeypatch.setattr(Segment, "sync", watched)
+    monkeypatch.setattr(Appender, "begin_sync", begun)
+    yield machine
+    machine.queue._appender.close()
+    machine.queue._reader.close()
+
+
+@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(8, 300))])
+async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(machine: Machine, seed: int) -> None:
+    rng = random.Random(seed + 1000)
+    for number in (1, 2, 3):
+        machine.put(number, started(number), b"{}")
+    for _ in range(8):
+        for _ in range(rng.randrange(5)):
+            number = rng.choice([1, 1, 2])
+            machine.put(number, node(number), b"y" * rng.randrange(1500))
+        machine.cut()
+        machine.turn()
+        machine.cut()
+        if machine.queue.synced > machine.queue._reader.cursor.position and rng.random() < 0.7:
+            batch = await machine.queue.get_batch(events_max=rng.choice([1, 4, 1000]), bytes_max=2**20, age_s_max=0.0)
+            await machine.queue.acknowledge(batch[-1].position)
+            machine.turn()
+            machine.cut()
+        if rng.random() < 0.1 and machine._sequences[2] > 0:
+            machine.put(3, node(3), b"third")
+    machine.put(1, ended(1), b"{}")
+    machine.cut()
+
+    assert len(machine.cuts) > 30
+    for folder, synced, stored, count in machine.cuts:
+        truth = machine.put_so_far[:count]
+        records = await recover(folder)
+        kept = [each for each in records if each.payload != b'{"status":"LOST"}']
+        first = kept[0].position if kept else records[0].position if records else 1
+        last = kept[-1].position if kept else first - 1
+        assert first <= stored + 1
+        assert synced <= last
+        assert kept == truth[first - 1 : last]
+        assert records[len(kept) :] == ends_of(truth[:last])
+        if first <= synced and rng.random() < 0.2:
+            spoil(folder, synced)
+            with pytest.raises(SpoolDamaged):
+                open_dead(folder)

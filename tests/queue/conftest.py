@@ -1,0 +1,21 @@
+"""One small live queue for a test, let go of afterwards."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.queue import RecorderQueue
+from tests.queue.writing import make
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Path:
+    return tmp_path / "memory.db.spool"
+
+
+@pytest.fixture
+def queue(spool: Path) -> Iterator[RecorderQueue]:
+    made = make(spool)
+    yield made
+    made.release()

@@ -1,0 +1,49 @@
+"""What may be put: never more files than allowed, and the reserve is there for those it is kept for."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import CallerError
+from pycrorm_async.queue.capacity import Capacity
+
+SMALL = Capacity(segment_bytes=1000, segments_max=5, reserve_bytes=500)
+
+
+def test_an_empty_segment_holds_all_but_its_header_and_two_commits() -> None:
+    assert SMALL.end == 1000 - 2 * 72
+    assert SMALL.frame_bytes_max(episodes=0) == 1000 - 2 * 72 - 56
+    assert SMALL.frame_bytes_max(episodes=3) == 1000 - 2 * 72 - 56 - 3 * 40
+
+
+def test_ordinary_records_leave_the_reserve_free_in_the_last_segment() -> None:
+    assert SMALL.ordinary_end(spare=4, episodes=0) == 856
+    assert SMALL.ordinary_end(spare=0, episodes=0) == 856 - 500
+    assert SMALL.admits(100, offset=256, spare=0, episodes=0, reserved=False)
+    assert not SMALL.admits(101, offset=256, spare=0, episodes=0, reserved=False)
+    assert SMALL.admits(600, offset=256, spare=0, episodes=0, reserved=True)
+    assert not SMALL.admits(601, offset=256, spare=0, episodes=0, reserved=True)
+
+
+def test_a_frame_that_does_not_fit_here_needs_a_whole_segment_of_its_own() -> None:
+    assert SMALL.admits(700, offset=800, spare=1, episodes=0, reserved=True)
+    assert not SMALL.admits(700, offset=800, spare=0, episodes=0, reserved=True)
+    assert not SMALL.admits(801, offset=800, spare=1, episodes=0, reserved=True)
+
+
+@given(st.integers(1, 2000), st.integers(56, 856), st.integers(0, 5), st.integers(0, 10), st.integers(1, 100))
+def test_what_is_admitted_ordinarily_is_admitted_reserved_and_with_more_room(
+    frame_bytes: int, offset: int, spare: int, episodes: int, more: int
+) -> None:
+    if SMALL.admits(frame_bytes, offset=offset, spare=spare, episodes=episodes, reserved=False):
+        assert SMALL.admits(frame_bytes, offset=offset, spare=spare, episodes=episodes, reserved=True)
+        assert SMALL.admits(frame_bytes, offset=offset, spare=spare + more, episodes=episodes, reserved=False)
+
+
+def test_settings_with_which_a_full_queue_could_never_be_emptied_are_refused() -> None:
+    with pytest.raises(CallerError, match="three segments"):
+        Capacity.of(Settings(segment_bytes=1000, spool_bytes_max=4000, spool_reserve_bytes=1001))
+    with pytest.raises(CallerError, match="holds no record"):
+        Capacity.of(Settings(segment_bytes=300, spool_bytes_max=4000, spool_reserve_bytes=0))
+    assert Capacity.of(Settings()) == Capacity(8 * 2**20, 512, 16 * 2**20)

@@ -1,0 +1,150 @@
+"""A frame is read whole and unchanged, or not at all; the golden bytes are reckoned here by hand."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pycrorm_async.queue.frame import COMMIT, DECLARATION, EVENT, Frame, decode, encode, encode_commit
+
+SALT = 0xA1B2C3D4
+EPISODE = bytes(range(0x10, 0x20))
+WALL_NS = 1_700_000_000_123_456_789
+MONOTONIC_NS = 987_654_321
+
+GOLDEN = {
+    name: bytes.fromhex(digits)
+    for name, digits in (
+        line.split(" ") for line in (Path(__file__).parent.parent / "golden" / "queue_v1.hex").read_text().splitlines()
+    )
+}
+
+
+def by_hand(head: bytes, body: bytes) -> bytes:
+    """60 bytes of header, their checksum with that of the body, the body."""
+    assert len(head) == 60
+    assert len(body) % 8 == 0
+    return head + struct.pack("<I", zlib.crc32(body + head)) + body
+
+
+EVENT_BY_HAND = by_hand(
+    struct.pack("<BBHI", 1, 11, 3, 10)
+    + struct.pack("<QQ", 42, 7)
+    + struct.pack("<qq", WALL_NS, MONOTONIC_NS)
+    + EPISODE
+    + struct.pack("<I", SALT),
+    b"NodeStarted" + b'{"a":"\xc3\xa4"}' + b"\0\0\0",
+)
+DECLARATION_BY_HAND = by_hand(
+    struct.pack("<BBHIQQqq", 2, 22, 1, 2, 43, 0, WALL_NS, MONOTONIC_NS) + bytes(16) + struct.pack("<I", SALT),
+    b"DesignatorTypeDeclared" + b"{}",
+)
+COMMIT_BY_HAND = by_hand(
+    struct.pack("<BBHIQQqq", 3, 0, 0, 4, 43, 2, WALL_NS, MONOTONIC_NS) + bytes(16) + struct.pack("<I", SALT),
+    struct.pack("<I", 0xDEADBEEF) + bytes(4),
+)
+
+
+def event(payload: bytes = b'{"a":"\xc3\xa4"}', *, position: int = 42) -> bytes:
+    return encode(
+        kind=EVENT,
+        version=3,
+        position=position,
+        sequence=7,
+        wall_ns=WALL_NS,
+        monotonic_ns=MONOTONIC_NS,
+        episode=EPISODE,
+        type_name=b"NodeStarted",
+        payload=payload,
+        salt=SALT,
+    )
+
+
+def test_an_event_has_its_golden_bytes_and_means_what_was_written() -> None:
+    assert event() == EVENT_BY_HAND == GOLDEN["event"]
+    checksum = zlib.crc32(EVENT_BY_HAND[64:] + EVENT_BY_HAND[:60])
+    assert decode(GOLDEN["event"], 0, SALT) == Frame(
+        EVENT, 3, 42, 7, WALL_NS, MONOTONIC_NS, EPISODE, b"NodeStarted", b'{"a":"\xc3\xa4"}', checksum, 88
+    )
+
+
+def test_a_declaration_has_its_golden_bytes_and_means_what_was_written() -> None:
+    frame = decode(GOLDEN["declaration"], 0, SALT)
+    assert GOLDEN["declaration"] == DECLARATION_BY_HAND
+    assert frame is not None
+    assert (frame.kind, frame.position, frame.sequence, frame.episode) == (DECLARATION, 43, 0, bytes(16))
+    assert (frame.type, frame.payload, frame.size) == (b"DesignatorTypeDeclared", b"{}", 88)
+
+
+def test_a_commit_has_its_golden_bytes_and_means_what_was_written() -> None:
+    encoded = encode_commit(
+        position=43, count=2, checksum=0xDEADBEEF, wall_ns=WALL_NS, monotonic_ns=MONOTONIC_NS, salt=SALT
+    )
+    frame = decode(GOLDEN["commit"], 0, SALT)
+    assert encoded == COMMIT_BY_HAND == GOLDEN["commit"]
+    assert frame is not None
+    assert (frame.kind, frame.position, frame.sequence, frame.payload, frame.size) == (
+        COMMIT,
+        43,
+        2,
+        b"\xef\xbe\xad\xde",
+        72,
+    )
+
+
+@pytest.mark.parametrize("name", ["event", "declaration", "commit"])
+def test_a_frame_cut_at_any_byte_is_none(name: str) -> None:
+    for end in range(len(GOLDEN[name])):
+        assert decode(GOLDEN[name][:end], 0, SALT) is None, end
+
+
+@pytest.mark.parametrize("name", ["event", "declaration", "commit"])
+def test_a_frame_of_which_only_the_first_bytes_reached_zeros_is_none(name: str) -> None:
+    whole = GOLDEN[name]
+    for end in range(len(whole)):
+        torn = whole[:end] + bytes(len(whole) - end + 64)
+        if torn[: len(whole)] != whole:  # the padding is zeros anyway
+            assert decode(torn, 0, SALT) is None, end
+
+
+@pytest.mark.parametrize("name", ["event", "declaration", "commit"])
+def test_a_frame_with_any_one_bit_flipped_is_none(name: str) -> None:
+    for bit in range(len(GOLDEN[name]) * 8):
+        changed = bytearray(GOLDEN[name])
+        changed[bit // 8] ^= 1 << bit % 8
+        assert decode(bytes(changed), 0, SALT) is None, bit
+
+
+@pytest.mark.parametrize("name", ["event", "declaration", "commit"])
+def test_what_stands_before_and_after_a_frame_does_not_matter(name: str) -> None:
+    whole = GOLDEN[name]
+    alone = decode(whole, 0, SALT)
+    assert alone is not None
+    for around in (b"\0" * 8, b"\xff" * 8, whole):
+        assert decode(around + whole + around, len(around), SALT) == alone
+
+
+def test_a_frame_of_another_segment_is_none() -> None:
+    assert decode(GOLDEN["event"], 0, SALT + 1) is None
+
+
+def test_space_made_ahead_is_no_frame() -> None:
+    assert decode(bytes(4096), 0, SALT) is None
+    assert decode(bytes(4096), 0, 0) is None
+
+
+def test_a_length_beyond_the_end_is_none_and_reads_nothing() -> None:
+    head = struct.pack("<BBHIQQqq", 1, 255, 1, 2**32 - 1, 1, 1, 0, 0) + EPISODE + struct.pack("<I", SALT)
+    assert decode(head + bytes(4096), 0, SALT) is None
+
+
+@given(st.binary(max_size=300), st.integers(min_value=1, max_value=2**64 - 1), st.binary(max_size=16))
+def test_any_payload_comes_back_and_frames_end_at_multiples_of_8(payload: bytes, position: int, after: bytes) -> None:
+    encoded = event(payload, position=position)
+    frame = decode(encoded + after, 0, SALT)
+    assert frame is not None
+    assert (frame.payload, frame.position, frame.size) == (payload, position, len(encoded))
+    assert len(encoded) % 8 == 0

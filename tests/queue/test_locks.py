@@ -1,0 +1,85 @@
+"""Locks: one holder at a time, gone with the holder, and a forked child holds none."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.queue.locks import FileLock, is_locked
+
+
+def test_a_lock_has_one_holder_and_can_be_taken_when_it_was_let_go(tmp_path: Path) -> None:
+    path = tmp_path / "alive"
+    assert is_locked(path) is False
+    first = FileLock.take(path)
+    assert first is not None
+    assert is_locked(path) is True
+    assert FileLock.take(path) is None
+    first.release()
+    first.release()
+    assert is_locked(path) is False
+    second = FileLock.take(path, create=False)
+    assert second is not None
+    second.release()
+
+
+def test_a_lock_that_is_not_there_is_not_made_unless_asked_for(tmp_path: Path) -> None:
+    assert FileLock.take(tmp_path / "alive", create=False) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_kernel_lets_go_when_the_holder_is_killed(tmp_path: Path) -> None:
+    path = tmp_path / "alive"
+    program = (
+        "import sys, pathlib; from pycrorm_async.queue.locks import FileLock;"
+        "lock = FileLock.take(pathlib.Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
+    )
+    holder = subprocess.Popen([sys.executable, "-c", program, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    with holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        assert is_locked(path) is True
+        holder.send_signal(signal.SIGSTOP)
+        assert FileLock.take(path) is None
+        holder.kill()
+        holder.wait()
+    assert is_locked(path) is False
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_neither_keeps_a_lock_nor_lets_it_go(tmp_path: Path) -> None:
+    path = tmp_path / "alive"
+    lock = FileLock.take(path)
+    assert lock is not None
+    begin_read, begin_write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        lock.release()  # closed already: must not unlock what the parent holds
+        os.read(begin_read, 1)
+        os._exit(0)
+    try:
+        assert is_locked(path) is True
+        lock.release()
+        assert is_locked(path) is False
+    finally:
+        os.write(begin_write, b"x")
+        os.waitpid(child, 0)
+        os.close(begin_read)
+        os.close(begin_write)
+
+
+def test_a_lock_whose_file_was_deleted_meanwhile_is_not_taken(tmp_path: Path) -> None:
+    """Between opening and locking the holder before may delete the file: the lock would be on nothing."""
+    path = tmp_path / "alive"
+    held = FileLock.take(path)
+    assert held is not None
+    path.unlink()
+    assert FileLock.take(path, create=False) is None
+    again = FileLock.take(path)
+    assert again is not None
+    held.release()
+    assert is_locked(path) is True
+    again.release()

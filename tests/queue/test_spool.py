@@ -1,0 +1,105 @@
+"""The spool: whose recorders live, which database it belongs to, what is not ours."""
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue import RecorderQueue, Spool, open_dead
+from tests.queue.writing import RECORDER, make, started
+
+
+def test_a_spool_that_is_not_there_has_no_recorders_and_is_not_made(spool: Path) -> None:
+    assert Spool(spool).recorders() == []
+    assert Spool(spool).strangers() == []
+    assert Spool(spool).log_id() is None
+    assert not spool.exists()
+
+
+def test_a_recorder_lives_until_it_is_let_go(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    (living,) = Spool(spool).recorders()
+    queue.release()
+    (dead,) = Spool(spool).recorders()
+    assert (living.name, living.alive, dead.alive) == (episode_text(RECORDER), True, False)
+    assert dead.path == living.path == queue.folder
+
+
+def test_looking_does_not_keep_a_dead_folder_from_being_opened(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    queue.release()
+    looking = True
+
+    def look() -> None:
+        while looking:
+            Spool(spool).recorders()
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    try:
+        for _ in range(200):
+            recovered = open_dead(queue.folder)
+            assert recovered is not None
+            recovered.release()
+    finally:
+        looking = False
+        thread.join()
+
+
+def test_a_spool_stays_with_the_first_log_that_drained_it(spool: Path) -> None:
+    Spool(spool).bind("0190-log-of-a")
+    Spool(spool).bind("0190-log-of-a")
+    assert Spool(spool).log_id() == "0190-log-of-a"
+    with pytest.raises(SpoolForeign, match=r"memory\.db\.spool belongs to log 0190-log-of-a, not to log 0190-log-of-b"):
+        Spool(spool).bind("0190-log-of-b")
+    assert [path.name for path in spool.iterdir()] == ["log"]
+    assert (spool / "log").read_bytes() == b"0190-log-of-a\n"
+
+
+def test_of_many_logs_at_once_exactly_one_gets_the_spool(spool: Path) -> None:
+    refused: list[str] = []
+    begin = threading.Barrier(8)
+
+    def bind(log_id: str) -> None:
+        begin.wait()
+        try:
+            Spool(spool).bind(log_id)
+        except SpoolForeign:
+            refused.append(log_id)
+
+    threads = [threading.Thread(target=bind, args=(f"log-{number}",)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    bound = Spool(spool).log_id()
+    assert bound is not None
+    assert sorted([*refused, bound]) == [f"log-{number}" for number in range(8)]
+
+
+def test_strangers_in_the_spool_are_named_and_left_alone(spool: Path, queue: RecorderQueue) -> None:
+    (spool / "notes.txt").write_text("mine")
+    (spool / "0190f0f0-0000-7000-8000-000000000000").mkdir()
+    (spool / "lost+found").mkdir()
+    Spool(spool).bind("log")
+    assert [path.name for path in Spool(spool).strangers()] == [
+        "0190f0f0-0000-7000-8000-000000000000",
+        "lost+found",
+        "notes.txt",
+    ]
+    assert [each.path for each in Spool(spool).recorders()] == [queue.folder]
+
+
+def test_a_file_where_the_spool_belongs_is_one_clear_line(tmp_path: Path) -> None:
+    blocking = tmp_path / "blocking"
+    blocking.touch()
+    for path in (blocking, blocking / "spool"):
+        for attempt in (Spool(path).recorders, Spool(path).strangers, lambda path=path: Spool(path).bind("log")):
+            with pytest.raises(SpoolUnavailable) as refused:
+                attempt()
+            assert str(blocking) in str(refused.value)
+            assert "\n" not in str(refused.value)

@@ -1,0 +1,137 @@
+"""What the tests of the queue write with: names, a clock that stands still, small files, and what a crash leaves."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from pycrorm_async.clock import Clock
+from pycrorm_async.config import Settings
+from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
+from pycrorm_async.queue import RecorderQueue, RecoveredQueue, open_dead
+from pycrorm_async.queue.appender import Appender
+from pycrorm_async.queue.capacity import Capacity
+
+WALL_NS = 1_700_000_000_123_456_789
+MONOTONIC_NS = 987_654_321
+STILL = Clock(wall_ns=lambda: WALL_NS, monotonic_ns=lambda: MONOTONIC_NS)
+
+SMALL = Settings(
+    sync_interval_ms=5,
+    segment_bytes=4096,
+    spool_bytes_max=8 * 4096,
+    spool_reserve_bytes=2 * 4096,
+    record_bytes_max=2048,
+)
+
+RECORDER = episode_id(1_700_000_000_000_000_000, b"recorder..")
+
+
+def episode(number: int) -> EpisodeId:
+    """The n-th episode's id; ids sort by number."""
+    return episode_id(1_700_000_000_000_000_000 + number * 1_000_000, b"an episode")
+
+
+def started(number: int = 1) -> Heading:
+    return Heading(episode(number), "EpisodeStarted", 1)
+
+
+def ended(number: int = 1) -> Heading:
+    return Heading(episode(number), "EpisodeEnded", 1)
+
+
+def node(number: int = 1) -> Heading:
+    return Heading(episode(number), "NodeStarted", 1)
+
+
+DECLARED = Heading(None, "DesignatorTypeDeclared", 1)
+
+
+def record(position: int, heading: Heading, sequence: int, payload: bytes) -> Record:
+    """The record that a queue with the clock that stands still makes of a heading."""
+    return Record(position, heading.episode, sequence, *heading[1:], WALL_NS, MONOTONIC_NS, payload)
+
+
+def lost(position: int, number: int, sequence: int) -> Record:
+    """The computed end of an episode."""
+    return record(position, ended(number), sequence, b'{"status":"LOST"}')
+
+
+def make(spool: Path, *, settings: Settings = SMALL, clock: Clock = STILL) -> RecorderQueue:
+    return RecorderQueue.create(spool, settings=settings, clock=clock, recorder=RECORDER)
+
+
+def as_left_by_a_kill(queue: RecorderQueue, spool: Path) -> Path:
+    """The folder as `kill -9` would leave it now: its files, unlocked, in another spool."""
+    folder = spool / episode_text(RECORDER)
+    shutil.copytree(queue.folder, folder)
+    return folder
+
+
+async def drain(queue: RecorderQueue | RecoveredQueue, *, events_max: int = 10_000) -> list[Record]:
+    """All that is left, without acknowledging; a live queue must be closed."""
+    records: list[Record] = []
+    while batch := await queue.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0):
+        records += batch
+    return records
+
+
+async def recover(folder: Path) -> list[Record]:
+    """All that recovery gives, the folder left as it is."""
+    recovered = open_dead(folder)
+    assert recovered is not None
+    try:
+        return await drain(recovered)
+    finally:
+        recovered.release()
+
+
+class Author:
+    """Writes a folder step by step, with no thread that syncs: each step of a sync is the test's own.
+
+    `records` is what was put; `places` where each stands: (file, offset, size).
+    """
+
+    def __init__(self, spool: Path, *, settings: Settings = SMALL) -> None:
+        self.folder = spool / episode_text(RECORDER)
+        self.folder.mkdir(parents=True)
+        (self.folder / "alive").touch()
+        self.appender = Appender(
+            folder=self.folder,
+            recorder=RECORDER,
+            capacity=Capacity.of(settings),
+            clock=STILL,
+            wake=lambda: None,
+            hurry=lambda: None,
+        )
+        self.records: list[Record] = []
+        self.places: list[tuple[Path, int, int]] = []
+
+    def put(self, heading: Heading, payload: bytes = b"{}") -> None:
+        sequence = self.appender.put(heading, payload, True)
+        self.records.append(record(len(self.records) + 1, heading, sequence, payload))
+        size = 64 + -(-(len(heading.type) + len(payload)) // 8) * 8
+        self.places.append((self.appender.begun[-1].path, self.appender._offset - size, size))
+
+    def sync(self) -> None:
+        span = self.appender.begin_sync()
+        for segment in span.segments:
+            segment.sync()
+        self.appender.append_commit(span).sync()
+        self.appender.end_sync(span)
+
+    @property
+    def segments(self) -> list[Path]:
+        return [begun.path for begun in self.appender.begun]
+
+    @property
+    def end(self) -> int:
+        """Where the next frame goes in the last segment."""
+        return self.appender._offset
+
+
+def overwrite(path: Path, offset: int, content: bytes) -> None:
+    with path.open("rb+") as file:
+        file.seek(offset)
+        file.write(content)
