@@ -14,7 +14,7 @@ Descend from `Action` or `Motion` to map a designator of your own; its table is 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, declared_attr, mapped_column, relationship
@@ -22,6 +22,9 @@ from sqlalchemy.orm import Mapped, declared_attr, mapped_column, relationship
 from pycrorm_async.orm.base import Base, ProcessMetaData, RobotState
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import ClassOfRow, JsonText
+
+if TYPE_CHECKING:
+    from pycrorm_async.orm.tree import TaskTreeNode
 
 __all__ = ["ParameterItem", "Designator", "Action", "Motion"]
 
@@ -81,6 +84,8 @@ class Designator(Base):
         items: the entries of its list and dict fields.
         parameters: its fields as they were recorded. Not loaded unless asked for: `undefer(Action.parameters)`, or
             `await action.awaitable_attrs.parameters`.
+        node: its node of the task tree, above all to join: `select(...).join(PickUpAction.node)`. Not loaded unless
+            asked for: `selectinload(Action.node)`, or `await action.awaitable_attrs.node`.
     """
 
     __tablename__ = "designator"
@@ -110,6 +115,9 @@ class Designator(Base):
         viewonly=True, lazy="selectin", order_by=(ParameterItem.field, ParameterItem.position)
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    node: Mapped[TaskTreeNode] = relationship(
+        primaryjoin="foreign(Designator.id) == TaskTreeNode.id", viewonly=True, lazy="select"
+    )
 
     def entries(self, field: str) -> list[Any]:
         """The values of a list field, in order."""

@@ -22,7 +22,8 @@ class TaskTreeNode(Base):
 
     Attributes:
         action: what was performed, an `Action`, a `Motion` or another `Designator`; None at the root of an episode.
-        parent: the node it ran inside, loaded one level up; further ones by `await node.awaitable_attrs.parent`.
+        parent: the node it ran inside, loaded for what a query is about; of nodes that come with something else, and
+            of parents, by `await node.awaitable_attrs.parent`.
         end_time: None while it runs, and for ever if it was LOST.
         start_ns, end_ns: monotonic time, for exact durations.
         reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
