@@ -146,6 +146,8 @@ class Memory:
     async def _open(self) -> None:
         address = self._stack.enter_context(self._address.located())
         self._address = address
+        # The database first: where it is refused, no spool is made beside it.
+        await (await EventLog.open(address, create=True, clock=self._clock)).close()
         self._spool = Spool(self._spool_path or address.default_spool)
         self._queue = RecorderQueue.create(
             self._spool.path,

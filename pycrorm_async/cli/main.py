@@ -12,6 +12,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import logging
 from collections.abc import Callable
@@ -62,6 +63,9 @@ def _told_in_a_line(verb: Callable[..., int | None]) -> Callable[..., None]:
         except KeyboardInterrupt:
             problem("interrupted; what was recorded up to here is kept")
             code = 130
+        except asyncio.CancelledError:
+            problem("the plan was cancelled; what was recorded up to there is kept")
+            code = 1
         raise typer.Exit(code)
 
     return told

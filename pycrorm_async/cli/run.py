@@ -12,7 +12,7 @@ import typer
 from pycrorm_async.cli.loading import LoadedPlan, load_plan
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
-from pycrorm_async.errors import EpisodeParked, PycrormError
+from pycrorm_async.errors import EpisodeParked
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.questions import EpisodeSummary
 
@@ -66,9 +66,7 @@ async def _remembered(
             else:
                 async with memory.episode(description=description, plan=loaded.name, seed=seed):
                     await loaded.function()
-        except PycrormError:
-            raise
-        except Exception as error:
+        except Exception as error:  # noqa: BLE001  a plan may raise anything; it is told in one line
             failure = error
         try:
             await memory.flush()

@@ -9,7 +9,7 @@ import pytest
 
 from tests.commands import environment
 
-SCRIPT = '''
+SCRIPT = """
 import asyncio, json, re, sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +46,7 @@ async def main(url, total):
     print(json.dumps({"sizes": sizes, "rows": list(rows), "done": done}))
 
 asyncio.run(main(sys.argv[1], int(sys.argv[2])))
-'''
+"""
 
 
 @pytest.mark.parametrize("total", [100_000])

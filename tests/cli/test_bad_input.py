@@ -1,0 +1,258 @@
+"""Bad input gets one line that says who is at fault, the documented exit code, and loses nothing recorded."""
+
+import os
+import signal
+import sqlite3
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+
+PLANS = '''
+import asyncio, math, os, sys
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract, NavigateActionPerformable, PlanFailure, simulated_robot
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+    weight: float = 0.0
+    async def perform(self):
+        return None
+
+async def plan():
+    """Take a note."""
+    await NoteActionPerformable("a").perform()
+
+def sync():
+    pass
+
+async def greedy(memory, world):
+    pass
+
+async def raises():
+    await NoteActionPerformable("a").perform()
+    raise ValueError("the milk is sour")
+
+async def fails():
+    await NoteActionPerformable("a").perform()
+    raise PlanFailure("the milk is out of reach")
+
+async def cancels():
+    await NoteActionPerformable("a").perform()
+    asyncio.current_task().cancel()
+    await asyncio.sleep(1)
+
+async def nan_in_a_pose():
+    await NoteActionPerformable("a").perform()
+    with BulletWorld(), simulated_robot:
+        Object("pr2", ObjectType.ROBOT)
+        await NavigateActionPerformable(Pose([math.nan, 0, 0])).perform()
+
+async def unrecordable():
+    await NoteActionPerformable("a").perform()
+    await NoteActionPerformable("b", weight="heavy").perform()
+
+async def reserved():
+    @dataclass
+    class BadActionPerformable(ActionAbstract):
+        robot_state: str
+        async def perform(self):
+            return None
+    await NoteActionPerformable("a").perform()
+    await BadActionPerformable("x").perform()
+
+async def twins():
+    @dataclass
+    class NoteAction(ActionAbstract):
+        async def perform(self):
+            return None
+    await NoteActionPerformable("a").perform()
+    await NoteAction().perform()
+
+async def two_episodes(memory):
+    async with memory.episode(description="outer"):
+        await NoteActionPerformable("a").perform()
+        async with memory.episode(description="inner"):
+            pass
+
+async def leaves():
+    await NoteActionPerformable("a").perform()
+    sys.exit(5)
+
+async def endless():
+    """Never suspends."""
+    while True:
+        await NoteActionPerformable("a").perform()
+        os.write(1, b".")
+'''
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "plans.py").write_text(PLANS)
+    (tmp_path / "broken.py").write_text("import math\nmath.no_such_thing\n")
+    (tmp_path / "wrong.py").write_text("def plan(:\n")
+    (tmp_path / "leaving.py").write_text("raise SystemExit(4)\n")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "line"),
+    [
+        (["run", "plans.py", "--url", "mongodb://lab/memory"], 2, "mongodb:// is not a database we know"),
+        (["episodes", "--url", "sqlite"], 2, "this is not a database URL"),
+        (["run", "plans.py", "--url", "sqlite:////no/such/folder/x.db"], 3, "/no/such/folder"),
+        (["episodes", "--url", "sqlite:///none.db"], 3, "none.db does not exist"),
+        (["show", "1", "--url", "sqlite:///none.db"], 3, "none.db does not exist"),
+        (["run", "none.py"], 2, "no plan file 'none.py'"),
+        (["run", "broken.py"], 2, "broken.py:2 does not import: AttributeError: module 'math' has no attribute"),
+        (["run", "wrong.py"], 2, "wrong.py:1 does not import: SyntaxError"),
+        (["run", "leaving.py"], 2, "leaving.py leaves the program when it is imported (exit 4)"),
+        (["run", "plans.py:none"], 2, "plans.py has no function 'none'; it has plan,"),
+        (["run", "plans.py:sync"], 2, "plans.py:sync is not an async function: write `async def sync()`"),
+        (["run", "plans.py:greedy"], 2, "plans.py:greedy takes memory, world: a plan takes the memory, or nothing"),
+        (["writer"], 2, "--once"),
+        (["writer", "--once", "--url", "sqlite://"], 2, "nothing to recover"),
+        (["run", "plans.py", "--spool", "plans.py"], 3, "plans.py"),
+    ],
+)
+def test_a_call_that_cannot_be_carried_out_is_one_line(
+    folder: Path, arguments: list[str], code: int, line: str
+) -> None:
+    done = pycrorm(*arguments, cwd=folder)
+    assert line in one_line_of(done)
+    assert done.returncode == code
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("function", "line", "status"),
+    [
+        ("raises", "the plan plans.py:raises failed: ValueError: the milk is sour (plans.py:", "ERROR"),
+        ("fails", "the plan plans.py:fails failed: PlanFailure: the milk is out of reach (plans.py:", "FAILED"),
+        ("cancels", "the plan was cancelled", "INTERRUPTED"),
+        ("nan_in_a_pose", "NavigateAction.target_location cannot be recorded: the pose holds", "ERROR"),
+        ("unrecordable", "NoteAction.weight cannot be recorded: a str stands where a float was declared", "ERROR"),
+        ("reserved", "BadActionPerformable cannot be declared: field 'robot_state' has a reserved name", "ERROR"),
+        ("twins", "plans.NoteActionPerformable is 'NoteAction' already", "ERROR"),
+        ("two_episodes", "is open in this task already", "ERROR"),
+    ],
+)
+def test_a_plan_that_goes_wrong_ends_with_one_line_and_what_it_did_is_remembered(
+    folder: Path, function: str, line: str, status: str
+) -> None:
+    done = pycrorm("run", f"plans.py:{function}", cwd=folder)
+    assert line in one_line_of(done)
+    assert done.returncode == 1
+    shown = answer("show", "last", cwd=folder)
+    assert shown["episode"]["status"] == status
+    notes = [node for node in shown["tree"] if node["dtype"] == "NoteAction"]
+    assert [(node["parameters"]["text"], node["status"]) for node in notes] == [("a", "SUCCEEDED")]
+
+
+def test_a_plan_that_leaves_the_program_keeps_its_exit_code_and_its_record(folder: Path) -> None:
+    done = pycrorm("run", "plans.py:leaves", cwd=folder)
+    assert done.returncode == 5
+    assert "Traceback" not in done.stderr
+    shown = answer("show", "last", cwd=folder)
+    assert shown["episode"]["status"] == "ERROR"
+    assert [node["status"] for node in shown["tree"]] == ["ERROR", "SUCCEEDED"]
+
+
+def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(folder: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "run", "plans.py:endless"],
+        cwd=folder,
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        bufsize=0,
+    )
+    assert process.stdout is not None
+    assert process.stderr is not None
+    assert process.stdout.read(1) == b"."
+    time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    dots = 1
+    while chunk := process.stdout.read(1 << 16):
+        dots += chunk.count(b".")
+    errors = process.stderr.read().decode()
+    process.stdout.close()
+    process.stderr.close()
+    assert process.wait(30) == 130
+    assert errors.splitlines() == ["pycrorm: interrupted; what was recorded up to here is kept"]
+    shown = answer("show", "last", cwd=folder)
+    assert shown["episode"]["status"] == "INTERRUPTED"
+    notes = [node for node in shown["tree"] if node["dtype"] == "NoteAction"]
+    ended = [node for node in notes if node["status"] == "SUCCEEDED"]
+    assert len(ended) == dots
+    assert len(notes) - len(ended) <= 1
+    assert shown["tree"][0]["status"] == "CANCELLED"
+
+
+def test_a_database_of_another_program_is_left_alone(folder: Path) -> None:
+    other = folder / "other.db"
+    with sqlite3.connect(other) as connection:
+        connection.execute("CREATE TABLE recipe (name TEXT)")
+    connection.close()
+    before = other.read_bytes()
+    for arguments in (["run", "plans.py"], ["episodes"], ["writer", "--once"]):
+        done = pycrorm(*arguments, "--url", "sqlite:///other.db", cwd=folder)
+        assert "other.db" in one_line_of(done)
+        assert done.returncode == 3
+    assert other.read_bytes() == before
+
+
+def test_a_file_that_is_no_database_is_left_alone(folder: Path) -> None:
+    for arguments in (["run", "plans.py"], ["episodes"]):
+        done = pycrorm(*arguments, "--url", "sqlite:///plans.py", cwd=folder)
+        assert "plans.py" in one_line_of(done)
+        assert done.returncode == 3
+    assert (folder / "plans.py").read_text() == PLANS
+
+
+def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    with sqlite3.connect(folder / "pycrorm.db") as connection:
+        connection.execute("UPDATE pycrorm_log SET format = 99")
+    connection.close()
+    for arguments in (["run", "plans.py"], ["episodes"]):
+        done = pycrorm(*arguments, cwd=folder)
+        assert "newer" in one_line_of(done)
+        assert done.returncode == 3
+
+
+def test_a_spool_of_another_database_is_refused_and_nothing_in_it_is_lost(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", "--spool", "spool", cwd=folder).returncode == 0
+    done = pycrorm("run", "plans.py", "--spool", "spool", "--url", "sqlite:///second.db", cwd=folder)
+    assert "belongs to log" in one_line_of(done)
+    assert done.returncode == 3
+
+
+@pytest.mark.parametrize("episode", ["99", "abcdef", "last"])
+def test_an_unknown_episode_is_a_usage_error(folder: Path, episode: str) -> None:
+    assert pycrorm("writer", "--once", cwd=folder).returncode == 0
+    done = pycrorm("show", episode, cwd=folder)
+    assert f"no episode {episode!r}" in one_line_of(done)
+    assert done.returncode == 2
+
+
+def test_nothing_is_left_in_the_spool_of_a_plan_that_ended(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    assert [path for path in (folder / "pycrorm.db.spool").iterdir() if path.is_dir()] == []
+
+
+def test_the_settings_may_come_from_the_environment(folder: Path) -> None:
+    settings = environment() | {"PYCRORM_URL": "sqlite:///mine.db", "PYCRORM_SPOOL": "mine.spool"}
+    done = subprocess.run(
+        [*COMMAND, "run", "plans.py"], cwd=folder, env=settings, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (folder / "mine.db").exists()
+    assert (folder / "mine.spool").is_dir()
+    assert not os.path.lexists(folder / "pycrorm.db")
