@@ -187,10 +187,10 @@ async def test_the_demo_is_remembered_as_it_was(tmp_path: Path) -> None:
                 ("attached", "pr2", "cereal"),
                 ("detached", "pr2", "cereal"),
             ]
-            torso = (
+            lifted = (
                 await session.scalars(select(JointChange.position).where(JointChange.joint == "torso_lift_joint"))
             ).all()
-            assert torso == [0.3]
+            assert lifted == [0.3]
             locations = (await session.scalars(select(LocationResolution).order_by(LocationResolution.id))).all()
             assert [each.location for each in locations] == [
                 "CostmapLocation",
