@@ -34,7 +34,7 @@ async def append_batch(connection: AsyncConnection, records: Sequence[Record]) -
     known, refusals = await _known(connection, batch)
     steps = {each: step(batch.episodes[each], row) for each, row in known.items()}
     await _insert_events(connection, steps.values())
-    changed = [each.after for identity, each in steps.items() if each.after != known[identity] or not each.again]
+    changed = [each.after for identity, each in steps.items() if each.after != known[identity]]
     if changed:
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(row) for row in changed]),))
     await _compare(connection, [each for each in steps.values() if each.again])

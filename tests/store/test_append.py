@@ -91,6 +91,8 @@ async def test_an_episode_knows_when_it_started_and_ended(log: EventLog) -> None
     assert ask(log.address.path, HEADS) == [(1, name(1), 2, 0, 100, None, None, None)]
     await log.append([record(episode(1), 3, wall_ns=300, kind="EpisodeEnded")])
     assert ask(log.address.path, HEADS) == [(1, name(1), 3, 0, 100, 300, None, None)]
+    await log.append([record(episode(1), 4, wall_ns=400, kind="NodeEnded")])
+    assert ask(log.address.path, HEADS) == [(1, name(1), 4, 0, 100, 300, None, None)]
 
 
 async def test_an_empty_batch_is_no_transaction(log: EventLog) -> None:
@@ -283,6 +285,16 @@ async def test_a_database_locked_by_another_writer_is_away_and_takes_the_batch_a
 async def test_a_file_removed_below_the_log_is_an_unavailable_database_not_a_success(log: EventLog) -> None:
     await log.append(run_of(episode(1), 1, 3))
     log.address.path.unlink()
+    with pytest.raises(DatabaseUnavailable, match="the file was removed or replaced while it was open"):
+        await log.append(run_of(episode(1), 4, 5))
+
+
+async def test_a_file_replaced_below_the_log_is_an_unavailable_database_not_a_success(
+    log: EventLog,
+) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    log.address.path.rename(log.address.path.with_suffix(".old"))
+    log.address.path.touch()
     with pytest.raises(DatabaseUnavailable, match="the file was removed or replaced while it was open"):
         await log.append(run_of(episode(1), 4, 5))
 

@@ -239,6 +239,7 @@ async def test_damage_is_raised_at_every_flush_and_at_close_while_the_plan_goes_
             await writer.flush(3)
         source.put(run_of(episode(2), 1, 3, position=4))
     assert writer.state.failure == (f"episode {name(1)}, event 1: another event is stored under this number already")
+    assert writers_alive() == ["pycrorm writer robot"]
     source.close()
     with pytest.raises(LogDamaged):
         await writer.close()
@@ -370,12 +371,21 @@ async def test_a_damaged_folder_of_somebody_else_is_shown_and_not_raised(address
 
 
 async def test_closing_does_not_wait_for_somebody_elses_records(address: DatabaseAddress) -> None:
-    endless = KeptSource(run_of(episode(2), 1, 5), name="never closed")
+    let_go: list[str] = []
+
+    def found() -> Iterator[Source]:
+        try:
+            yield KeptSource(run_of(episode(2), 1, 5), name="never closed")
+        finally:
+            let_go.append("never closed")
+
+    folders = found()
     source = KeptSource(run_of(episode(1), 1, 3))
-    writer = writer_for(source, address, adopt=[endless])
+    writer = writer_for(source, address, adopt=folders)
     await writer.start()
     await until_asked(address.path, "SELECT count(*) FROM event", [(8,)])
     source.close()
     await writer.close()
     assert writers_alive() == []
+    assert let_go == ["never closed"]
     assert ask(address.path, "SELECT id, folded FROM episode ORDER BY id") == [(name(1), 3), (name(2), 5)]

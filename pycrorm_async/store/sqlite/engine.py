@@ -6,9 +6,11 @@ writing transaction takes the write lock at once, so it waits at the start or no
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from typing import Any
 
+import aiosqlite
 from sqlalchemy import URL, Connection, event
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 
@@ -25,14 +27,10 @@ _WRITE_PRAGMAS = (
 
 def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncEngine:
     """An engine for the file at this absolute path, which must exist: connecting never makes one."""
-    url = URL.create(
-        "sqlite+aiosqlite",
-        database=path.as_uri(),
-        query={"mode": "ro" if read_only else "rw", "uri": "true"},
-    )
+    uri = f"{path.as_uri()}?mode={'ro' if read_only else 'rw'}"
     engine = create_async_engine(
-        url,
-        connect_args={"timeout": busy_timeout_s, "isolation_level": None},
+        URL.create("sqlite+aiosqlite", database=str(path)),
+        async_creator=lambda: _connect(uri, busy_timeout_s),
         execution_options={BEGIN: "BEGIN" if read_only else "BEGIN IMMEDIATE"},
         hide_parameters=True,
     )
@@ -41,6 +39,19 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
     if not read_only:
         event.listen(engine.sync_engine, "connect", _set_write_pragmas)
     return engine
+
+
+async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
+    connection = aiosqlite.connect(uri, uri=True, isolation_level=None, timeout=busy_timeout_s)
+    thread = connection._thread  # noqa: SLF001 - as SQLAlchemy's own connecting does: there is no public way to it
+    thread.daemon = True
+    try:
+        return await connection
+    except BaseException:
+        # The thread reports its end to this loop; if the loop were gone by then, a traceback of it would be printed.
+        while thread.is_alive():  # noqa: ASYNC110 - a thread sets no event of ours
+            await asyncio.sleep(0.001)
+        raise
 
 
 def _begin(connection: Connection) -> None:
