@@ -132,10 +132,10 @@ class _Walk:
         later = self._cut.position - frame.position
         if later < 0:
             raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was safe and is missing")
-        covered = self._unsaid[: len(self._unsaid) - later]
+        covered = self._unsaid[: max(0, len(self._unsaid) - later)]
         self._unsaid = self._unsaid[len(covered) :]
         if len(covered) < frame.sequence:
-            return  # the segments its first records were in are stored and gone
+            return  # segments with records it covers are stored and gone
         checksum = 0
         for each in covered:
             checksum = chain(each, checksum)

@@ -43,8 +43,13 @@ class Machine:
         sequence = self._sequences[number] = self._sequences.get(number, 0) + 1
         assert self.queue.put_nowait(heading, payload, reserved=True) == sequence
         self.put_so_far.append(record(len(self.put_so_far) + 1, heading, sequence, payload))
-        for path in self._files():
-            self._since.setdefault(path, []).append(path.read_bytes())
+        path = self.queue._appender.begun[-1].path
+        self._since.setdefault(path, []).append(path.read_bytes())
+
+    def put_meanwhile(self) -> None:
+        """What other threads put while the sync thread takes its turn: nothing, a little, or what rolls a segment."""
+        for size in self._rng.choice([[], [], [], [], [], [10], [3000], [10, 3000]]):
+            self.put(1, node(1), b"m" * size)
 
     def synced(self, path: Path) -> None:
         self._safe[path], self._since[path] = path.read_bytes(), []
@@ -108,19 +113,17 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> Itera
 
     def watched(segment: Segment) -> None:
         machine.cut()
-        if machine._rng.random() < 0.5:
-            machine.put(1, node(1), b"s" * machine._rng.choice([10, 10, 3000]))
-        machine.cut()
+        machine.put_meanwhile()
         sync(segment)
         machine.synced(segment.path)
+        machine.put_meanwhile()
         machine.cut()
 
     begin_sync = Appender.begin_sync
 
     def begun(appender: Appender) -> Span:
         span = begin_sync(appender)
-        if machine._rng.random() < 0.3:
-            machine.put(1, node(1), b"z" * 3000)
+        machine.put_meanwhile()
         return span
 
     monkeypatch.setattr(Segment, "sync", watched)
@@ -130,12 +133,12 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> Itera
     machine.queue._reader.close()
 
 
-@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(8, 300))])
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(6, 200))])
 async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(machine: Machine, seed: int) -> None:
     rng = random.Random(seed + 1000)
     for number in (1, 2, 3):
         machine.put(number, started(number), b"{}")
-    for _ in range(8):
+    for _ in range(6):
         for _ in range(rng.randrange(5)):
             number = rng.choice([1, 1, 2])
             machine.put(number, node(number), b"y" * rng.randrange(1500))
@@ -152,7 +155,7 @@ async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(
     machine.put(1, ended(1), b"{}")
     machine.cut()
 
-    assert len(machine.cuts) > 30
+    assert len(machine.cuts) > 20
     for folder, synced, stored, count in machine.cuts:
         truth = machine.put_so_far[:count]
         records = await recover(folder)

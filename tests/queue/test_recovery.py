@@ -345,6 +345,16 @@ def test_a_folder_that_cannot_be_read_is_one_clear_line(author: Author) -> None:
 # --- acknowledging and removing --------------------------------------------------------------------------------
 
 
+def test_a_segment_may_only_go_when_the_header_after_it_is_safe(author: Author) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    assert [each.number for each in author.appender.trimmable(stored=4, safe_number=1)] == []
+    assert [each.number for each in author.appender.trimmable(stored=3, safe_number=2)] == []
+    assert [each.number for each in author.appender.trimmable(stored=4, safe_number=2)] == [1]
+    assert [each.number for each in author.appender.trimmable(stored=5, safe_number=2)] == [1]
+
+
 async def test_stored_segments_go_and_the_ends_are_the_same_from_the_header_of_the_next(author: Author) -> None:
     author.put(started(1))
     author.put(started(2))
@@ -367,6 +377,18 @@ async def test_stored_segments_go_and_the_ends_are_the_same_from_the_header_of_t
     assert author.segments[2].exists()
     recovered.remove()
     assert not author.folder.exists()
+
+
+async def test_a_commit_that_covers_only_records_that_are_stored_and_gone_is_no_damage(author: Author) -> None:
+    author.put(started())
+    span = author.appender.begin_sync()
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    author.appender.append_commit(span)
+    author.sync()
+    author.put(node(), b"after")
+    author.segments[0].unlink()
+    assert await recover(author.folder) == [*author.records[4:], lost(7, 1, 7)]
 
 
 async def test_the_end_of_an_episode_whose_records_are_all_gone_has_the_times_of_its_last_record(
