@@ -8,6 +8,7 @@ plan (measured: 872 against 123,000 a second).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -17,8 +18,9 @@ from pycrorm_async.projections.tables import physical_name
 
 __all__ = ["write_rows"]
 
-_PARAMETERS_MAX = 32_766
-"""What SQLite takes in one statement, unless it was built with another limit."""
+_PARAMETERS_MAX = 8_000
+"""In one statement. SQLite takes 32,766, but is a third slower with so many; with fewer, a busy plan is waited for more
+often."""
 
 
 async def write_rows(connection: AsyncConnection, rows: Rows, generation: int) -> None:
@@ -42,7 +44,7 @@ async def _insert(
     into = f"INSERT INTO {quote(table)} ({', '.join(map(quote, columns))}) VALUES "  # noqa: S608
     for part in _parts(rows, len(columns)):
         await connection.exec_driver_sql(
-            f"{into}{_placeholders(part)} ON CONFLICT DO NOTHING", tuple(value for row in part for value in row)
+            f"{into}{_placeholders(part)} ON CONFLICT DO NOTHING", tuple(chain.from_iterable(part))
         )
 
 
@@ -54,7 +56,7 @@ async def _update(
         await connection.exec_driver_sql(
             f"UPDATE {table} SET {changes}"  # noqa: S608
             f" FROM (VALUES {_placeholders(part)}) AS change WHERE {table}.id = change.column1",
-            tuple(value for row in part for value in row),
+            tuple(chain.from_iterable(part)),
         )
 
 
