@@ -229,7 +229,7 @@ async def test_the_same_plan_runs_without_a_memory_and_records_nothing(tmp_path:
         await breakfast()
         assert world.object("cereal").pose.distance(Pose([1.3, 0.7, 0.95])) > 1
         assert world.observers == ()
-    assert not any(tmp_path.iterdir())  # noqa: ASYNC240  a look at an empty folder
+    assert not any(tmp_path.iterdir())
 
 
 async def test_the_plan_runs_on_the_mesh_model_as_well(tmp_path: Path) -> None:
