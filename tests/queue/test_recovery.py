@@ -380,15 +380,17 @@ async def test_stored_segments_go_and_the_ends_are_the_same_from_the_header_of_t
 
 
 async def test_a_commit_that_covers_only_records_that_are_stored_and_gone_is_no_damage(author: Author) -> None:
-    author.put(started())
+    author.put(started(), b"x" * 900)
+    author.put(node(), b"x" * 900)
     span = author.appender.begin_sync()
+    author.put(node(), b"x" * 1700)
     for _ in range(4):
-        author.put(node(), b"x" * 900)
+        author.put(node(), b"x" * 100)
     author.appender.append_commit(span)
     author.sync()
-    author.put(node(), b"after")
+    assert [path for path, _, _ in author.places] == [author.segments[0]] * 3 + [author.segments[1]] * 4
     author.segments[0].unlink()
-    assert await recover(author.folder) == [*author.records[4:], lost(7, 1, 7)]
+    assert await recover(author.folder) == [*author.records[3:], lost(8, 1, 8)]
 
 
 async def test_the_end_of_an_episode_whose_records_are_all_gone_has_the_times_of_its_last_record(
