@@ -1,0 +1,57 @@
+"""What README.md shows does what it says: its plan runs, its questions are answered, its commands exist."""
+
+import asyncio
+import re
+import textwrap
+from pathlib import Path
+
+import pytest
+
+from tests.commands import answer, pycrorm
+
+README = (Path(__file__).parent.parent.parent / "README.md").read_text()
+PLAN, QUESTIONS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+
+
+def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
+    (tmp_path / "hello.py").write_text(PLAN)
+    done = pycrorm("run", "hello.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("Hello, Ada!\n")
+    shown = answer("show", "1", cwd=tmp_path)
+    assert shown["episode"]["description"] == "Say hello from the other side of the room."
+    assert [(node["dtype"], node["status"]) for node in shown["tree"]] == [
+        (None, "SUCCEEDED"),
+        ("MoveTorsoAction", "SUCCEEDED"),
+        ("MoveJointsMotion", "SUCCEEDED"),
+        ("NavigateAction", "SUCCEEDED"),
+        ("MoveMotion", "SUCCEEDED"),
+        ("GreetAction", "SUCCEEDED"),
+    ]
+
+
+async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    imports, _, rest = QUESTIONS.partition("async with Memory")
+    (tmp_path / "hello.py").write_text(PLAN)
+    monkeypatch.syspath_prepend(tmp_path)
+    exec(imports, names)
+    body = textwrap.indent("async with Memory" + rest + "    return actions, picked, greeted, frame\n", "    ")
+    exec(f"async def asked():\n{body}", names)
+    asked = names["asked"]
+    actions, picked, greeted, frame = await asked()  # type: ignore[operator]
+    assert [each.dtype for each in actions] == ["MoveTorsoAction", "NavigateAction", "GreetAction"]
+    assert picked == []
+    assert [each.whom for each in greeted] == ["Ada"]
+    assert len(frame) == 0
+    assert await asyncio.to_thread((tmp_path / "memory.db").exists)
+
+
+def test_every_verb_the_readme_names_exists(tmp_path: Path) -> None:
+    verbs = set(re.findall(r"^pycrorm (\w+)", README, re.MULTILINE))
+    assert verbs == {"demo", "run", "episodes", "show", "writer"}
+    for verb in sorted(verbs):
+        done = pycrorm(verb, "--help", cwd=tmp_path)
+        assert done.returncode == 0
+        assert "--url" in done.stdout
