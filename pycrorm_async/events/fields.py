@@ -35,8 +35,8 @@ RESERVED_COLUMNS = frozenset(
 
 RESERVED_TABLES = frozenset(
     "event episode process_metadata task_tree_node designator action motion language robot_state pose position"
-    " quaternion object object_part believe_object parameter_item attachment joint_change location_resolution"
-    " location_candidate detection pick_up_with_context_view".split()
+    " quaternion object object_removal object_part believe_object parameter_item attachment joint_change"
+    " location_resolution location_candidate detection pick_up_with_context_view pickupwithcontextview".split()
 )
 """Tables and views of the memory itself; names that begin with `pycrorm_`, `sqlite_` or `pg_` are taken as well."""
 

@@ -118,10 +118,9 @@ class DynamicClasses:
             fields = self._catalogue.fields_of(dtype)
         except Contradiction:  # the projector parks what it cannot fold; what it can is asked for without a class
             return False
-        columned = [each for each in fields if each.type in _TYPES or each.type in ("pose", "object")]
         known = self._classes.get(dtype)
         if known is not None:
-            return self._add_fields(dtype, known, columned)
+            return self._add_fields(dtype, known, fields)
         declared = self._catalogue.of_dtype(dtype)[-1]
         base = self._base(declared)
         table = Table(declared.table, self._metadata, Column("id", ForeignKey(base.__table__.c.id), primary_key=True))
@@ -136,7 +135,7 @@ class DynamicClasses:
         )
         self._classes[dtype] = made
         self._fields[dtype] = set()
-        self._add_fields(dtype, made, columned)
+        self._add_fields(dtype, made, fields)
         return True
 
     def _base(self, declared: DesignatorTypeDeclared) -> type[Designator]:
@@ -154,7 +153,7 @@ class DynamicClasses:
         new = [each for each in fields if each.name not in self._fields[dtype]]
         for field in new:
             self._fields[dtype].add(field.name)
-            if not hasattr(made, field.name):  # a base's attribute shows the same value
+            if not made.__mapper__.has_property(field.name):  # a base's attribute shows the same value
                 self._add_field(made, field)
         if new:
             for engine in self._engines:
@@ -162,6 +161,9 @@ class DynamicClasses:
         return bool(new)
 
     def _add_field(self, made: type[Designator], field: FieldDeclared) -> None:
+        if field.type in ("list", "dict"):
+            setattr(made, field.name, _entries(field))
+            return
         mapper = made.__mapper__
         table = mapper.local_table
         assert isinstance(table, Table)
@@ -184,13 +186,20 @@ class DynamicClasses:
                 lazy="selectin",
             ),
         )
-        if not hasattr(made, field.type):  # the first pose is also `pose`, the first object also `object`
+        if not mapper.has_property(field.type):  # the first pose is also `pose`, the first object also `object`
             mapper.add_property(field.type, synonym(field.name))
             mapper.add_property(f"{field.type}_id", synonym(field.column))
 
     def _introduce(self, engine: AsyncEngine) -> None:
         identities = {dtype: str(made.__mapper__.polymorphic_identity) for dtype, made in self._classes.items()}
         known_classes(engine.dialect).adopt(identities)
+
+
+def _entries(field: FieldDeclared) -> property:
+    """The values of a list field, or of a dict field by key."""
+    if field.type == "dict":
+        return property(lambda designator: designator.mapping(field.name))
+    return property(lambda designator: designator.entries(field.name))
 
 
 def _shared_class(names: Iterable[str]) -> type[Designator] | None:

@@ -5,7 +5,6 @@
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
         drain                  locked by whoever drains the folder
-        stored                 position up to which a drainer in another process has stored, decimal text
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
         00000002.segment       the last one may be made ahead: all zero
         00000001.segment.tail  what sealing cut off, kept for whoever wants to look

@@ -16,11 +16,10 @@ from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.segment import segment_numbers, segment_path, sync_folder
 
-__all__ = ["ALIVE", "DRAIN", "STORED", "MAKING", "TAIL", "available", "make_folder", "remove_folder", "write_safely"]
+__all__ = ["ALIVE", "DRAIN", "MAKING", "TAIL", "available", "make_folder", "remove_folder", "write_safely"]
 
 ALIVE: Final = "alive"
 DRAIN: Final = "drain"
-STORED: Final = "stored"
 MAKING: Final = ".making"
 TAIL: Final = ".tail"
 
@@ -57,7 +56,7 @@ def remove_folder(folder: Path) -> None:
     for path in list(folder.iterdir()):
         if path.suffix in {MAKING, TAIL}:
             path.unlink()
-    for name in (STORED, DRAIN, ALIVE):
+    for name in (DRAIN, ALIVE):
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()

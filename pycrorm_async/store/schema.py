@@ -55,7 +55,9 @@ async def make_or_migrate(engine: AsyncEngine, name: str, *, birth: Birth, migra
         # Not before the database is known to be ours or empty: the journal mode is a lasting change of the file.
         await connection.execution_options(**{BEGIN: None})
         await _look(connection, name, len(migrations))
-        await connection.exec_driver_sql(sql.USE_WAL)
+        mode = (await connection.exec_driver_sql(sql.USE_WAL)).scalar_one()
+        if mode != "wal":
+            raise DatabaseUnavailable(f"{name}: SQLite cannot keep a write-ahead log there (a network folder?)")
     async with engine.begin() as connection:
         found = await _look(connection, name, len(migrations))
         for statements in migrations[found.format if found else 0 :]:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import random
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
+from typing import NamedTuple, TypeVar
 
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
@@ -17,6 +17,8 @@ from pycrorm_async.writer.drain import Drain, DrainState, to_the_end
 from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["LiveWriter", "WriterState"]
+
+_T = TypeVar("_T")
 
 
 class WriterState(NamedTuple):
@@ -67,7 +69,7 @@ class LiveWriter:
 
         Raises what stopped the appending, or `EpisodeParked` for episodes that stopped since this began.
         """
-        self._stopped_before = await self._destination.stopped()
+        self._stopped_before = await self._patiently(self._destination.stopped)
         async with asyncio.TaskGroup() as tasks:
             others = (
                 tasks.create_task(self._fold_when_idle(), name="pycrorm fold when idle"),
@@ -121,25 +123,26 @@ class LiveWriter:
             raise self._failure
 
     async def _raise_stopped(self) -> None:
-        stopped = {**self._drain.state.refused, **await self._destination.stopped()}
+        stopped = {**self._drain.state.refused, **await self._patiently(self._destination.stopped)}
         news = {episode: reason for episode, reason in stopped.items() if episode not in self._stopped_before}
         if news:
             raise EpisodeParked(news)
 
     async def _fold(self) -> None:
-        """Folds all there is, asking again while the database is away; the caller bounds the time."""
+        async with self._folding:
+            await self._patiently(self._destination.fold)
+        self._fold_error = None
+
+    async def _patiently(self, ask: Callable[[], Awaitable[_T]]) -> _T:
+        """Asks again while the database is away; the caller bounds the time."""
         attempt = 0
         while True:
             try:
-                async with self._folding:
-                    await self._destination.fold()
+                return await ask()
             except DatabaseUnavailable as error:
                 attempt += 1
                 self._fold_error = str(error)
                 await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0)
-            else:
-                self._fold_error = None
-                return
 
     async def _fold_when_idle(self) -> None:
         self._news.set()  # something may have been left behind before

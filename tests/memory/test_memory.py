@@ -7,6 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import func, select
@@ -51,8 +52,8 @@ class GentlePickUpActionPerformable(PickUpActionPerformable):
 
 async def texts(memory: Memory | Reading) -> list[str]:
     async with memory.session() as session:
-        notes = memory.mapped(NoteActionPerformable)
-        return list(await session.scalars(select(notes.text).order_by(notes.id)))  # type: ignore[attr-defined]
+        notes: Any = memory.mapped(NoteActionPerformable)
+        return list(await session.scalars(select(notes.text).order_by(notes.id)))
 
 
 def url_of(folder: Path) -> str:
@@ -282,6 +283,7 @@ async def test_a_subclass_of_an_action_is_found_as_that_action(tmp_path: Path) -
             assert type(picked).__name__ == "GentlePickUpAction"
             assert (picked.arm, picked.grasp, picked.force) == (Arms.RIGHT, Grasp.TOP, 0.5)  # type: ignore[attr-defined]
             assert picked.object.dtype == "BelieveObject"
+            assert picked.object.pose is not None
             assert (picked.object.name, picked.object.pose.position.z) == ("cup", 3.0)
 
 

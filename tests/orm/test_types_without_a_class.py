@@ -127,6 +127,29 @@ async def test_a_class_is_made_for_it_with_its_fields(log: EventLog) -> None:
         assert nodes[0].action.via.position.x == 7.0
 
 
+async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_they_are_called(log: EventLog) -> None:
+    trip = declared(
+        "TripAction",
+        "trip_action",
+        field("stops", "list", 2, item="pose"),
+        field("loads", "dict", 3, item="integer"),
+        field("entries", "text", 4),
+        field("start", "pose", 5),
+        field("end", "pose", 6),
+    )
+    script = Script()
+    stops, loads = [pose(1), pose(2)], {"milk": 2, "cup": 1}
+    parameters = {"stops": stops, "loads": loads, "entries": "x", "start": pose(3), "end": pose(4)}
+    script.put(NodeStarted("action", None, name_of(trip), parameters))
+    await stored_and_folded(log, [*declarations(trip), *script.records])
+    async with classes_of(log):
+        (found,) = await every(log, select(Action))
+        assert (found.start.position.x, found.end.position.x) == (3.0, 4.0)
+        assert (found.pose is found.start, found.pose_id, found.end_id) == (True, row(1, 5), row(1, 6))
+        assert found.entries == "x"
+        assert found.loads == {"milk": 2, "cup": 1}
+
+
 async def test_a_class_is_found_by_type_table_or_designator(log: EventLog) -> None:
     class SayingActionPerformable:
         dtype = "SayingAction"

@@ -155,11 +155,11 @@ async def test_the_demo_is_remembered_as_it_was(tmp_path: Path) -> None:
             # 3. all actions, polymorphically
             actions = (await session.scalars(select(Action).order_by(Action.id))).all()
             assert [each.dtype for each in actions] == [each[0] for each in witness.seen] + ["SayingAction"]
-            for row, (name, robot_pose, torso, _) in zip(actions, witness.seen, strict=False):
-                assert type(row).__name__ == name
-                assert row.robot_state is not None
-                assert same(row.robot_state.pose, robot_pose)
-                assert row.robot_state.torso_height == torso
+            for action, (name, robot_pose, torso, _) in zip(actions, witness.seen, strict=False):
+                assert type(action).__name__ == name
+                assert action.robot_state is not None
+                assert same(action.robot_state.pose, robot_pose)
+                assert action.robot_state.torso_height == torso
             assert actions[-1].robot_state is None
 
             # 4. the poses of objects that were picked up, at that moment

@@ -287,6 +287,34 @@ async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) ->
     assert writers_alive() == []
 
 
+async def test_a_database_away_while_folding_is_asked_again(address: DatabaseAddress) -> None:
+    class OftenAway(Passing):
+        asked = 0
+
+        async def fold(self) -> int:
+            self.asked += 1
+            if self.asked % 3:
+                raise DatabaseUnavailable("the database is locked")
+            return await super().fold()
+
+        async def stopped(self) -> Mapping[str, str]:
+            self.asked += 1
+            if self.asked % 3:
+                raise DatabaseUnavailable("the database is locked")
+            return await super().stopped()
+
+    source = KeptSource(run_of(episode(1), 1, 5))
+    writer = WriterThread(
+        source=source, open_destination=opener(address, around=OftenAway), adopt=nobody, settings=NEVER_IDLE
+    )
+    await writer.start()
+    await writer.flush(5)
+    assert ask(address.path, HEADS) == [(name(1), 5, 5)]
+    assert writer.state.fold_error is None
+    source.close()
+    await writer.close()
+
+
 async def test_a_cancelled_flush_stops_the_waiting_and_not_the_work(address: DatabaseAddress) -> None:
     entered, release = threading.Event(), threading.Event()
 
