@@ -197,9 +197,8 @@ class DynamicClasses:
 
 def _entries(field: FieldDeclared) -> property:
     """The values of a list field, or of a dict field by key."""
-    if field.type == "dict":
-        return property(lambda designator: designator.mapping(field.name))
-    return property(lambda designator: designator.entries(field.name))
+    read = Designator.mapping if field.type == "dict" else Designator.entries  # a field may have these names itself
+    return property(lambda designator: read(designator, field.name))
 
 
 def _shared_class(names: Iterable[str]) -> type[Designator] | None:

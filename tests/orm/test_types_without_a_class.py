@@ -147,6 +147,7 @@ async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_the
         assert (found.start.position.x, found.end.position.x) == (3.0, 4.0)
         assert (found.pose is found.start, found.pose_id, found.end_id) == (True, row(1, 5), row(1, 6))
         assert found.entries == "x"
+        assert [(each.x, each.frame) for each in found.stops] == [(1.0, "map"), (2.0, "map")]
         assert found.loads == {"milk": 2, "cup": 1}
 
 

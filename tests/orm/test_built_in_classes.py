@@ -1,0 +1,52 @@
+"""The mapped classes that ship agree with the designators that ship, field by field."""
+
+from __future__ import annotations
+
+import pytest
+from sqlalchemy import Table, inspect
+
+import pycrorm_async.orm
+from pycrorm_async.hooks.declaration import declared_type
+from pycrorm_async.orm import Action, Designator, Motion
+from pycrorm_async.plan import actions, motions
+from pycrorm_async.projections.classes import mapped_leaves
+from pycrorm_async.projections.layout import Layout
+
+PERFORMABLES = [getattr(module, name) for module in (actions, motions) for name in module.__all__]
+
+
+@pytest.mark.parametrize("designator", PERFORMABLES, ids=lambda each: each.dtype)
+def test_every_action_and_motion_of_a_plan_has_its_class(designator: type) -> None:
+    declaration = declared_type(designator).declaration
+    mapped = getattr(pycrorm_async.orm, declaration.dtype)
+    assert issubclass(mapped, Action if declaration.kind == "action" else Motion)
+    assert mapped.__tablename__ == declaration.table
+    table = inspect(mapped).local_table
+    assert isinstance(table, Table)
+    columned = [each for each in declaration.fields if each.type not in ("list", "dict")]
+    assert {each.name for each in table.columns} == {"id", *(each.column for each in columned)}
+    for field in declaration.fields:
+        assert hasattr(mapped, field.name), field.name
+    for kind in ("pose", "object"):
+        first = next((each for each in columned if each.type == kind), None)
+        if first is not None:
+            assert getattr(mapped, f"{kind}_id").property.columns[0].name == first.column
+            assert hasattr(mapped, kind)
+
+
+@pytest.mark.parametrize("designator", PERFORMABLES, ids=lambda each: each.dtype)
+def test_every_declaration_of_a_plan_fits_into_the_tables_of_the_classes(designator: type) -> None:
+    layout = Layout().with_leaves(mapped_leaves())
+    declaration = declared_type(designator).declaration
+    assert layout.with_declaration(declaration) == layout
+
+
+def test_the_thesis_names_are_all_there() -> None:
+    table_4_1 = (
+        "CloseAction DetectAction GraspingAction GripAction LookAtAction MoveTorsoAction NavigateAction OpenAction"
+        " ParkArmsAction PickUpAction PlaceAction ReleaseAction SetGripperAction TransportAction"
+        " AccessingMotion ClosingMotion DetectingMotion LookingMotion MoveGripperMotion MoveMotion MoveTCPMotion"
+        " OpeningMotion WorldStateDetectingMotion"
+    )
+    for name in table_4_1.split():
+        assert issubclass(getattr(pycrorm_async.orm, name), Designator), name
