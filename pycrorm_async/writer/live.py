@@ -131,18 +131,20 @@ class LiveWriter:
     async def _fold(self) -> None:
         async with self._folding:
             await self._patiently(self._destination.fold)
-        self._fold_error = None
 
     async def _patiently(self, ask: Callable[[], Awaitable[_T]]) -> _T:
         """Asks again while the database is away; the caller bounds the time."""
         attempt = 0
         while True:
             try:
-                return await ask()
+                answer = await ask()
             except DatabaseUnavailable as error:
                 attempt += 1
                 self._fold_error = str(error)
                 await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0)
+            else:
+                self._fold_error = None
+                return answer
 
     async def _fold_when_idle(self) -> None:
         self._news.set()  # something may have been left behind before
