@@ -1,8 +1,7 @@
 """Which designator types an episode's log refers to: a fold gets this as an argument and needs no user code.
 
 Declarations are named by fingerprint. One dtype may have several (a field was added, two processes differ): its columns
-unite, first declared first; a column declared with two types is a contradiction, which parks the episode that
-brought it.
+unite; a declaration that would give a column another type contradicts the ones before it, and is left out.
 """
 
 from __future__ import annotations
@@ -12,11 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared
 
-__all__ = ["Catalogue", "Contradiction"]
-
-
-class Contradiction(ValueError):
-    """Two declarations of one dtype cannot share a table."""
+__all__ = ["Catalogue"]
 
 
 class Catalogue(Mapping[str, DesignatorTypeDeclared]):
@@ -51,18 +46,16 @@ class Catalogue(Mapping[str, DesignatorTypeDeclared]):
         return tuple(each for each in self._declarations.values() if each.dtype == dtype)
 
     def fields_of(self, dtype: str) -> tuple[FieldDeclared, ...]:
-        """The united fields of a dtype. Raises `Contradiction` naming the column and both types."""
+        """The united fields of a dtype, without those of a declaration that contradicts an earlier one."""
         united: dict[str, FieldDeclared] = {}
         for declaration in self.of_dtype(dtype):
-            for field in declaration.fields:
-                known = united.setdefault(field.name, field)
-                if (known.type, known.item) != (field.type, field.item):
-                    raise Contradiction(
-                        f"{dtype}.{field.name} is declared as {known.type} and as {field.type}"
-                        " (types that share a name must agree: rename one field or set another dtype)"
-                    )
+            if all(_agree(field, united.get(field.name, field)) for field in declaration.fields):
+                for field in declaration.fields:
+                    united.setdefault(field.name, field)
         return tuple(united.values())
 
-    def descendants_of(self, dtype: str) -> tuple[str, ...]:
-        """The dtypes whose classes descend from that of `dtype`."""
-        return tuple(dict.fromkeys(each.dtype for each in self._declarations.values() if dtype in each.bases))
+
+def _agree(one: FieldDeclared, other: FieldDeclared) -> bool:
+    """Whether both fit into one column; members of an enum are stored as text."""
+    kinds = {each.type if each.type != "enum" else "text" for each in (one, other)}
+    return len(kinds) == 1 and one.item == other.item

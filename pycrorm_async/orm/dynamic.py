@@ -22,7 +22,7 @@ from sqlalchemy.orm import registry, relationship, synonym
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.catalogue import Catalogue, Contradiction
+from pycrorm_async.events.catalogue import Catalogue
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared, FieldType
 from pycrorm_async.orm.base import Base, Pose
 from pycrorm_async.orm.designators import Action, Designator, Motion
@@ -114,10 +114,7 @@ class DynamicClasses:
 
     def _make(self, dtype: str) -> bool:
         """Whether the class is new or has grown."""
-        try:
-            fields = self._catalogue.fields_of(dtype)
-        except Contradiction:  # the projector parks what it cannot fold; what it can is asked for without a class
-            return False
+        fields = self._catalogue.fields_of(dtype)
         known = self._classes.get(dtype)
         if known is not None:
             return self._add_fields(dtype, known, fields)
