@@ -28,8 +28,8 @@ LOST: Final = b'{"status":"LOST"}'
 def open_dead(folder: Path) -> RecoveredQueue | None:
     """The folder as a source, or None if its recorder lives, somebody drains it, or it is gone.
 
-    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte, some 300,000 records
-    a second. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`, holding nothing.
+    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte, some 300,000
+    records a second. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`, holding nothing.
     """
     with available(folder):
         alive = FileLock.take(folder / ALIVE, create=False)
