@@ -65,7 +65,7 @@ class Declarations:
         if known is not None:
             return known
         declared = declared_type(designator)
-        for name in {declared.declaration.dtype, declared.declaration.table}:
+        for name in (declared.declaration.dtype, declared.declaration.table):
             reference = self._classes.get(name)
             other = reference() if reference is not None else None
             if other is not None and _path(other) != _path(designator):
@@ -74,7 +74,7 @@ class Declarations:
                     f"{_path(other)} is {name!r} already (set a class attribute `dtype` on one of them)",
                 )
         on_new(declared)
-        for name in {declared.declaration.dtype, declared.declaration.table}:
+        for name in (declared.declaration.dtype, declared.declaration.table):
             self._classes[name] = weakref.ref(designator)
         self._declared[designator] = declared
         return declared
