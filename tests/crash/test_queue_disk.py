@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import subprocess
 from collections.abc import Iterator
@@ -76,18 +77,25 @@ async def test_a_failed_sync_ends_the_waiting_of_the_writer(tmp_path: Path) -> N
     queue.release()
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of its own of 256 KiB; mounting one takes a privilege that not every machine gives."""
-    mounted = tmp_path / "disk"
-    mounted.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(mounted)], capture_output=True, check=False
-    )
-    if done.returncode:
-        pytest.skip(f"cannot mount: {done.stderr.decode().strip()}")
-    yield mounted
-    subprocess.run(["umount", str(mounted)], check=True)
+@pytest.fixture(params=["mounted", "simulated"])
+def small_disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A disk of 256 KiB: one of its own, and one that only says so, for machines that give no right to mount."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
+    if request.param == "mounted" and subprocess.run(mount, capture_output=True, check=False).returncode == 0:
+        yield disk
+        subprocess.run(["umount", str(disk)], check=True)
+        return
+    allocate = os.posix_fallocate
+
+    def allocate_on_a_small_disk(descriptor: int, offset: int, size: int) -> None:
+        if sum(path.stat().st_size for path in disk.rglob("*")) + size > 2**18:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        allocate(descriptor, offset, size)
+
+    monkeypatch.setattr(os, "posix_fallocate", allocate_on_a_small_disk)
+    yield disk
 
 
 ON_A_SMALL_DISK = Settings(sync_interval_ms=5, segment_bytes=2**15, spool_bytes_max=2**30, spool_reserve_bytes=2**16)
