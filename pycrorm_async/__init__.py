@@ -15,9 +15,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pycrorm_async.adoption import recover
     from pycrorm_async.config import Settings
     from pycrorm_async.errors import PycrormError
-    from pycrorm_async.memory import Memory, MemoryStatus, recover
+    from pycrorm_async.memory import Memory, MemoryStatus
     from pycrorm_async.projections.views import UserView
     from pycrorm_async.query.reading import Reading
 
@@ -32,7 +33,7 @@ _HOMES = {
     "Reading": "query.reading",
     "Settings": "config",
     "UserView": "projections.views",
-    "recover": "memory",
+    "recover": "adoption",
 }
 
 

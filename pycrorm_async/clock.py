@@ -1,4 +1,8 @@
-"""The only reader of a clock. Parts that need one get a `Clock` as an argument; tests hand in their own."""
+"""The only reader of a clock.
+
+What is recorded is timed by the `Clock` that a part gets as an argument, so that tests can hand in their own; plans and
+poses without a memory read the system's.
+"""
 
 from __future__ import annotations
 

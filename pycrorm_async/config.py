@@ -6,13 +6,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
+from typing import Literal, get_args
+
+from pycrorm_async.errors import CallerError
 
 __all__ = ["Settings", "OnFull", "OnUnrecordable"]
 
-OnFull = Literal["wait", "fail", "thin_out"]
+OnFull = Literal["wait", "fail"]
 OnUnrecordable = Literal["refuse", "record_missing"]
+_CHOICES = {"on_full": get_args(OnFull), "on_unrecordable": get_args(OnUnrecordable)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +23,7 @@ class Settings:
     """Limits and rhythms of one memory.
 
     Attributes:
-        sync_interval_ms: what was written is synced to the disk after at most this long.
+        sync_interval_ms: a sync of what was written begins after at most this long.
         segment_bytes: size of one file of the write-ahead queue, allocated ahead.
         spool_bytes_max: what one recorder may hold on disk before `on_full` applies.
         spool_reserve_bytes: kept free below that for ends and world observations, which never wait for room.
@@ -29,7 +32,7 @@ class Settings:
         idle_ms: a plan that has emitted nothing for so long is idle: its tables are brought up to date.
         flush_timeout_s: `flush` and closing give up after this long; nothing is lost by it.
         connect_timeout_s: how long a database may take to answer at the first connection.
-        on_full: wait for room, fail with `SpoolFull`, or thin out state samples.
+        on_full: what a node does that starts while the spool is full: wait for room, or fail with `SpoolFull`.
         on_unrecordable: refuse a perform whose parameters cannot be recorded, or record them as missing.
     """
 
@@ -46,3 +49,12 @@ class Settings:
     connect_timeout_s: float = 10.0
     on_full: OnFull = "wait"
     on_unrecordable: OnUnrecordable = "refuse"
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            choices = _CHOICES.get(each.name)
+            if choices is not None and value not in choices:
+                raise CallerError(f"Settings.{each.name} is {value!r}: use {' or '.join(map(repr, choices))}")
+            if choices is None and not (isinstance(value, int | float) and value > 0):
+                raise CallerError(f"Settings.{each.name} is {value!r}: it must be a number above zero")

@@ -1,11 +1,11 @@
-"""The composition root: opens a memory, wires its parts, drains and closes it. No other module sees both ends.
+"""The composition root: opens a memory, wires its parts, drains and closes it.
 
-async with Memory.open("sqlite:///memory.db") as memory:
-    async with memory.episode(description="Tutorial"):
-        await plan()
-    await memory.flush()
-    async with memory.session() as session:
-        actions = (await session.scalars(select(Action))).all()
+>>> async with Memory.open("sqlite:///memory.db") as memory:
+...     async with memory.episode(description="Tutorial"):
+...         await plan()
+...     await memory.flush()
+...     async with memory.session() as session:
+...         actions = (await session.scalars(select(Action))).all()
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import asyncio
 import logging
 import os
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, suppress
-from contextvars import ContextVar, Token
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
@@ -24,32 +24,29 @@ from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async import __version__
+from pycrorm_async.adoption import dead_queues, open_destination
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError, PycrormError
-from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
+from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter, Faults
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.recorder import Recorder, current_episode
-from pycrorm_async.plan.ports import PlanObserver, recorder
-from pycrorm_async.projections.projector import Projector
+from pycrorm_async.plan.ports import recorder
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.recorder import RecorderQueue
-from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.world.watch import WorldWatcher, watcher
+from pycrorm_async.world.watch import watcher
 from pycrorm_async.writer.live import WriterState
-from pycrorm_async.writer.once import Recovered, drain_once
 from pycrorm_async.writer.thread import WriterThread
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-__all__ = ["Memory", "MemoryStatus", "RecoveryReport", "recover", "spool_of"]
+__all__ = ["Memory", "MemoryStatus"]
 
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
@@ -76,6 +73,16 @@ class MemoryStatus(NamedTuple):
     unadopted: Mapping[str, PycrormError]
 
 
+class _Parts(NamedTuple):
+    """What an open memory is made of."""
+
+    queue: RecorderQueue
+    writer: WriterThread
+    reading: Reading
+    emitter: Emitter
+    recorder: Recorder
+
+
 class Memory:
     """The memory of one process in one database. Use `Memory.open` as an async context manager.
 
@@ -94,13 +101,13 @@ class Memory:
         clock: Clock,
     ) -> None:
         self._address = address
-        self._spool_path = spool
+        self._spool = spool
         self._views = tuple(views)
         self._settings = settings
         self._clock = clock
         self._unadopted: dict[str, PycrormError] = {}
         self._stack = AsyncExitStack()
-        self._closed = False
+        self._parts: _Parts | None = None
 
     @classmethod
     def open(
@@ -112,7 +119,7 @@ class Memory:
         settings: Settings | None = None,
         clock: Clock = SYSTEM_CLOCK,
     ) -> Memory:
-        """A memory to be entered with `async with`.
+        """A memory to be entered with `async with`, once.
 
         Args:
             url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that is gone when closed.
@@ -137,58 +144,55 @@ class Memory:
 
     async def __aenter__(self) -> Self:
         try:
-            await self._open()
+            self._parts = await self._open()
+            self._stack.enter_context(self._recording(self._parts.recorder))
         except BaseException:
             await self._stack.aclose()
             raise
         return self
 
-    async def _open(self) -> None:
+    async def _open(self) -> _Parts:
         address = self._stack.enter_context(self._address.located())
-        self._address = address
         # The database first: where it is refused, no spool is made beside it.
         await (await EventLog.open(address, create=True, clock=self._clock)).close()
-        self._spool = Spool(self._spool_path or address.default_spool)
-        self._queue = RecorderQueue.create(
-            self._spool.path,
+        spool = Spool(self._spool or address.default_spool)
+        queue = RecorderQueue.create(
+            spool.path,
             settings=self._settings,
             clock=self._clock,
             recorder=episode_id(self._clock.wall_ns(), os.urandom(10)),
         )
-        self._stack.callback(self._queue.release)
-        self._writer = WriterThread(
-            source=self._queue,
-            open_destination=lambda: _destination(address, self._spool, self._clock, self._views),
-            adopt=self._dead_queues,
+        self._stack.callback(queue.release)
+        writer = WriterThread(
+            source=queue,
+            open_destination=lambda: open_destination(address, spool, clock=self._clock, views=self._views),
+            adopt=lambda: dead_queues(spool, self._unadopted),
             settings=self._settings,
         )
-        await self._writer.start()
+        await writer.start()
         self._stack.push_async_exit(self._drain)
-        self._reading = await self._stack.enter_async_context(Reading.open_address(address))
-        self._emitter = Emitter(self._queue, self._settings)
-        self._recorder = Recorder(self._emitter, clock=self._clock, software=__version__)
-        self._tokens: tuple[Token[PlanObserver | None], Token[WorldWatcher | None]] = (
-            recorder.set(self._recorder),
-            watcher.set(self._recorder),
-        )
+        reading = await self._stack.enter_async_context(Reading.open_address(address))
+        emitter = Emitter(queue, self._settings)
+        return _Parts(queue, writer, reading, emitter, Recorder(emitter, clock=self._clock, software=__version__))
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._closed = True
-        _reset(recorder, self._tokens[0])
-        _reset(watcher, self._tokens[1])
-        for episode in self._recorder.open_episodes:
-            self._recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
+        open_recorder = self._now.recorder
+        for episode in open_recorder.open_episodes:
+            open_recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
         await self._stack.__aexit__(kind, error, traceback)
 
     async def _drain(
         self, _kind: type[BaseException] | None, error: BaseException | None, _traceback: TracebackType | None
     ) -> None:
         """Store and fold what is left. A failure of ours never hides the plan's own."""
-        self._queue.close()
+        parts, self._parts = self._parts, None
+        if parts is None:  # opening failed behind the writer's start: nothing was recorded
+            return
+        parts.queue.close()
         try:
-            await self._writer.close()
+            await parts.writer.close()
         except PycrormError as fault:
             if error is None:
                 raise
@@ -202,33 +206,33 @@ class Memory:
     ) -> AsyncIterator[Episode]:
         """An episode: what is performed inside belongs to it, and so does the world that is entered inside or before.
 
+        Waits for room in a full spool, or raises `SpoolFull`, as `Settings.on_full` says.
+
         Args:
             description: why; default: the plan's name.
             plan: the plan's name.
-            seed: of the plan's random numbers, to find it again.
+            seed: of the plan's random numbers, to find it again; 64 bits.
 
         Raises:
             EpisodeRefused: one is open in this task already. A child task may open its own.
         """
-        self._require_open()
-        episode = self._recorder.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
-        tokens = recorder.set(self._recorder), watcher.set(self._recorder), current_episode.set(episode)
-        try:
-            yield episode
-        except BaseException as failure:
-            self._recorder.close_episode(episode, failure)
-            raise
-        else:
-            self._recorder.close_episode(episode, None)
-        finally:
-            _reset(recorder, tokens[0])
-            _reset(watcher, tokens[1])
-            _reset(current_episode, tokens[2])
+        told = self._now.recorder
+        if (room := told.admit()) is not None:
+            await room
+        episode = told.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
+        failure: BaseException | None = None
+        with self._recording(told), _set(current_episode, episode):
+            try:
+                yield episode
+            except BaseException as raised:
+                failure = raised
+                raise
+            finally:
+                told.close_episode(episode, failure)
 
     async def synced(self) -> None:
         """All emitted so far survives power loss when this returns."""
-        self._require_open()
-        await self._queue.synced_to(self._queue.written)
+        await self._now.queue.synced_to(self._now.queue.written)
 
     async def flush(self) -> None:
         """All emitted so far is stored and visible in the tables when this returns.
@@ -237,150 +241,80 @@ class Memory:
             EpisodeParked: with the reason, if an episode could not be stored or folded.
             FlushTimeout: after `flush_timeout_s`. What was emitted is safe in the spool.
         """
-        self._require_open()
-        position = self._queue.written
-        await self._queue.synced_to(position)
-        await self._writer.flush(position)
-        await self._reading.refresh()
+        parts = self._now
+        position = parts.queue.written
+        await parts.queue.synced_to(position)
+        await parts.writer.flush(position)
+        await parts.reading.refresh()
 
     @property
     def status(self) -> MemoryStatus:
         """How the memory is, at this moment."""
+        parts = self._now
         return MemoryStatus(
-            written=self._queue.written,
-            synced=self._queue.synced,
-            stored=self._queue.stored,
-            bytes_spooled=self._queue.bytes_spooled,
-            faults=self._emitter.faults,
-            writer=self._writer.state,
+            written=parts.queue.written,
+            synced=parts.queue.synced,
+            stored=parts.queue.stored,
+            bytes_spooled=parts.queue.bytes_spooled,
+            faults=parts.emitter.faults,
+            writer=parts.writer.state,
             unadopted=dict(self._unadopted),
         )
 
     @property
     def recent_episodes(self) -> tuple[str, ...]:
         """The ids of the last hundred episodes this memory opened."""
-        return self._recorder.recent_episodes
+        return self._now.recorder.recent_episodes
+
+    @property
+    def opened_count(self) -> int:
+        """How many episodes this memory opened."""
+        return self._now.recorder.opened_count
 
     # --- asking -----------------------------------------------------------------------------------------------
 
     @property
     def reading(self) -> Reading:
         """The asking side on its own: named questions, sessions, frames."""
-        return self._reading
+        return self._now.reading
 
     def session(self) -> AbstractAsyncContextManager[AsyncSession]:
         """An ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager."""
-        return self._reading.session()
+        return self._now.reading.session()
 
     async def dataframe(self, statement: Select[Any]) -> DataFrame:
         """The answer as a pandas DataFrame (extra `learning`)."""
-        return await self._reading.dataframe(statement)
+        return await self._now.reading.dataframe(statement)
 
     def mapped(self, designator: str | type) -> Any:
-        """The mapped class of a designator type, by its dtype or its class."""
-        return self._reading.mapped(designator)
+        """The mapped class of a designator type, by its dtype or its class, once one of it was flushed."""
+        return self._now.reading.mapped(designator)
 
     async def number_of(self, episode: Episode) -> int:
         """The number this database gave the episode; after `flush`."""
-        return await self._reading.number_of(str(episode))
+        return await self._now.reading.number_of(str(episode))
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _require_open(self) -> None:
-        if self._closed or not hasattr(self, "_recorder"):
+    @property
+    def _now(self) -> _Parts:
+        if self._parts is None:
             raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
+        return self._parts
 
-    def _dead_queues(self) -> Iterator[RecoveredQueue]:
-        return _dead_queues(self._spool, self._unadopted)
-
-
-def _reset(variable: ContextVar[_T], token: Token[_T]) -> None:
-    """Back to what it was. Left in another context than it was entered in, there is nothing of ours to undo."""
-    with suppress(ValueError):
-        variable.reset(token)
+    @contextmanager
+    def _recording(self, told: Recorder) -> Iterator[None]:
+        """What is performed and entered in this context is told to this memory."""
+        with _set(recorder, told), _set(watcher, told):
+            yield
 
 
-class _Destination:
-    """The writer's far end: the log, and the tables behind it."""
-
-    def __init__(self, log: EventLog, projector: Projector) -> None:
-        self._log = log
-        self._projector = projector
-
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self._log.append(records)
-
-    async def fold(self) -> int:
-        return await self._projector.fold_behind()
-
-    async def stopped(self) -> Mapping[str, str]:
-        return {each.id: each.refused or each.parked or "" for each in await self._log.stopped()}
-
-
-@asynccontextmanager
-async def _destination(
-    address: DatabaseAddress, spool: Spool, clock: Clock, views: Sequence[UserView] = ()
-) -> AsyncIterator[_Destination]:
-    log = await EventLog.open(address, create=True, clock=clock)
+@contextmanager
+def _set(variable: ContextVar[_T], value: _T) -> Iterator[None]:
+    """The variable has this value inside. Left in another context than entered in, there is nothing of ours to undo."""
+    token = variable.set(value)
     try:
-        spool.bind(log.log_id)
-        projector = Projector(log, views=views)
-        await projector.open()
-        yield _Destination(log, projector)
+        yield
     finally:
-        await log.close()
-
-
-def _dead_queues(
-    spool: Spool, failures: dict[str, PycrormError], lost: list[str] | None = None
-) -> Iterator[RecoveredQueue]:
-    """What dead recorders left, one after the other; each folder is deleted once all of it is stored.
-
-    One that cannot be recovered is noted in `failures` and does not keep the others from being recovered; the ids of
-    episodes that were left open are added to `lost`.
-    """
-    for folder in spool.recorders():
-        if folder.alive:
-            continue
-        try:
-            recovered = open_dead(folder.path)
-            if recovered is None:
-                continue
-            if lost is not None:
-                lost += [episode_text(end.episode) for end in recovered.lost if end.episode is not None]
-            try:
-                yield recovered
-            finally:
-                if recovered.stored == recovered.last:
-                    recovered.remove()
-                else:
-                    recovered.release()
-        except PycrormError as error:
-            failures[folder.name] = error
-            _log.warning("%s", error)
-
-
-class RecoveryReport(NamedTuple):
-    """What `recover` did: the rounds of draining and folding, the episodes that ended LOST, the folders that failed."""
-
-    round: Recovered
-    lost: tuple[str, ...]
-    failed: Mapping[str, PycrormError]
-
-
-async def recover(url: str, *, spool: Path | None = None, settings: Settings | None = None) -> RecoveryReport:
-    """Append and fold all that dead processes left in the spool of a database. Raises as `Memory.open` does."""
-    failures: dict[str, PycrormError] = {}
-    lost: list[str] = []
-    address = DatabaseAddress.parse(url)
-    if address.is_private:
-        raise CallerError("sqlite:// is gone with its process: there is nothing to recover")
-    place = Spool(spool or address.default_spool)
-    async with _destination(address, place, SYSTEM_CLOCK) as destination:
-        done = await drain_once(_dead_queues(place, failures, lost), destination, settings=settings or Settings())
-    return RecoveryReport(done, tuple(lost), {**done.failed, **failures})
-
-
-def spool_of(url: str) -> Path:
-    """Where the write-ahead queue of this database is, if nobody says otherwise."""
-    return DatabaseAddress.parse(url).default_spool
+        with suppress(ValueError):
+            variable.reset(token)

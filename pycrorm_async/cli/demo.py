@@ -136,20 +136,19 @@ async def _remembered(url: str, spool: Path | None) -> Answers:
 
 
 async def _asked(memory: Memory, number: int, saying: Any) -> list[tuple[str, Sequence[str], list[Any]]]:
-    """The thesis' five questions, about this episode."""
-    mine = number
+    """The thesis' five questions: four about this episode, one about what was said last."""
     async with memory.session() as session:
-        metadata = (await session.scalars(select(ProcessMetaData).where(ProcessMetaData.id == mine))).all()
+        metadata = (await session.scalars(select(ProcessMetaData).where(ProcessMetaData.id == number))).all()
         navigations = (
-            await session.scalars(select(NavigateAction).where(NavigateAction.process_metadata_id == mine))
+            await session.scalars(select(NavigateAction).where(NavigateAction.process_metadata_id == number))
         ).all()
-        actions = (await session.scalars(select(Action).where(Action.process_metadata_id == mine))).all()
+        actions = (await session.scalars(select(Action).where(Action.process_metadata_id == number))).all()
         picked = (
             await session.scalars(
                 select(PoseRow)
                 .join(PickUpAction.object)
                 .join(Object.pose)
-                .where(PickUpAction.process_metadata_id == mine)
+                .where(PickUpAction.process_metadata_id == number)
             )
         ).all()
         sayings = (await session.scalars(select(saying).order_by(saying.id.desc()).limit(1))).all()

@@ -61,6 +61,8 @@ def load_plan(reference: str) -> LoadedPlan:
 
 def _imported(path: Path) -> Any:
     name = path.stem
+    if name in sys.modules:
+        raise PlanNotLoadable(f"{path} has the name of a module that is in use: rename the file")
     specification = importlib.util.spec_from_file_location(name, path.resolve())
     if specification is None or specification.loader is None:
         raise PlanNotLoadable(f"{path} is no Python file")
@@ -70,8 +72,10 @@ def _imported(path: Path) -> Any:
     try:
         specification.loader.exec_module(module)
     except SystemExit as error:
+        del sys.modules[name]
         raise PlanNotLoadable(f"{path} leaves the program when it is imported (exit {error.code})") from error
     except Exception as error:
+        del sys.modules[name]
         frames = traceback.extract_tb(error.__traceback__)
         line = getattr(error, "lineno", None) or next(
             (frame.lineno for frame in reversed(frames) if frame.filename == str(path.resolve())), None

@@ -73,6 +73,8 @@ async def _remembered(
         except EpisodeParked as parked:
             note(str(parked))
         opened = memory.recent_episodes
+        if memory.opened_count > len(opened):
+            note(f"the last {len(opened)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")
         return failure, [each for each in await memory.reading.episodes() if each.id in opened]
 
 

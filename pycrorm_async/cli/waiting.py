@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pycrorm_async.adoption import waiting
 from pycrorm_async.cli.output import note
-from pycrorm_async.memory import spool_of
-from pycrorm_async.queue.spool import Spool
 
 __all__ = ["note_what_waits"]
 
 
 def note_what_waits(url: str, spool: Path | None) -> None:
     """One line on stderr for each kind of recorder that may hold more than the database shows."""
-    recorders = Spool(spool or spool_of(url)).recorders()
-    dead = sum(not each.alive for each in recorders)
-    alive = len(recorders) - dead
+    dead, alive = waiting(url, spool)
     if dead:
         option = f" --spool {spool}" if spool else ""
         note(

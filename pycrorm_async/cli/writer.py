@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
+from pycrorm_async.adoption import RecoveryReport, recover
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import print_json, problem, stdout
+from pycrorm_async.cli.output import print_json, problem, stderr, stdout
 from pycrorm_async.errors import CallerError, DamageError
-from pycrorm_async.memory import RecoveryReport, recover
 
 __all__ = ["writer"]
 
@@ -27,28 +27,29 @@ def writer(
     """
     if not once:
         raise CallerError("`pycrorm writer` runs with --once: a live process writes its own events")
-    report = asyncio.run(recover(url, spool=spool))
+    with stderr.status("recovering what dead processes left …"):
+        report = asyncio.run(recover(url, spool=spool))
     if as_json:
         print_json(_document(report))
     else:
         _print(report)
     for name, error in report.failed.items():
         problem(f"{name}: {error}")
-    for episode, reason in report.round.stopped.items():
+    for episode, reason in report.drained.stopped.items():
         problem(f"episode {episode} is stopped: {reason}")
     if any(isinstance(error, DamageError) for error in report.failed.values()):
         return 4
     if report.failed:
         return 3
-    return 1 if report.round.stopped else 0
+    return 1 if report.drained.stopped else 0
 
 
 def _print(report: RecoveryReport) -> None:
-    drained = report.round.drained
+    drained = report.drained.drained
     events = sum(each.records for each in drained)
     stdout.print(
         f"{len(drained)} dead recorder{'' if len(drained) == 1 else 's'}, {events} events stored,"
-        f" {report.round.folded} folded, {len(report.lost)} episode{'' if len(report.lost) == 1 else 's'} LOST"
+        f" {report.drained.folded} folded, {len(report.lost)} episode{'' if len(report.lost) == 1 else 's'} LOST"
     )
     for episode in report.lost:
         stdout.print(f"  LOST {episode}")
@@ -56,10 +57,10 @@ def _print(report: RecoveryReport) -> None:
 
 def _document(report: RecoveryReport) -> dict[str, object]:
     return {
-        "recorders": [each.source for each in report.round.drained],
-        "events_stored": sum(each.records for each in report.round.drained),
-        "events_folded": report.round.folded,
+        "recorders": [each.source for each in report.drained.drained],
+        "events_stored": sum(each.records for each in report.drained.drained),
+        "events_folded": report.drained.folded,
         "lost": report.lost,
         "failed": {name: str(error) for name, error in report.failed.items()},
-        "stopped": dict(report.round.stopped),
+        "stopped": dict(report.drained.stopped),
     }

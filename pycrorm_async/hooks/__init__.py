@@ -1,0 +1,1 @@
+"""Who saw it: what plans and worlds tell becomes events, with the values of the moment, in the queue."""

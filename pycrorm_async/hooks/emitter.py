@@ -29,8 +29,9 @@ class Faults(NamedTuple):
 class Emitter:
     """The hooks' way to the queue.
 
-    Ends and world observations are `reserved`: they use the room kept free for them, and when that is gone as well they
-    block the calling thread until something was stored. Nothing is dropped.
+    Only the start of a node or an episode waits for room, before it is written (`Recorder.admit`). Everything else
+    must not wait, so all that is put may use the reserve; when that is gone as well, the calling thread blocks until
+    something was stored. Nothing is dropped.
     """
 
     def __init__(self, sink: EventSink, settings: Settings) -> None:
@@ -43,21 +44,18 @@ class Emitter:
     def faults(self) -> Faults:
         return Faults(self._fault_count, self._last_fault)
 
-    def put(self, episode: EpisodeId | None, event: Happening, *, reserved: bool = True) -> int:
+    def put(self, episode: EpisodeId | None, event: Happening) -> int:
         """Append the event; its sequence. Raises `NotEncodable` before anything was written."""
+        kind = type(event)
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        return self.put_payload(episode, type(event).__name__, type(event).version, payload, reserved=reserved)
+        return self.put_payload(Heading(episode, kind.__name__, kind.version), payload)
 
-    def put_payload(
-        self, episode: EpisodeId | None, kind: str, version: int, payload: bytes, *, reserved: bool = True
-    ) -> int:
-        heading = Heading(episode, kind, version)
+    def put_payload(self, heading: Heading, payload: bytes) -> int:
+        """The same for an event that is encoded already."""
         while True:
             try:
-                return self.sink.put_nowait(heading, payload, reserved=reserved)
+                return self.sink.put_nowait(heading, payload, reserved=True)
             except SpoolFull:
-                if not reserved:
-                    raise
                 self.sink.block_until_room(_BLOCK_S)
 
     def note_fault(self, where: str, error: BaseException) -> None:

@@ -7,6 +7,8 @@ import getpass
 import platform
 from typing import Any, Final, NamedTuple
 
+from msgspec.structs import replace
+
 from pycrorm_async.errors import EpisodeRefused, Unrecordable
 from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.happenings import (
@@ -29,6 +31,7 @@ from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.values import (
     Unwritable,
     clean,
+    clean_repr,
     failure_value,
     pose_value,
     written,
@@ -51,6 +54,7 @@ class EpisodeOpening(NamedTuple):
     software: str
     plan: str | None = None
     seed: int | None = None
+    world: str | None = None
 
 
 class NodeRecord(NamedTuple):
@@ -60,6 +64,8 @@ class NodeRecord(NamedTuple):
     sequence: int
     implicit: bool
     """Whether the episode was opened for this node and ends with it."""
+    before: Episode | None
+    """The current episode of the context when the node started."""
 
 
 class Episode:
@@ -87,8 +93,8 @@ class Episode:
                 python=platform.python_version(),
                 plan=clean(opening.plan) if opening.plan is not None else None,
                 seed=opening.seed,
+                world=clean(opening.world) if opening.world is not None else None,
             ),
-            reserved=False,
         )
         self._root = emitter.put(episode, NodeStarted("root"))
 
@@ -120,8 +126,8 @@ class Episode:
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
-    def start_node(self, node: TaskTreeNode, declared: DeclaredType, *, implicit: bool) -> None:
-        """Write down that the node starts. Raises `Unrecordable` for a parameter, if so chosen, and `SpoolFull`."""
+    def start_node(self, node: TaskTreeNode, declared: DeclaredType) -> int:
+        """Write down that the node starts; its sequence. Raises `Unrecordable` for a parameter, if so chosen."""
         parent = self._parent_of(node)
         event = NodeStarted(
             kind=node.kind,
@@ -131,11 +137,11 @@ class Episode:
             robot=self._robot(),
         )
         try:
-            sequence = self._emitter.put(self.id, event, reserved=False)
+            sequence = self._emitter.put(self.id, event)
         except NotEncodable as error:
             sequence = self._start_incomplete(event, declared, error)
         self._open_nodes.add(sequence)
-        node.record = NodeRecord(self, sequence, implicit)
+        return sequence
 
     def end_node(self, node: TaskTreeNode) -> None:
         """Write down how the node ended."""
@@ -202,38 +208,35 @@ class Episode:
         parameters: dict[str, Any] = {}
         for field, path, enum in declared.fields:
             value: Any = node.designator
-            for name in path:
-                value = getattr(value, name, None)
-            if value is None:
-                continue
             try:
-                parameters[field.name] = written(field, enum, value, self)
+                for name in path:
+                    value = getattr(value, name, None)
+                if value is not None:
+                    parameters[field.name] = written(field, enum, value, self)
             except Unwritable as reason:
                 parameters[field.name] = self._missing(declared, field.name, str(reason), value)
+            except Exception as error:  # noqa: BLE001  a property or a __float__ of the user's may raise anything
+                raised = f"reading it raised {type(error).__name__}: {clean(str(error))}"
+                parameters[field.name] = self._missing(declared, field.name, raised, value)
         return parameters
 
     def _missing(self, declared: DeclaredType, name: str, reason: str, value: object) -> MissingValue:
         if self._emitter.settings.on_unrecordable == "refuse":
             raise Unrecordable(declared.declaration.dtype, name, reason)
-        missing = written_or_missing(value, self)
-        return missing if isinstance(missing, MissingValue) else MissingValue(reason, clean(repr(value))[:200])
+        return MissingValue(reason, clean_repr(value))
 
     def _start_incomplete(self, event: NodeStarted, declared: DeclaredType, error: NotEncodable) -> int:
         """A start that is too large, or whose world value cannot be written: without that part, if so chosen."""
         part, _, rest = error.path.partition(".")
         if part == "robot":
             self._emitter.note_fault("robot state", error)
-            event = NodeStarted(event.kind, event.parent, event.designator, event.parameters)
-            return self._emitter.put(self.id, event, reserved=False)
+            event = replace(event, robot=None)
+            return self._emitter.put(self.id, event)
         names = [rest.partition(".")[0]] if rest else list(event.parameters)
         if self._emitter.settings.on_unrecordable == "refuse":
             raise Unrecordable(declared.declaration.dtype, " and ".join(names) or "it", error.reason) from None
         kept = event.parameters | {name: MissingValue(error.reason) for name in names}
-        return self._emitter.put(
-            self.id,
-            NodeStarted(event.kind, event.parent, event.designator, kept, event.robot),
-            reserved=False,
-        )
+        return self._emitter.put(self.id, replace(event, parameters=kept))
 
     def _robot(self) -> RobotValue | None:
         if self._world is None:

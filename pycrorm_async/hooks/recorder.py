@@ -12,7 +12,8 @@ from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.errors import CallerError, EpisodeRefused, SpoolFull
+from pycrorm_async.errors import CallerError, DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
+from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
@@ -25,6 +26,7 @@ from pycrorm_async.world.watch import current_world
 __all__ = ["Recorder", "current_episode"]
 
 RECENT_MAX = 100
+TEXT_MAX = 10_000
 
 current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
 
@@ -47,6 +49,7 @@ class Recorder:
         self._declarations = Declarations()
         self._open: dict[EpisodeId, Episode] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
+        self.opened_count = 0
 
     # --- episodes ---------------------------------------------------------------------------------------------
 
@@ -57,11 +60,14 @@ class Recorder:
             raise EpisodeRefused(
                 f"episode {open_here} is open in this task already: end it first, or open the second in its own task"
             )
+        _check_arguments(description=description, plan=plan, seed=seed)
         name = episode_id(self._clock.wall_ns(), self._randomness(10))
-        episode = Episode(self._emitter, name, EpisodeOpening(description, self._software, plan, seed))
+        world = current_world.get()
+        opening = EpisodeOpening(description, self._software, plan, seed, world.description if world else None)
+        episode = Episode(self._emitter, name, opening)
         self._open[name] = episode
         self._recent.append(name)
-        world = current_world.get()
+        self.opened_count += 1
         if world is not None:
             episode.enter_world(world)
         return episode
@@ -100,6 +106,7 @@ class Recorder:
 
     def node_started(self, node: TaskTreeNode) -> None:
         assert node.designator is not None
+        before = current_episode.get()
         implicit: Episode | None = None
         try:
             declared = self._declarations.of(type(node.designator), self._declare)
@@ -107,15 +114,19 @@ class Recorder:
             if episode is None:
                 name = declared.declaration.dtype
                 episode = implicit = self.open_episode(description=name, plan=name)
-            episode.start_node(node, declared, implicit=implicit is not None)
-            if implicit is not None:
-                current_episode.set(implicit)
-        except (CallerError, SpoolFull) as refused:
+            sequence = episode.start_node(node, declared)
+        except (Unrecordable, DeclarationRefused, EpisodeRefused) as refused:
             if implicit is not None:
                 self.close_episode(implicit, refused)
             raise
         except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
             self._emitter.note_fault("NodeStarted", error)
+            if implicit is not None:
+                self.close_episode(implicit, error)
+        else:
+            node.record = NodeRecord(episode, sequence, implicit is not None, before)
+            if implicit is not None:
+                current_episode.set(implicit)
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
@@ -127,7 +138,7 @@ class Recorder:
             self._emitter.note_fault("NodeEnded", error)
         if record.implicit:
             self.close_episode(record.episode, node.failure)
-            current_episode.set(None)
+            current_episode.set(record.before)
 
     def location_resolved(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
@@ -142,9 +153,8 @@ class Recorder:
             self._emitter.note_fault("LocationResolved", error)
 
     def _declare(self, declared: DeclaredType) -> None:
-        self._emitter.put_payload(
-            None, type(declared.declaration).__name__, declared.declaration.version, declared.payload
-        )
+        kind = type(declared.declaration)
+        self._emitter.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
 
     # --- the world's port ---------------------------------------------------------------------------------------
 
@@ -157,3 +167,12 @@ class Recorder:
         episode = self._open_here()
         if episode is not None:
             episode.leave_world(world)
+
+
+def _check_arguments(*, description: object, plan: object, seed: object) -> None:
+    """What an episode is opened with must fit its columns. Raises `CallerError` naming the argument."""
+    for name, text in (("description", description), ("plan", plan)):
+        if text is not None and not (isinstance(text, str) and len(text) <= TEXT_MAX):
+            raise CallerError(f"the {name} of an episode must be a str of at most {TEXT_MAX:,} characters")
+    if seed is not None and not (isinstance(seed, int) and -(2**63) <= seed < 2**63):
+        raise CallerError(f"the seed of an episode must be an int of at most 64 bits, not {seed!r:.100}")

@@ -36,6 +36,8 @@ __all__ = [
     "written",
     "written_or_missing",
     "failure_value",
+    "clean",
+    "clean_repr",
 ]
 
 OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)

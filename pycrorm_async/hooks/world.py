@@ -6,7 +6,7 @@ An object's identity is the sequence of its `ObjectAdded`; its row in force that
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from pycrorm_async.events.happenings import (
     Happening,
@@ -76,11 +76,8 @@ class WorldRecorder:
 
     def object_added(self, added: Object) -> None:
         sequence = self._put(
-            ObjectAdded(
-                clean(added.name),
-                added.object_type.name,
-                pose_value(added.pose),
-                dict(added.joint_positions()),
+            lambda: ObjectAdded(
+                clean(added.name), added.object_type.name, pose_value(added.pose), dict(added.joint_positions())
             )
         )
         if sequence is not None:
@@ -89,19 +86,15 @@ class WorldRecorder:
     def object_removed(self, removed: Object) -> None:
         reference = self._references.pop(removed, None)
         if reference is not None:
-            self._put(ObjectRemoved(reference, self._node()))
+            self._put(lambda: ObjectRemoved(reference, self._node()))
 
     def object_moved(self, moved: Object) -> None:
         reference = self._references.get(moved)
         if reference is None:
             return
         sequence = self._put(
-            ObjectMoved(
-                reference.object,
-                clean(moved.name),
-                moved.object_type.name,
-                pose_value(moved.pose),
-                self._node(),
+            lambda: ObjectMoved(
+                reference.object, clean(moved.name), moved.object_type.name, pose_value(moved.pose), self._node()
             )
         )
         if sequence is not None:
@@ -110,17 +103,17 @@ class WorldRecorder:
     def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
         reference = self._references.get(moved)
         if reference is not None:
-            self._put(JointsMoved(reference, dict(positions), self._node()))
+            self._put(lambda: JointsMoved(reference, dict(positions), self._node()))
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
         pair = self._pair(parent, child)
         if pair is not None:
-            self._put(ObjectAttached(*pair, link, self._node()))
+            self._put(lambda: ObjectAttached(*pair, link, self._node()))
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
         pair = self._pair(parent, child)
         if pair is not None:
-            self._put(ObjectDetached(*pair, link, self._node()))
+            self._put(lambda: ObjectDetached(*pair, link, self._node()))
 
     def _pair(self, parent: Object, child: Object) -> tuple[ObjectReference, ObjectReference] | None:
         first, second = self._references.get(parent), self._references.get(child)
@@ -136,9 +129,10 @@ class WorldRecorder:
             return sequence
         return None
 
-    def _put(self, event: Happening) -> int | None:
+    def _put(self, made: Callable[[], Happening]) -> int | None:
+        """Makes the event and writes it down; whatever goes wrong is counted, and the world's setter goes on."""
         try:
-            return self._emitter.put(self._episode, event)
+            return self._emitter.put(self._episode, made())
         except Exception as error:  # noqa: BLE001  a world's setter never fails because of a memory
-            self._emitter.note_fault(type(event).__name__, error)
+            self._emitter.note_fault("a change of the world", error)
             return None

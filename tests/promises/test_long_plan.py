@@ -63,5 +63,5 @@ def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path,
     found = json.loads(done.stdout)
     assert found["rows"] == [total, 0, total - 1, total]
     assert found["done"] == total + 1  # the root of the episode as well
-    # 90,000 actions more, at the 32 kB a node of the reference system, would be 2.8 GB.
-    assert found["sizes"][-1] - found["sizes"][0] < 40_000, found["sizes"]
+    # 50,000 actions more, at the 32 kB a node of the reference system, would be 1.6 GB; at 100 bytes 5 MB.
+    assert found["sizes"][-1] - found["sizes"][4] < 5_000, found["sizes"]

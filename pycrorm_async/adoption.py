@@ -1,0 +1,132 @@
+"""Where queues end, and what becomes of those whose process died: drained into the log, folded, deleted.
+
+With `memory.py` this is where the parts are wired: no other module sees a queue and a database.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import CallerError, PycrormError
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.views import UserView
+from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
+from pycrorm_async.queue.spool import Spool
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.once import Recovered, drain_once
+
+__all__ = ["LogAndTables", "open_destination", "dead_queues", "RecoveryReport", "recover", "Waiting", "waiting"]
+
+_log = logging.getLogger("pycrorm_async")
+
+
+class LogAndTables:
+    """The writer's far end: the log, and the tables behind it. Implements the writer's `Destination`."""
+
+    def __init__(self, log: EventLog, projector: Projector) -> None:
+        self._log = log
+        self._projector = projector
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        return await self._log.append(records)
+
+    async def fold(self) -> int:
+        return await self._projector.fold_behind()
+
+    async def stopped(self) -> Mapping[str, str]:
+        return {each.id: each.refused or each.parked or "" for each in await self._log.stopped()}
+
+
+@asynccontextmanager
+async def open_destination(
+    address: DatabaseAddress, spool: Spool, *, clock: Clock, views: Sequence[UserView] = ()
+) -> AsyncIterator[LogAndTables]:
+    """Opens log and tables for writing, in the running loop, and binds the spool to them. Raises `SpoolForeign`."""
+    log = await EventLog.open(address, create=True, clock=clock)
+    try:
+        spool.bind(log.log_id)
+        projector = Projector(log, views=views)
+        await projector.open()
+        yield LogAndTables(log, projector)
+    finally:
+        await log.close()
+
+
+def dead_queues(
+    spool: Spool, failures: dict[str, PycrormError], lost: list[str] | None = None
+) -> Iterator[RecoveredQueue]:
+    """What dead recorders left, one after the other; each folder is deleted once all of it is stored.
+
+    One that cannot be recovered is noted in `failures` and does not keep the others from being recovered; the ids of
+    episodes that were left open are added to `lost`.
+    """
+    for folder in spool.recorders():
+        if folder.alive:
+            continue
+        try:
+            recovered = open_dead(folder.path)
+            if recovered is None:
+                continue
+            recovered.seal()
+            if lost is not None:
+                lost += [episode_text(end.episode) for end in recovered.lost if end.episode is not None]
+            try:
+                yield recovered
+            finally:
+                if recovered.stored == recovered.last:
+                    recovered.remove()
+                else:
+                    recovered.release()
+        except PycrormError as error:
+            failures[folder.name] = error
+            _log.warning("%s", error)
+
+
+class RecoveryReport(NamedTuple):
+    """What `recover` did.
+
+    Attributes:
+        drained: what was drained and folded.
+        lost: ids of the episodes that were left open and ended LOST.
+        failed: by the folder's name, why it could not be recovered.
+    """
+
+    drained: Recovered
+    lost: tuple[str, ...]
+    failed: Mapping[str, PycrormError]
+
+
+async def recover(url: str, *, spool: Path | None = None, settings: Settings | None = None) -> RecoveryReport:
+    """Append and fold all that dead processes left in the spool of a database. Raises as `Memory.open` does."""
+    failures: dict[str, PycrormError] = {}
+    lost: list[str] = []
+    address = DatabaseAddress.parse(url)
+    if address.is_private:
+        raise CallerError("sqlite:// is gone with its process: there is nothing to recover")
+    place = Spool(spool or address.default_spool)
+    async with open_destination(address, place, clock=SYSTEM_CLOCK) as destination:
+        done = await drain_once(dead_queues(place, failures, lost), destination, settings=settings or Settings())
+    return RecoveryReport(done, tuple(lost), {**done.failed, **failures})
+
+
+class Waiting(NamedTuple):
+    """How many recorders of a spool are dead, with events that may not be in the database, and how many alive."""
+
+    dead: int
+    alive: int
+
+
+def waiting(url: str, spool: Path | None = None) -> Waiting:
+    """What a spool holds beside its database. Reads only. Raises `SpoolUnavailable`."""
+    recorders = Spool(spool or DatabaseAddress.parse(url).default_spool).recorders()
+    alive = sum(each.alive for each in recorders)
+    return Waiting(len(recorders) - alive, alive)
