@@ -16,9 +16,10 @@ import os
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from contextvars import ContextVar
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
@@ -27,7 +28,7 @@ from pycrorm_async import __version__
 from pycrorm_async.adoption import dead_queues, open_destination
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import CallerError, PycrormError
+from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter, Faults
 from pycrorm_async.hooks.episode import Episode
@@ -35,6 +36,7 @@ from pycrorm_async.hooks.recorder import Recorder, current_episode
 from pycrorm_async.plan.ports import recorder
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.queue.locks import in_forked_child
 from pycrorm_async.queue.recorder import RecorderQueue
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
@@ -49,7 +51,6 @@ if TYPE_CHECKING:
 __all__ = ["Memory", "MemoryStatus"]
 
 _log = logging.getLogger("pycrorm_async")
-_T = TypeVar("_T")
 
 
 class MemoryStatus(NamedTuple):
@@ -108,6 +109,8 @@ class Memory:
         self._unadopted: dict[str, PycrormError] = {}
         self._stack = AsyncExitStack()
         self._parts: _Parts | None = None
+        self._told: set[str] = set()
+        in_forked_child(self._forked)
 
     @classmethod
     def open(
@@ -170,7 +173,7 @@ class Memory:
             settings=self._settings,
         )
         await writer.start()
-        self._stack.push_async_exit(self._drain)
+        self._stack.push_async_exit(partial(self._drain, queue, writer))
         reading = await self._stack.enter_async_context(Reading.open_address(address))
         emitter = Emitter(queue, self._settings)
         return _Parts(queue, writer, reading, emitter, Recorder(emitter, clock=self._clock, software=__version__))
@@ -178,25 +181,47 @@ class Memory:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        open_recorder = self._now.recorder
-        for episode in open_recorder.open_episodes:
-            open_recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
+        if self._parts is None:  # a forked child leaves the memory of its parent alone
+            return
+        told = self._parts.recorder
+        for episode in told.open_episodes:
+            told.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
+        self._parts.emitter.over = True
         await self._stack.__aexit__(kind, error, traceback)
 
     async def _drain(
-        self, _kind: type[BaseException] | None, error: BaseException | None, _traceback: TracebackType | None
+        self,
+        queue: RecorderQueue,
+        writer: WriterThread,
+        _kind: type[BaseException] | None,
+        error: BaseException | None,
+        _traceback: TracebackType | None,
     ) -> None:
         """Store and fold what is left. A failure of ours never hides the plan's own."""
-        parts, self._parts = self._parts, None
-        if parts is None:  # opening failed behind the writer's start: nothing was recorded
-            return
-        parts.queue.close()
+        self._parts = None
+        queue.close()
         try:
-            await parts.writer.close()
+            await writer.close()
         except PycrormError as fault:
-            if error is None:
-                raise
-            _log.error("when closing the memory: %s", fault)
+            news = self._news(fault)
+            if news is not None and error is None:
+                raise news from fault
+            if news is not None:
+                _log.error("when closing the memory: %s", news)
+
+    def _news(self, fault: PycrormError) -> PycrormError | None:
+        """The fault without the parked episodes that a flush has told already; None if nothing is left of it."""
+        if not isinstance(fault, EpisodeParked):
+            return fault
+        reasons = {episode: reason for episode, reason in fault.reasons.items() if episode not in self._told}
+        self._told.update(reasons)
+        return EpisodeParked(reasons) if reasons else None
+
+    def _forked(self) -> None:
+        """In a forked child: the memory is its parent's; plans go on and nothing is told."""
+        if self._parts is not None:
+            self._parts.emitter.over = True
+            self._parts = None
 
     # --- recording --------------------------------------------------------------------------------------------
 
@@ -238,13 +263,18 @@ class Memory:
         """All emitted so far is stored and visible in the tables when this returns.
 
         Raises:
-            EpisodeParked: with the reason, if an episode could not be stored or folded.
+            EpisodeParked: with the reason, if an episode could not be stored or folded; each is told once.
             FlushTimeout: after `flush_timeout_s`. What was emitted is safe in the spool.
         """
         parts = self._now
         position = parts.queue.written
         await parts.queue.synced_to(position)
-        await parts.writer.flush(position)
+        try:
+            await parts.writer.flush(position)
+        except EpisodeParked as fault:
+            news = self._news(fault)
+            if news is not None:
+                raise news from fault
         await parts.reading.refresh()
 
     @property
@@ -270,6 +300,11 @@ class Memory:
     def opened_count(self) -> int:
         """How many episodes this memory opened."""
         return self._now.recorder.opened_count
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it can be used."""
+        return self._parts is not None
 
     # --- asking -----------------------------------------------------------------------------------------------
 
@@ -310,11 +345,16 @@ class Memory:
 
 
 @contextmanager
-def _set(variable: ContextVar[_T], value: _T) -> Iterator[None]:
+def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
     """The variable has this value inside. Left in another context than entered in, there is nothing of ours to undo."""
+    before = variable.get()
     token = variable.set(value)
     try:
         yield
     finally:
-        with suppress(ValueError):
-            variable.reset(token)
+        # Memories may be closed in another order than they were opened: only what we set is taken back.
+        if variable.get() is value:
+            with suppress(ValueError):
+                variable.reset(token)
+            if getattr(before, "over", False):
+                variable.set(None)

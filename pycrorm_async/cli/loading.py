@@ -61,8 +61,8 @@ def load_plan(reference: str) -> LoadedPlan:
 
 def _imported(path: Path) -> Any:
     name = path.stem
-    if name in sys.modules:
-        raise PlanNotLoadable(f"{path} has the name of a module that is in use: rename the file")
+    if name in sys.modules or name in sys.stdlib_module_names:
+        raise PlanNotLoadable(f"{path} has the name of a module of Python's own or one in use: rename the file")
     specification = importlib.util.spec_from_file_location(name, path.resolve())
     if specification is None or specification.loader is None:
         raise PlanNotLoadable(f"{path} is no Python file")

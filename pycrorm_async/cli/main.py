@@ -12,9 +12,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import functools
+import io
 import logging
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -63,8 +64,8 @@ def _told_in_a_line(verb: Callable[..., int | None]) -> Callable[..., None]:
         except KeyboardInterrupt:
             problem("interrupted; what was recorded up to here is kept")
             code = 130
-        except asyncio.CancelledError:
-            problem("the plan was cancelled; what was recorded up to there is kept")
+        except OSError as error:
+            problem(f"the answer cannot be written: {error.strerror or error}")
             code = 1
         raise typer.Exit(code)
 
@@ -94,4 +95,9 @@ def main() -> None:
     """The console script."""
     handler = RichHandler(console=stderr, show_time=False, show_path=False)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    # An interrupted statement's connection is given up; its loop is gone, which the pool would tell at length.
+    logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     app()

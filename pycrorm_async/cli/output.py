@@ -17,7 +17,7 @@ __all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "
 _WIDTH_PIPED = 160
 """A pipe has no width; tables are then as wide as this, so that lines stay whole."""
 
-stdout = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH_PIPED)
+stdout = Console(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 
 

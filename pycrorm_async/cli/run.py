@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import sys
+import sysconfig
 import traceback
+from contextlib import nullcontext, redirect_stdout
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +17,7 @@ from pycrorm_async.cli.loading import LoadedPlan, load_plan
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
 from pycrorm_async.errors import EpisodeParked
+from pycrorm_async.hooks.values import message_of
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.questions import EpisodeSummary
 
@@ -38,7 +43,13 @@ def run(
     Exit code 1 if the plan failed: everything up to there is remembered.
     """
     loaded = load_plan(plan)
-    failure, episodes = asyncio.run(_remembered(loaded, url, spool, description or loaded.description, seed))
+    outcome = _Outcome()
+    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+        try:
+            asyncio.run(_remembered(loaded, url, spool, description or loaded.description, seed, outcome))
+        except asyncio.CancelledError as cancelled:  # the plan's own doing: Ctrl-C is a KeyboardInterrupt here
+            outcome.failure = cancelled
+    failure, episodes = outcome.failure, outcome.episodes
     if as_json:
         print_json({"plan": loaded.name, "failure": _one_line(failure), "episodes": episodes})
     else:
@@ -55,10 +66,17 @@ def run(
     return 1
 
 
+@dataclass
+class _Outcome:
+    """What the plan ended with, if not well, and its episodes."""
+
+    failure: BaseException | None = None
+    episodes: list[EpisodeSummary] = field(default_factory=list)
+
+
 async def _remembered(
-    loaded: LoadedPlan, url: str, spool: Path | None, description: str, seed: int | None
-) -> tuple[Exception | None, list[EpisodeSummary]]:
-    failure: Exception | None = None
+    loaded: LoadedPlan, url: str, spool: Path | None, description: str, seed: int | None, outcome: _Outcome
+) -> None:
     async with Memory.open(url, spool=spool) as memory:
         try:
             if loaded.takes_memory:
@@ -66,23 +84,39 @@ async def _remembered(
             else:
                 async with memory.episode(description=description, plan=loaded.name, seed=seed):
                     await loaded.function()
-        except Exception as error:  # noqa: BLE001  a plan may raise anything; it is told in one line
-            failure = error
-        try:
-            await memory.flush()
-        except EpisodeParked as parked:
-            note(str(parked))
-        opened = memory.recent_episodes
-        if memory.opened_count > len(opened):
-            note(f"the last {len(opened)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")
-        return failure, [each for each in await memory.reading.episodes() if each.id in opened]
+        except (KeyboardInterrupt, asyncio.CancelledError):
+            raise
+        except SystemExit as leaving:
+            outcome.failure = leaving if leaving.code not in (None, 0) else None
+        except BaseException as error:  # noqa: BLE001  a plan may raise anything; it is told in one line
+            outcome.failure = error
+        finally:
+            await _summarise(memory, outcome)
 
 
-def _one_line(failure: Exception | None) -> str | None:
+async def _summarise(memory: Memory, outcome: _Outcome) -> None:
+    if not memory.is_open:  # the plan closed it
+        return
+    try:
+        await memory.flush()
+    except EpisodeParked as parked:
+        note(str(parked))
+    recent = memory.recent_episodes
+    if memory.opened_count > len(recent):
+        note(f"the last {len(recent)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")
+    outcome.episodes = [each for each in await memory.reading.episodes() if each.id in recent]
+
+
+def _one_line(failure: BaseException | None) -> str | None:
     if failure is None:
         return None
     frames = traceback.extract_tb(failure.__traceback__)
-    own = [frame for frame in frames if "pycrorm_async" not in Path(frame.filename).parts]
+    library = sysconfig.get_path("stdlib")
+    own = [
+        frame
+        for frame in frames
+        if "pycrorm_async" not in Path(frame.filename).parts and not frame.filename.startswith(library)
+    ]
     where = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
-    message = " ".join(str(failure).split())
+    message = " ".join(message_of(failure).split())
     return f"{type(failure).__name__}: {message}{where}" if message else f"{type(failure).__name__}{where}"

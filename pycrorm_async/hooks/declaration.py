@@ -27,6 +27,9 @@ from pycrorm_async.world.pose import Pose
 __all__ = ["DeclaredType", "Field", "Declarations", "declared_type"]
 
 
+_OUR_PACKAGE = "pycrorm_async."
+
+
 class Field(NamedTuple):
     """A declared field, the attribute path that leads to its value, and the enum class if it is one."""
 
@@ -58,6 +61,7 @@ class Declarations:
     def __init__(self) -> None:
         self._declared: weakref.WeakKeyDictionary[type, DeclaredType] = weakref.WeakKeyDictionary()
         self._classes: dict[str, weakref.ref[type]] = {}
+        self._shapes: dict[str, dict[str, str]] = {}
 
     def of(self, designator: type[Designator], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
         """The declaration of this class; `on_new` is called before the first time it is given out."""
@@ -65,6 +69,7 @@ class Declarations:
         if known is not None:
             return known
         declared = declared_type(designator)
+        self._refuse_contradiction(designator, declared)
         for name in (declared.declaration.dtype, declared.declaration.table):
             reference = self._classes.get(name)
             other = reference() if reference is not None else None
@@ -77,15 +82,51 @@ class Declarations:
         for name in (declared.declaration.dtype, declared.declaration.table):
             self._classes[name] = weakref.ref(designator)
         self._declared[designator] = declared
+        self._shapes.setdefault(declared.declaration.dtype, {}).update(_shape_of(declared))
         return declared
+
+    def _refuse_contradiction(self, designator: type[Designator], declared: DeclaredType) -> None:
+        """A class defined again, or one with the name of a built-in, must not give a field another type."""
+        known = dict(self._shapes.get(declared.declaration.dtype, {}))
+        if not designator.__module__.startswith(_OUR_PACKAGE):
+            for other in _descendants(Designator):
+                if other.__module__.startswith(_OUR_PACKAGE) and getattr(other, "dtype", None) == designator.dtype:
+                    raise DeclarationRefused(
+                        _path(designator), f"{_path(other)} is {other.dtype!r} already (set a class attribute `dtype`)"
+                    )
+        for name, kind in _shape_of(declared).items():
+            if known.setdefault(name, kind) != kind:
+                raise DeclarationRefused(
+                    _path(designator),
+                    f"field {name!r} was {known[name]} before and is {kind} now (rename it, or set another dtype)",
+                )
+
+
+def _shape_of(declared: DeclaredType) -> dict[str, str]:
+    """Each field's type, in words; a member of an enum is stored as text."""
+    return {
+        each.name: f"{'text' if each.type == 'enum' else each.type}{f' of {each.item}' if each.item else ''}"
+        for each in declared.declaration.fields
+    }
+
+
+def _descendants(root: type) -> typing.Iterator[Any]:
+    each: Any
+    for each in root.__subclasses__():
+        yield each
+        yield from _descendants(each)
 
 
 def declared_type(designator: type[Designator]) -> DeclaredType:
     """The declaration of one class. Raises `DeclarationRefused` naming class and field."""
     fields = tuple(_fields(designator))
-    orm_class = designator.orm_class
+    orm_class = vars(designator).get("orm_class")
     table = getattr(orm_class, "__tablename__", None) or table_name(designator.dtype)
-    fault = fault_in_table(table) or fault_in_fields([field.declared for field in fields])
+    fault = (
+        _fault_in_dtype(designator.dtype)
+        or fault_in_table(table)
+        or fault_in_fields([field.declared for field in fields])
+    )
     if fault is not None:
         raise DeclarationRefused(_path(designator), fault)
     declaration = DesignatorTypeDeclared(
@@ -98,6 +139,13 @@ def declared_type(designator: type[Designator]) -> DeclaredType:
     )
     payload = encode(declaration)
     return DeclaredType(declaration, payload, fingerprint(payload), fields)
+
+
+def _fault_in_dtype(dtype: str) -> str | None:
+    """The name must work as one of a class and of a table; two underscores are kept for tables of a generation."""
+    if not dtype.isidentifier() or "__" in dtype:
+        return f"its dtype {dtype!r} is not a name (letters, digits and single underscores)"
+    return None
 
 
 def _bases(designator: type[Designator]) -> tuple[str, ...]:

@@ -37,6 +37,8 @@ class Emitter:
     def __init__(self, sink: EventSink, settings: Settings) -> None:
         self.sink = sink
         self.settings = settings
+        self.over = False
+        """Whether the memory is closed, or belongs to the process that forked this one: nothing is told any more."""
         self._fault_count = 0
         self._last_fault: str | None = None
 
@@ -63,4 +65,5 @@ class Emitter:
         self._fault_count += 1
         self._last_fault = f"{where}: {type(error).__name__}: {error}"
         if self._fault_count & (self._fault_count - 1) == 0:
-            _log.error("not recorded (%d so far): %s", self._fault_count, self._last_fault, exc_info=error)
+            _log.error("not recorded (%d so far): %s", self._fault_count, self._last_fault)
+            _log.debug("where it happened", exc_info=error)

@@ -115,8 +115,11 @@ class Episode:
             )
         self._world = WorldRecorder(self._emitter, self.id, world)
 
-    def leave_world(self, world: BulletWorld) -> None:
+    def leave_world(self, world: BulletWorld, *, emptied: bool) -> None:
+        """Look at it no longer; `emptied` if it is gone with all its objects, and not only the episode over."""
         if self._world is not None and self._world.world is world:
+            if emptied:
+                self._world.empty()
             self._world.stop()
             self._world = None
 
@@ -148,11 +151,12 @@ class Episode:
         record: NodeRecord = node.record
         if record.sequence not in self._open_nodes:
             return
-        self._open_nodes.discard(record.sequence)
         failure = failure_value(node.failure, self) if node.failure is not None else None
         result = written_or_missing(node.result, self) if node.result is not None else None
         status: NodeStatus = node.status.value
         self._put_end(NodeEnded(record.sequence, status, failure, result))
+        # Only now: an end that was not written is LOST when the episode ends.
+        self._open_nodes.discard(record.sequence)
 
     def locate(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
@@ -178,7 +182,7 @@ class Episode:
             return
         self.closed = True
         if self._world is not None:
-            self.leave_world(self._world.world)
+            self.leave_world(self._world.world, emptied=False)
         for sequence in sorted(self._open_nodes, reverse=True):
             self._put_end(NodeEnded(sequence, "LOST"))
         self._open_nodes.clear()

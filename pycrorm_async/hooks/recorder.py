@@ -51,6 +51,11 @@ class Recorder:
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
         self.opened_count = 0
 
+    @property
+    def over(self) -> bool:
+        """Whether its memory is closed."""
+        return self._emitter.over
+
     # --- episodes ---------------------------------------------------------------------------------------------
 
     def open_episode(self, *, description: str, plan: str | None = None, seed: int | None = None) -> Episode:
@@ -74,6 +79,8 @@ class Recorder:
 
     def close_episode(self, episode: Episode, failure: BaseException | None) -> None:
         """Its last event. A fault of ours is counted, not raised."""
+        if self._emitter.over:
+            return
         self._open.pop(episode.id, None)
         try:
             episode.end(failure)
@@ -98,13 +105,15 @@ class Recorder:
     # --- the plan layer's port ----------------------------------------------------------------------------------
 
     def admit(self) -> Awaitable[None] | None:
-        if not self._emitter.sink.full:
+        if self._emitter.over or not self._emitter.sink.full:
             return None
         if self._emitter.settings.on_full == "fail":
             raise SpoolFull("the spool is full (spool_bytes_max) and on_full is 'fail': start a writer or make room")
         return self._emitter.sink.room()
 
     def node_started(self, node: TaskTreeNode) -> None:
+        if self._emitter.over:
+            return
         assert node.designator is not None
         before = current_episode.get()
         implicit: Episode | None = None
@@ -130,7 +139,7 @@ class Recorder:
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
-        if record is None:
+        if record is None or self._emitter.over:
             return
         try:
             record.episode.end_node(node)
@@ -138,14 +147,15 @@ class Recorder:
             self._emitter.note_fault("NodeEnded", error)
         if record.implicit:
             self.close_episode(record.episode, node.failure)
-            current_episode.set(record.before)
+            if current_episode.get() is record.episode:  # a dropped plan is closed in whatever context drops it
+                current_episode.set(record.before)
 
     def location_resolved(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
         node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
         episode = self._open_here()
-        if episode is None:
+        if episode is None or self._emitter.over:
             return
         try:
             episode.locate(location=location, offered=offered, taken=taken, considered=considered, node=node)
@@ -160,18 +170,18 @@ class Recorder:
 
     def world_entered(self, world: BulletWorld) -> None:
         episode = self._open_here()
-        if episode is not None:
+        if episode is not None and not self._emitter.over:
             episode.enter_world(world)
 
     def world_left(self, world: BulletWorld) -> None:
         episode = self._open_here()
         if episode is not None:
-            episode.leave_world(world)
+            episode.leave_world(world, emptied=True)
 
 
 def _check_arguments(*, description: object, plan: object, seed: object) -> None:
     """What an episode is opened with must fit its columns. Raises `CallerError` naming the argument."""
-    for name, text in (("description", description), ("plan", plan)):
+    for name, text in (("plan", plan), ("description", description)):
         if text is not None and not (isinstance(text, str) and len(text) <= TEXT_MAX):
             raise CallerError(f"the {name} of an episode must be a str of at most {TEXT_MAX:,} characters")
     if seed is not None and not (isinstance(seed, int) and -(2**63) <= seed < 2**63):

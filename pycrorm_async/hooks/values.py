@@ -36,6 +36,7 @@ __all__ = [
     "written",
     "written_or_missing",
     "failure_value",
+    "message_of",
     "clean",
     "clean_repr",
 ]
@@ -71,12 +72,17 @@ def written(field: FieldDeclared, enum: type[Enum] | None, value: Any, reference
         if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
             raise Unwritable(f"{_a(value)} stands where a list was declared")
         scalar = _WRITERS[field.item or "text"]
-        return [scalar(each, enum, references) for each in value]
+        return [scalar(each, enum, references) if each is not None else None for each in value]
     if field.type == "dict":
         if not isinstance(value, Mapping):
             raise Unwritable(f"{_a(value)} stands where a dict was declared")
         scalar = _WRITERS[field.item or "text"]
-        return {_key(key): scalar(each, enum, references) for key, each in value.items()}
+        entries = {
+            _key(key): scalar(each, enum, references) if each is not None else None for key, each in value.items()
+        }
+        if len(entries) < len(value):
+            raise Unwritable("two keys of the dict have the same text")
+        return entries
     return _WRITERS[field.type](value, enum, references)
 
 
@@ -92,16 +98,20 @@ def written_or_missing(value: Any, references: References) -> Any:
 
 def failure_value(failure: BaseException, references: References) -> FailureValue:
     """Class, message and arguments of an exception. Never raises."""
-    try:
-        message = str(failure)
-    except Exception as error:  # noqa: BLE001  a user's __str__ may raise anything
-        message = f"<its message could not be made: {type(error).__name__}>"
     kind = type(failure)
     return FailureValue(
         type=f"{kind.__module__}.{kind.__qualname__}",
-        message=clean(message)[:_TEXT_MAX],
+        message=clean(message_of(failure))[:_TEXT_MAX],
         arguments=[written_or_missing(each, references) for each in failure.args],
     )
+
+
+def message_of(failure: BaseException) -> str:
+    """The text of an exception. Never raises."""
+    try:
+        return str(failure)
+    except Exception as error:  # noqa: BLE001  a user's __str__ may raise anything
+        return f"<its message could not be made: {type(error).__name__}>"
 
 
 def clean(text: str) -> str:
@@ -135,18 +145,18 @@ def _real(value: Any, _enum: type[Enum] | None, _references: References) -> floa
         if isinstance(value, str | bytes) or not hasattr(value, "__float__"):
             raise Unwritable(f"{_a(value)} stands where a float was declared")
         try:
-            value = float(value)
+            value = float.__float__(value) if isinstance(value, float) else float(value)
         except (TypeError, ValueError, OverflowError) as error:
             raise Unwritable(f"{_a(value)} stands where a float was declared: {error}") from None
     if not math.isfinite(value):
         raise Unwritable(f"{value} is not a finite number")
-    return float(value)
+    return float.__float__(value)
 
 
 def _text(value: Any, _enum: type[Enum] | None, _references: References) -> str:
     if not isinstance(value, str):
         raise Unwritable(f"{_a(value)} stands where a str was declared")
-    return str(_checked(str(value)))
+    return str.__str__(_checked(str.__str__(value)))
 
 
 def _boolean(value: Any, _enum: type[Enum] | None, _references: References) -> bool:

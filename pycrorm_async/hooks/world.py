@@ -47,6 +47,11 @@ class WorldRecorder:
                 self.object_attached(each, child, link)
         world.observe(self)
 
+    def empty(self) -> None:
+        """The world is gone, and so is all that was in it."""
+        for each in tuple(self._references):
+            self.object_removed(each)
+
     def stop(self) -> None:
         """Look no longer; references stay readable."""
         self.world.unobserve(self)
@@ -131,6 +136,8 @@ class WorldRecorder:
 
     def _put(self, made: Callable[[], Happening]) -> int | None:
         """Makes the event and writes it down; whatever goes wrong is counted, and the world's setter goes on."""
+        if self._emitter.over:
+            return None
         try:
             return self._emitter.put(self._episode, made())
         except Exception as error:  # noqa: BLE001  a world's setter never fails because of a memory

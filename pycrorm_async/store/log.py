@@ -8,6 +8,7 @@ await log.close()
 
 from __future__ import annotations
 
+import os
 import uuid
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -40,6 +41,7 @@ class EventLog:
         self.address = address
         self.engine = engine
         self.log_id = log_id
+        self._process = os.getpid()
         self._reads = engine.execution_options(**{BEGIN: "BEGIN"})
         self._file = _identity(address.path)
 
@@ -76,8 +78,9 @@ class EventLog:
             raise
 
     async def close(self) -> None:
-        """Closes every connection."""
-        await self.engine.dispose()
+        """Closes every connection. In a forked child it does nothing: the connections and their threads are the parent's."""
+        if os.getpid() == self._process:
+            await self.engine.dispose()
 
     # --- append -----------------------------------------------------------------------------------------------
 

@@ -97,6 +97,7 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "plans.py").write_text(PLANS)
     (tmp_path / "broken.py").write_text("import math\nmath.no_such_thing\n")
     (tmp_path / "wrong.py").write_text("def plan(:\n")
+    (tmp_path / "types.py").write_text("async def plan(): pass\n")
     (tmp_path / "leaving.py").write_text("raise SystemExit(4)\n")
     return tmp_path
 
@@ -116,6 +117,7 @@ def folder(tmp_path: Path) -> Path:
         (["run", "plans.py:none"], 2, "plans.py has no function 'none'; it has plan,"),
         (["run", "plans.py:sync"], 2, "plans.py:sync is not an async function: write `async def sync()`"),
         (["run", "plans.py:greedy"], 2, "plans.py:greedy takes memory, world: a plan takes the memory, or nothing"),
+        (["run", "types.py"], 2, "types.py has the name of a module of Python's own or one in use"),
         (["writer"], 2, "--once"),
         (["writer", "--once", "--url", "sqlite://"], 2, "nothing to recover"),
         (["run", "plans.py", "--spool", "plans.py"], 3, "plans.py"),
@@ -135,7 +137,7 @@ def test_a_call_that_cannot_be_carried_out_is_one_line(
     [
         ("raises", "the plan plans.py:raises failed: ValueError: the milk is sour (plans.py:", "ERROR"),
         ("fails", "the plan plans.py:fails failed: PlanFailure: the milk is out of reach (plans.py:", "FAILED"),
-        ("cancels", "the plan was cancelled", "INTERRUPTED"),
+        ("cancels", "the plan plans.py:cancels failed: CancelledError (plans.py:", "INTERRUPTED"),
         ("nan_in_a_pose", "NavigateAction.target_location cannot be recorded: the pose holds", "ERROR"),
         ("unrecordable", "NoteAction.weight cannot be recorded: a str stands where a float was declared", "ERROR"),
         ("reserved", "BadActionPerformable cannot be declared: field 'robot_state' has a reserved name", "ERROR"),
@@ -155,10 +157,10 @@ def test_a_plan_that_goes_wrong_ends_with_one_line_and_what_it_did_is_remembered
     assert [(node["parameters"]["text"], node["status"]) for node in notes] == [("a", "SUCCEEDED")]
 
 
-def test_a_plan_that_leaves_the_program_keeps_its_exit_code_and_its_record(folder: Path) -> None:
+def test_a_plan_that_leaves_the_program_has_failed_and_keeps_its_record(folder: Path) -> None:
     done = pycrorm("run", "plans.py:leaves", cwd=folder)
-    assert done.returncode == 5
-    assert "Traceback" not in done.stderr
+    assert "the plan plans.py:leaves failed: SystemExit: 5 (plans.py:" in one_line_of(done)
+    assert done.returncode == 1
     shown = answer("show", "last", cwd=folder)
     assert shown["episode"]["status"] == "ERROR"
     assert [node["status"] for node in shown["tree"]] == ["ERROR", "SUCCEEDED"]
@@ -256,3 +258,29 @@ def test_the_settings_may_come_from_the_environment(folder: Path) -> None:
     assert (folder / "mine.db").exists()
     assert (folder / "mine.spool").is_dir()
     assert not os.path.lexists(folder / "pycrorm.db")
+
+
+def test_a_json_answer_is_one_document_whatever_the_plan_prints(folder: Path) -> None:
+    (folder / "loud.py").write_text("async def plan():\n    print('hello')\n")
+    done = answer("run", "loud.py", cwd=folder)
+    assert (done["failure"], [each["status"] for each in done["episodes"]]) == (None, ["SUCCEEDED"])
+    failed = answer("run", "plans.py:cancels", cwd=folder, code=1)
+    assert failed["failure"].startswith("CancelledError")
+    assert [each["status"] for each in failed["episodes"]] == ["INTERRUPTED"]
+
+
+def test_an_answer_that_cannot_be_written_is_one_line(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*COMMAND, "episodes"],
+            cwd=folder,
+            env=environment(),
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert "No space left on device" in done.stderr.splitlines()[0]
+    assert "Traceback" not in done.stderr
+    assert done.returncode != 0

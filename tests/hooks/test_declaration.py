@@ -184,3 +184,59 @@ def test_a_class_defined_again_at_the_same_place_takes_over() -> None:
     assert declarations.of(first, seen.append) is one
     declarations.of(again, seen.append)
     assert [each.fingerprint for each in seen] == [one.fingerprint, one.fingerprint]
+
+
+def test_a_class_defined_again_with_another_type_is_refused_with_both_types() -> None:
+    def counting(kind: type) -> type[ActionAbstract]:
+        async def perform(self: Any) -> None:
+            """Nothing."""
+
+        namespace = {"__annotations__": {"many": kind}, "perform": perform, "__qualname__": "CountingAction"}
+        return dataclass(type("CountingAction", (ActionAbstract,), namespace))
+
+    declarations = Declarations()
+    seen: list[DeclaredType] = []
+    declarations.of(counting(int), seen.append)
+    with pytest.raises(DeclarationRefused, match="field 'many' was integer before and is real now"):
+        declarations.of(counting(float), seen.append)
+    assert len(seen) == 1
+
+
+def test_a_class_with_the_name_of_a_built_in_one_is_refused() -> None:
+    @dataclass
+    class NavigateAction(ActionAbstract):
+        where: str
+
+        async def perform(self) -> None:
+            """Nothing."""
+
+    with pytest.raises(DeclarationRefused, match=r"pycrorm_async\.plan\.actions\.NavigateActionPerformable is 'Nav"):
+        Declarations().of(NavigateAction, lambda _: None)
+
+
+@pytest.mark.parametrize("dtype", ["we ird'", "pose__1", "", "1st", "a-b"])
+def test_a_dtype_that_is_no_name_is_refused(dtype: str) -> None:
+    namespace = {"dtype": dtype, "perform": EverythingActionPerformable.perform.__wrapped__}  # type: ignore[attr-defined]
+    made: type[ActionAbstract] = type("OddActionPerformable", (ActionAbstract,), namespace)
+    with pytest.raises(DeclarationRefused, match="is not a name"):
+        declared_type(made)
+
+
+def test_a_mapped_class_of_ones_own_belongs_to_its_designator_and_not_to_its_descendants() -> None:
+    class Mapped:
+        __tablename__ = "my_sayings"
+
+    @dataclass
+    class SayActionPerformable(ActionAbstract):
+        text: str
+        orm_class = Mapped
+
+        async def perform(self) -> None:
+            """Nothing."""
+
+    @dataclass
+    class WhisperActionPerformable(SayActionPerformable):
+        volume: float = 0.1
+
+    assert declared_type(SayActionPerformable).declaration.table == "my_sayings"
+    assert declared_type(WhisperActionPerformable).declaration.table == "whisper_action"

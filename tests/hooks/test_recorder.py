@@ -27,6 +27,7 @@ from pycrorm_async.events.happenings import (
     ObjectDetached,
     ObjectMoved,
     ObjectReference,
+    ObjectRemoved,
     PoseValue,
 )
 from pycrorm_async.events.ids import EpisodeId
@@ -53,9 +54,13 @@ class ListSink:
         self.sequences: dict[EpisodeId, int] = {}
         self.full = False
         self.broken = False
+        self.broken_starts = 0
         self.space = asyncio.Event()
 
     def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+        if heading.type == "NodeStarted" and self.broken_starts and b'"action"' in payload:
+            self.broken_starts -= 1
+            raise RuntimeError("the disk is on fire")
         if self.broken:
             raise RuntimeError("the disk is on fire")
         if self.full and not reserved:
@@ -509,3 +514,45 @@ async def test_three_plans_in_three_tasks_never_share_a_parent() -> None:
         if "text" in event.parameters:
             assert event.parent is not None
             assert starts[event.parent].parameters["name"] == event.parameters["text"][0]
+
+
+async def test_a_parameter_whose_reading_raises_is_refused_before_perform_runs() -> None:
+    class Heavy:
+        def __float__(self) -> float:
+            raise RuntimeError("too heavy")
+
+    with rigged() as rig, rig.episode() as episode:
+        note = NoteActionPerformable("x", weight=Heavy())  # type: ignore[arg-type]
+        with pytest.raises(Unrecordable, match=r"NoteAction\.weight .* reading it raised RuntimeError: too heavy"):
+            await note.perform()
+        assert not note.ran
+    assert kinds(rig.sink.of(episode)).count("NodeStarted") == 1
+
+
+async def test_a_start_that_fails_by_our_fault_leaves_no_episode_open() -> None:
+    with rigged() as rig:
+        await NoteActionPerformable("first").perform()
+        rig.sink.broken_starts = 1
+        await NoteActionPerformable("second").perform()
+        await NoteActionPerformable("third").perform()
+        assert rig.emitter.faults.total == 1
+        assert rig.recorder.open_episodes == ()
+    for name in rig.sink.sequences:
+        assert findings(rig.sink.of(name)) == []
+
+
+async def test_a_world_that_is_left_takes_its_objects_with_it() -> None:
+    with rigged() as rig, rig.episode() as episode:
+        for _ in range(2):
+            with BulletWorld():
+                Object("milk", ObjectType.MILK)
+    changes = [(type(e).__name__, e.object.object) for _, e in rig.sink.of(episode) if isinstance(e, ObjectRemoved)]
+    assert changes == [("ObjectRemoved", 3), ("ObjectRemoved", 5)]
+    assert findings(rig.sink.of(episode)) == []
+
+
+async def test_an_implicit_episode_gives_the_context_back_as_it_was() -> None:
+    with rigged() as outer, outer.episode() as episode, rigged() as inner:
+        await NoteActionPerformable("inner").perform()
+        assert current_episode.get() is episode
+    assert len(inner.sink.sequences) == 1

@@ -157,3 +157,25 @@ def test_a_failure_whose_message_cannot_be_made_is_kept_all_the_same() -> None:
             raise RuntimeError
 
     assert failure_value(Mute(), NOBODY).message == "<its message could not be made: RuntimeError>"
+
+
+def test_a_text_that_is_also_an_enum_is_written_as_its_text() -> None:
+    class Side(str, enum.Enum):  # noqa: UP042  the form people write
+        LEFT = "left"
+
+    class Odd(float):
+        def __float__(self) -> float:
+            return 99.0
+
+    assert write("text", Side.LEFT) == "left"
+    assert write("real", Odd(1.5)) == 1.5
+
+
+def test_none_in_a_list_or_a_dict_is_none() -> None:
+    assert write("list", [1, None], item="integer") == [1, None]
+    assert write("dict", {"a": None}, item="pose") == {"a": None}
+
+
+def test_two_keys_of_one_text_are_refused() -> None:
+    with pytest.raises(Unwritable, match="two keys of the dict have the same text"):
+        write("dict", {"LEFT": 1, Arms.LEFT: 2}, item="integer")

@@ -1,10 +1,12 @@
 """A memory as its user meets it: opened, recorded into, asked, closed; with others beside it."""
 
 import asyncio
+import contextvars
 import os
 import sqlite3
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -385,3 +387,189 @@ async def test_importing_the_package_loads_nothing_else() -> None:
     )
     assert done.stdout == "[]\n", done.stderr
     assert os.environ.get("PYCRORM_URL") is None
+
+
+async def test_a_memory_opened_inside_an_episode_of_another_leaves_that_episode_whole(tmp_path: Path) -> None:
+    outer, inner = f"sqlite:///{tmp_path}/1.db", f"sqlite:///{tmp_path}/2.db"
+    async with Memory.open(outer) as one:
+        async with one.episode(description="outer"):
+            await NoteActionPerformable("1").perform()
+            async with Memory.open(inner) as two:
+                await NoteActionPerformable("2").perform()
+                await two.flush()
+                assert await texts(two) == ["2"]
+            await NoteActionPerformable("3").perform()
+        await one.flush()
+        assert [each.description for each in await one.reading.episodes()] == ["outer"]
+        assert await texts(one) == ["1", "3"]
+
+
+async def test_a_forked_child_leaves_the_memory_of_its_parent_alone(tmp_path: Path) -> None:
+    script = (
+        "import asyncio, os, sys\n"
+        "from tests.memory.test_memory import Memory, NoteActionPerformable\n"
+        "async def main():\n"
+        "    async with Memory.open(sys.argv[1]) as memory, memory.episode(description='parent'):\n"
+        "        await NoteActionPerformable('before').perform()\n"
+        "        child = os.fork()\n"
+        "        if child == 0:\n"
+        "            await NoteActionPerformable('in the child').perform()\n"
+        "            os._exit(7)\n"  # the way every worker of multiprocessing leaves
+        "        _, status = os.waitpid(child, 0)\n"
+        "        assert os.waitstatus_to_exitcode(status) == 7\n"
+        "        await NoteActionPerformable('after').perform()\n"
+        "asyncio.run(main())\n"
+    )
+    done = await asyncio.to_thread(
+        subprocess.run,
+        [sys.executable, "-c", script, url_of(tmp_path)],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["before", "after"]
+        assert [each.status for each in await reading.episodes()] == ["SUCCEEDED"]
+
+
+async def test_what_outlives_the_memory_runs_on_and_is_not_recorded(tmp_path: Path) -> None:
+    leave = asyncio.Event()
+
+    async def late() -> str:
+        await NoteActionPerformable("early").perform()
+        await leave.wait()
+        await NoteActionPerformable("late").perform()
+        return "ran"
+
+    async with Memory.open(url_of(tmp_path)) as memory:
+        task = asyncio.create_task(late())
+        await asyncio.sleep(0.1)
+        assert memory.status.faults.total == 0
+    leave.set()
+    assert await task == "ran"
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["early"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"seed": 2**63}, "seed"),
+        ({"seed": "x"}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"description": 5}, "description"),
+        ({"description": "x" * 3_000_000}, "description"),
+        ({"plan": "x" * 3_000_000}, "plan"),
+    ],
+)
+async def test_what_an_episode_cannot_be_opened_with_is_refused_by_name(
+    tmp_path: Path, arguments: dict[str, Any], named: str
+) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with pytest.raises(CallerError, match=f"the {named} of an episode must be"):
+            async with memory.episode(**arguments):
+                pass
+        async with memory.episode(description="fine", seed=-1):
+            await NoteActionPerformable("a").perform()
+        await memory.flush()
+        assert [each.description for each in await memory.reading.episodes()] == ["fine"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"on_full": "waait"}, {"on_unrecordable": ""}, {"batch_events_max": 0}, {"flush_timeout_s": -1.0}]
+)
+def test_a_setting_that_cannot_work_is_refused_by_name(arguments: dict[str, Any]) -> None:
+    with pytest.raises(CallerError, match=rf"Settings\.{next(iter(arguments))} is "):
+        Settings(**arguments)
+
+
+async def test_nothing_of_a_memory_that_is_not_open_is_an_attribute_error(tmp_path: Path) -> None:
+    memory = Memory.open(url_of(tmp_path))
+    for use in (
+        lambda: memory.status,
+        lambda: memory.reading,
+        memory.session,
+        lambda: memory.mapped("NoteAction"),
+        lambda: memory.recent_episodes,
+    ):
+        with pytest.raises(CallerError, match=r"async with Memory\.open"):
+            use()
+
+
+async def test_a_parked_episode_is_told_once(tmp_path: Path) -> None:
+    def other() -> Any:
+        @dataclass
+        class NoteActionPerformable(ActionAbstract):
+            text: int
+
+            async def perform(self) -> None:
+                """Noted."""
+
+        return NoteActionPerformable
+
+    async with Memory.open(url_of(tmp_path)):
+        await NoteActionPerformable("text").perform()
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await other()(7).perform()
+        with pytest.raises(EpisodeParked):
+            await memory.flush()
+        await memory.flush()
+        assert memory.status.faults.total == 0
+
+
+async def test_memories_closed_in_another_order_than_opened_record_what_is_theirs(tmp_path: Path) -> None:
+    one, two = Memory.open(f"sqlite:///{tmp_path}/1.db"), Memory.open(f"sqlite:///{tmp_path}/2.db")
+    await one.__aenter__()
+    await two.__aenter__()
+    await one.__aexit__(None, None, None)
+    await NoteActionPerformable("to the second").perform()
+    await two.flush()
+    assert await texts(two) == ["to the second"]
+    await two.__aexit__(None, None, None)
+    assert recorder.get() is None
+    assert watcher.get() is None
+
+
+async def test_an_opening_that_fails_or_is_cancelled_leaves_no_thread(tmp_path: Path) -> None:
+    def ours() -> set[str]:
+        return {each.name for each in threading.enumerate() if each.name.startswith("pycrorm ")}
+
+    before = ours()
+    for turns in range(12):
+        task = asyncio.create_task(Memory.open(url_of(tmp_path)).__aenter__())
+        for _ in range(turns):
+            await asyncio.sleep(0.01)
+        if task.done():
+            await (await task).__aexit__(None, None, None)
+            continue
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+    for _ in range(500):
+        if ours() <= before:
+            break
+        await asyncio.sleep(0.02)
+    assert ours() <= before
+
+
+async def test_a_dropped_plan_that_is_closed_elsewhere_leaves_the_episode_there_alone(tmp_path: Path) -> None:
+    @dataclass
+    class HangActionPerformable(ActionAbstract):
+        async def perform(self) -> None:
+            await asyncio.sleep(60)
+
+    async with Memory.open(url_of(tmp_path)) as memory:
+        dropped = HangActionPerformable().perform()
+        context = contextvars.copy_context()
+        context.run(dropped.send, None)
+        while recorder.get() is not None and not memory.recent_episodes:
+            context.run(dropped.send, None)
+        async with memory.episode(description="mine"):
+            dropped.close()
+            await NoteActionPerformable("here").perform()
+        await memory.flush()
+        found = {each.description: each.nodes for each in await memory.reading.episodes()}
+        assert found == {"HangAction": 2, "mine": 2}
