@@ -1,7 +1,7 @@
 """Classes for types that have none: made from the declarations in a memory, and belonging to that memory alone.
 
     classes = DynamicClasses()
-    classes.learn(declarations)
+    classes.learn(unite(layout, payloads).accepted.values())
     classes.use_in(engine)                          # this engine's rows of SayingAction become SayingAction objects
     SayingAction = classes.of("SayingAction")
     classes.dispose()
@@ -13,7 +13,7 @@ own, and only the engines that use it know that identity.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 from sqlalchemy import BigInteger, Boolean, Column, Double, ForeignKey, MetaData, Table, Text
@@ -22,7 +22,6 @@ from sqlalchemy.orm import registry, relationship, synonym
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.catalogue import Catalogue
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared, FieldType
 from pycrorm_async.orm.base import Base, Pose
 from pycrorm_async.orm.designators import Action, Designator, Motion
@@ -51,19 +50,20 @@ class DynamicClasses:
         self._classes: dict[str, type[Designator]] = {}
         self._fields: dict[str, set[str]] = {}
         self._engines: list[AsyncEngine] = []
-        self._catalogue = Catalogue()
-        self._payloads: list[bytes] = []
+        self._declared: dict[str, list[DesignatorTypeDeclared]] = {}
 
-    def learn(self, payloads: Iterable[bytes]) -> None:
-        """Makes classes for the types in these declarations that have none, and gives known ones their new fields."""
-        given = list(payloads)
-        if given == self._payloads:
-            return
-        self._payloads = given
-        self._catalogue = self._catalogue.with_payloads(given)
+    def learn(self, declarations: Iterable[DesignatorTypeDeclared]) -> None:
+        """Makes classes for the declared types that have none, and gives known ones their new fields.
+
+        Only what the tables accepted, all of it, in the order of its arrival: classes of what contradicts each other
+        would make every question for a common base fail.
+        """
+        self._declared = {}
+        for each in declarations:
+            self._declared.setdefault(each.dtype, []).append(each)
         grown = False
-        for dtype in self._catalogue.dtypes():
-            if _shared_class(self._names(dtype)) is None:
+        for dtype in self._declared:
+            if self._shared(dtype) is None:
                 grown |= self._make(dtype)
         if grown:
             # A statement compiled before knows nothing of new classes and would meet them unfinished.
@@ -79,12 +79,12 @@ class DynamicClasses:
     def of(self, name: str | type) -> type[Designator]:
         """The mapped class of a dtype, a table or a designator class, built-in ones too. Raises `CallerError`."""
         wanted = getattr(name, "dtype", name.__name__) if isinstance(name, type) else name
-        names = [wanted, *(each.dtype for each in self._catalogue.values() if each.table == wanted)]
-        for each in names:
-            found = self._classes.get(each) or _shared_class(self._names(each))
+        of_table = (dtype for dtype, known in self._declared.items() if any(each.table == wanted for each in known))
+        for dtype in (wanted, *of_table):
+            found = self._classes.get(dtype) or self._shared(dtype)
             if found is not None:
                 return found
-        raise CallerError(f"this memory holds nothing of the type {wanted!r} (it holds: {', '.join(self._types())})")
+        raise CallerError(f"this memory holds nothing of the type {wanted!r} (it holds: {', '.join(self._declared)})")
 
     def dispose(self) -> None:
         """Unmaps all of them: what is left of the objects are plain values. The shared classes forget them."""
@@ -105,21 +105,27 @@ class DynamicClasses:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _types(self) -> Iterator[str]:
-        yield from self._catalogue.dtypes()
+    def _shared(self, dtype: str) -> type[Designator] | None:
+        """The class every memory of this process shares, known by the type's name or one of its tables."""
+        known = self._declared.get(dtype, [])
+        wanted = {dtype, *(each.table for each in known)}
+        for mapper in Designator.__mapper__.self_and_descendants:
+            identity = str(mapper.polymorphic_identity)
+            table = mapper.local_table
+            assert isinstance(table, Table)
+            fits = not known or _root(mapper.class_) is _ROOTS[known[0].kind]
+            if fits and "@" not in identity and wanted & {identity, table.name}:
+                return mapper.class_
+        return None
 
-    def _names(self, dtype: str) -> list[str]:
-        """The type's name, then its tables: what a shared class may be known by."""
-        return [dtype, *(each.table for each in reversed(self._catalogue.of_dtype(dtype)))]
-
-    def _make(self, dtype: str) -> bool:
+    def _make(self, dtype: str, descendants: tuple[str, ...] = ()) -> bool:
         """Whether the class is new or has grown."""
-        fields = self._catalogue.fields_of(dtype)
+        fields = [field for each in self._declared[dtype] for field in each.fields]
         known = self._classes.get(dtype)
         if known is not None:
             return self._add_fields(dtype, known, fields)
-        declared = self._catalogue.of_dtype(dtype)[-1]
-        base = self._base(declared)
+        declared = self._declared[dtype][-1]
+        base = self._base(declared, (*descendants, dtype))
         table = Table(declared.table, self._metadata, Column("id", ForeignKey(base.__table__.c.id), primary_key=True))
         made = type(dtype, (base,), {"__abstract__": True, "__doc__": f"{dtype}, as it was declared."})
         identity = f"{dtype}@{id(self):x}"
@@ -135,27 +141,33 @@ class DynamicClasses:
         self._add_fields(dtype, made, fields)
         return True
 
-    def _base(self, declared: DesignatorTypeDeclared) -> type[Designator]:
-        """The class of the nearest type it descends from."""
+    def _base(self, declared: DesignatorTypeDeclared, descendants: tuple[str, ...]) -> type[Designator]:
+        """The class of the nearest type it descends from. One of another kind does not count, nor a descendant (two
+        processes may have it the other way round)."""
+        root = _ROOTS[declared.kind]
         for dtype in declared.bases:
-            found = self._classes.get(dtype) or _shared_class(self._names(dtype))
-            if found is None and self._catalogue.of_dtype(dtype):
-                self._make(dtype)
+            found = self._classes.get(dtype) or self._shared(dtype)
+            if found is None and dtype in self._declared and dtype not in descendants:
+                self._make(dtype, descendants)
                 found = self._classes.get(dtype)
-            if found is not None:
+            if found is not None and _root(found) is root:
                 return found
-        return _ROOTS[declared.kind]
+        return root
 
     def _add_fields(self, dtype: str, made: type[Designator], fields: Iterable[FieldDeclared]) -> bool:
-        new = [each for each in fields if each.name not in self._fields[dtype]]
-        for field in new:
-            self._fields[dtype].add(field.name)
+        present = self._fields[dtype]
+        before = len(present)
+        for field in fields:
+            if field.name in present:
+                continue
+            present.add(field.name)
             if not made.__mapper__.has_property(field.name):  # a base's attribute shows the same value
                 self._add_field(made, field)
-        if new:
+        grown = len(present) > before
+        if grown:
             for engine in self._engines:
                 engine.sync_engine.clear_compiled_cache()
-        return bool(new)
+        return grown
 
     def _add_field(self, made: type[Designator], field: FieldDeclared) -> None:
         if field.type in ("list", "dict"):
@@ -198,13 +210,9 @@ def _entries(field: FieldDeclared) -> property:
     return property(lambda designator: read(designator, field.name))
 
 
-def _shared_class(names: Iterable[str]) -> type[Designator] | None:
-    """The class every memory of this process shares, by one of its names: type or table."""
-    wanted = set(names)
-    for mapper in Designator.__mapper__.self_and_descendants:
-        identity = str(mapper.polymorphic_identity)
-        table = mapper.local_table
-        assert isinstance(table, Table)
-        if "@" not in identity and wanted & {identity, table.name}:
-            return mapper.class_
-    return None
+def _root(made: type[Designator]) -> type[Designator]:
+    """Which of the classes that are there always it is, or descends from."""
+    for root in (Action, Motion):
+        if issubclass(made, root):
+            return root
+    return Designator

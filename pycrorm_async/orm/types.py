@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 from sqlalchemy import BigInteger, Dialect, String, Text
+from sqlalchemy.orm import Mapper
 from sqlalchemy.types import TypeDecorator
 
 __all__ = ["Moment", "Named", "JsonText", "ClassOfRow", "KnownClasses", "known_classes"]
@@ -86,7 +87,10 @@ class KnownClasses:
         self._size = -1
 
     def identity(self, lineage: str, mapped: Mapping[str, Any]) -> str:
-        """The polymorphic identity for this lineage; its last name is a class always."""
+        """The polymorphic identity for this lineage; its last name is a class always.
+
+        Classes of another kind are passed over: an author may map as an action what another process does as a motion.
+        """
         if self._size != len(mapped):  # a class was declared since
             self._found.clear()
             self._size = len(mapped)
@@ -96,14 +100,21 @@ class KnownClasses:
                 mapper.local_table.name: identity for identity, mapper in list(mapped.items()) if "@" not in identity
             }
             known = {name: name for name in mapped} | tables | self.own
-            names = lineage.split(" ")
-            found = self._found[lineage] = next((known[name] for name in names if name in known), names[-1])
+            *names, root = lineage.split(" ")
+            fitting = (known[name] for name in names if name in known and _root(mapped[known[name]]) == root)
+            found = self._found[lineage] = next(fitting, root)
         return found
 
     def adopt(self, own: Mapping[str, str]) -> None:
         """From now on these names mean these identities in this engine."""
         self.own = dict(own)
         self._found.clear()
+
+
+def _root(mapper: Mapper[Any]) -> str:
+    """Action, Motion or Designator, whichever is nearest."""
+    identities = (str(each.polymorphic_identity) for each in mapper.iterate_to_root())
+    return next(each for each in identities if each in ("Action", "Motion", "Designator"))
 
 
 def known_classes(dialect: Dialect) -> KnownClasses:

@@ -12,7 +12,7 @@ from typing import NamedTuple, Self
 
 import msgspec
 
-from pycrorm_async.events.fields import table_name
+from pycrorm_async.events.fields import fault_in_table, table_name
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldType
 from pycrorm_async.projections.tables import CORE, Storage
 
@@ -94,12 +94,17 @@ class Layout(msgspec.Struct, frozen=True):
         )
 
     def _refuse_taken(self, declared: DesignatorTypeDeclared) -> None:
+        fault = fault_in_table(declared.table)
+        if fault is not None:
+            raise Contradictory(f"{declared.dtype}: {fault}")
+        asks = f"{declared.dtype} asks for the table {declared.table}"
+        for dtype, each in self.types.items():
+            if declared.table in each.tables and dtype != declared.dtype:
+                raise Contradictory(f"{asks}, which is that of {dtype} (set another dtype)")
         # Databases take names that differ in case alone for the same.
-        lowered = declared.table.lower()
-        taken = TAKEN_NAMES | {name.lower() for name in self.user_views}
-        taken |= {name.lower() for name in self.leaves if name != declared.table}
-        if lowered in taken:
-            raise Contradictory(f"{declared.dtype} asks for the table {declared.table}, whose name is taken")
+        for name in (*self.user_views, *(each for each in self.leaves if each != declared.table)):
+            if name.lower() == declared.table.lower():
+                raise Contradictory(f"{asks}, and {name} is there already (set another dtype)")
 
     def members(self, table: str) -> tuple[str, ...]:
         """The leaf tables whose rows the view of `table` shows: its own, then those of its types' and descendants'."""
@@ -107,7 +112,7 @@ class Layout(msgspec.Struct, frozen=True):
         shown = [
             member
             for dtype, each in self.types.items()
-            if dtype in own or own.intersection(each.bases)
+            if dtype in own or own.intersection(self._bases(each))
             for member in each.tables
         ]
         return tuple(dict.fromkeys((table, *shown)))
@@ -116,10 +121,14 @@ class Layout(msgspec.Struct, frozen=True):
         """The names a row of this type answers to, nearest first, the last one a class that always exists."""
         known = self.types[dtype]
         names = [dtype, *(table for table in reversed(known.tables) if table != table_name(dtype))]
-        for base in known.bases:
+        for base in self._bases(known):
             tables = self.types[base].tables if base in self.types else ()
             names += [base, *(table for table in reversed(tables) if table != table_name(base))]
         return " ".join([*names, _BASE_OF_KIND[known.kind]])
+
+    def _bases(self, each: DesignatorType) -> list[str]:
+        """Without those of another kind: a motion is never among the actions, whatever its class descends from."""
+        return [base for base in each.bases if base not in self.types or self.types[base].kind == each.kind]
 
 
 def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mapping[str, Storage]) -> None:

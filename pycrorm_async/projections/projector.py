@@ -21,8 +21,6 @@ from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import InternalError
-from pycrorm_async.events.codec import declaration_of, fingerprint
-from pycrorm_async.events.happenings import DesignatorTypeDeclared
 from pycrorm_async.projections.classes import mapped_leaves
 from pycrorm_async.projections.fold import CannotFold, fold
 from pycrorm_async.projections.generations import (
@@ -31,9 +29,10 @@ from pycrorm_async.projections.generations import (
     grow,
     make_generation,
 )
-from pycrorm_async.projections.layout import Contradictory, Layout
+from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.parameters import Designators
 from pycrorm_async.projections.rows import Rows
+from pycrorm_async.projections.union import unite
 from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
 from pycrorm_async.projections.write import write_rows
 from pycrorm_async.store.log import EventLog
@@ -41,7 +40,7 @@ from pycrorm_async.store.progress import advance_folded, park
 from pycrorm_async.store.rows import StoredEvent
 from pycrorm_async.store.sqlite.faults import ours
 
-__all__ = ["Projector", "united"]
+__all__ = ["Projector"]
 
 
 @dataclass(frozen=True)
@@ -145,8 +144,9 @@ class Projector:
         payloads = await self._log.declarations()
         types = self._types
         if types is None or types.revision != self._generation.revision or types.payloads != payloads:
-            layout, designators = united(self._generation.layout, payloads)
-            types = self._types = _Types(payloads, self._generation.revision, layout, designators)
+            layout, accepted, refused = unite(self._generation.layout, payloads)
+            types = _Types(payloads, self._generation.revision, layout, Designators(accepted, refused))
+            self._types = types
         return types
 
     async def _fold_apart(self, events: Sequence[StoredEvent], error: Exception) -> int:
@@ -170,21 +170,6 @@ class Projector:
             yield
         except DBAPIError as error:
             raise ours(error, str(self._log.address)) from error
-
-
-def united(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Designators]:
-    """The layout with these declarations, and how to fold them; those that cannot share the tables are refused."""
-    declared: dict[str, DesignatorTypeDeclared] = {}
-    refused: dict[str, str] = {}
-    for payload in payloads:
-        name = fingerprint(payload)
-        declaration = declaration_of(payload)
-        try:
-            layout = layout.with_declaration(declaration)
-            declared[name] = declaration
-        except Contradictory as reason:
-            refused[name] = str(reason)
-    return layout, Designators(declared, refused)
 
 
 def _folded(events: Sequence[StoredEvent], designators: Designators) -> _Folded:

@@ -20,7 +20,8 @@ from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.projections.generations import current_generation
+from pycrorm_async.projections.generations import Generation, current_generation
+from pycrorm_async.projections.union import unite
 from pycrorm_async.query import questions
 from pycrorm_async.query.frames import dataframe
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
@@ -40,6 +41,7 @@ class Reading:
     def __init__(self, log: EventLog) -> None:
         self._log = log
         self._classes = DynamicClasses()
+        self._declarations: list[bytes] = []
         self._classes.use_in(log.engine)
         self._sessions = async_sessionmaker(log.engine, expire_on_commit=False)
 
@@ -63,7 +65,8 @@ class Reading:
         try:
             reading = cls(log)
             try:
-                await reading._recognise()
+                await reading._generation()
+                await reading.refresh()
                 yield reading
             finally:
                 reading._classes.dispose()
@@ -72,7 +75,11 @@ class Reading:
 
     async def refresh(self) -> None:
         """Learns the designator types that were declared since; every session begins with it."""
-        self._classes.learn(await self._log.declarations())
+        declarations = await self._log.declarations()
+        if declarations != self._declarations:
+            generation = await self._generation()
+            self._classes.learn(unite(generation.layout, declarations).accepted.values())
+            self._declarations = declarations
 
     @asynccontextmanager
     async def session(self) -> AsyncIterator[AsyncSession]:
@@ -119,14 +126,15 @@ class Reading:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    async def _recognise(self) -> None:
+    async def _generation(self) -> Generation:
         with self._translated():
             async with self._log.engine.connect() as connection:
-                if await current_generation(connection) is None:
-                    raise DatabaseUnavailable(
-                        f"{self._log.address} has a log and no tables yet: `pycrorm writer --once` makes them"
-                    )
-        await self.refresh()
+                generation = await current_generation(connection)
+        if generation is None:
+            raise DatabaseUnavailable(
+                f"{self._log.address} has a log and no tables yet: `pycrorm writer --once` makes them"
+            )
+        return generation
 
     @contextmanager
     def _translated(self) -> Iterator[None]:

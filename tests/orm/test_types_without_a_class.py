@@ -24,7 +24,9 @@ from pycrorm_async.events.happenings import (
 )
 from pycrorm_async.orm import Action, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
+from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.union import unite
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms
@@ -74,10 +76,14 @@ def names(found: list[Any]) -> list[str]:
     return [type(each).__name__ for each in found]
 
 
+async def accepted(log: EventLog) -> list[DesignatorTypeDeclared]:
+    return list(unite(Layout(), await log.declarations()).accepted.values())
+
+
 @asynccontextmanager
 async def classes_of(log: EventLog) -> AsyncIterator[DynamicClasses]:
     classes = DynamicClasses()
-    classes.learn(await log.declarations())
+    classes.learn(await accepted(log))
     classes.use_in(log.engine)
     try:
         yield classes
@@ -175,7 +181,7 @@ async def test_a_type_that_appears_after_the_question_was_first_asked_is_in_the_
         await log.append([*KINDS, *all_kinds().records])
         await projector.fold_behind()
         assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
-        classes.learn(await log.declarations())
+        classes.learn(await accepted(log))
         assert names(await every(log, select(Action).order_by(Action.id))) == ["CarefulPickUpAction", "SayingAction"]
         assert names(await every(log, select(PickUpAction))) == ["CarefulPickUpAction"]
 
@@ -190,7 +196,7 @@ async def test_a_field_that_appears_later_is_an_attribute_of_the_class_there_is(
         script.put(NodeStarted("action", None, name_of(louder), {"text": "HI", "volume": 0.5}))
         await log.append([*declarations(louder), *script.records])
         await projector.fold_behind()
-        classes.learn(await log.declarations())
+        classes.learn(await accepted(log))
         grown: Any = classes.of("SayingAction")
         assert grown is saying
         said = await every(log, select(grown).order_by(grown.id))

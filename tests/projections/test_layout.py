@@ -45,11 +45,11 @@ def test_lists_and_dicts_have_no_column() -> None:
         (declared("SayingAction", "saying_action", kind="motion"), "SayingAction is declared as action and as motion"),
         (
             declared("PoseAction", "pose", field("x", "real", 2)),
-            "PoseAction asks for the table pose, whose name is taken",
+            "PoseAction: its table would be 'pose', which the memory itself uses (set another dtype)",
         ),
         (
             declared("Saying", "Saying_Action", field("text", "text", 2)),
-            "Saying asks for the table Saying_Action, whose name is taken",
+            "Saying asks for the table Saying_Action, and saying_action is there already (set another dtype)",
         ),
     ],
     ids=["another type", "another case", "another kind", "a table of ours", "a table in another case"],

@@ -1,0 +1,40 @@
+"""Declarations of one type unite; what contradicts is refused whole, and nothing else."""
+
+from __future__ import annotations
+
+from pycrorm_async.events.codec import encode
+from pycrorm_async.events.happenings import DesignatorTypeDeclared
+from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.union import unite
+from tests.projections.script import declared, field, name_of
+
+TEXT = declared("NoteAction", "note_action", field("text", "text", 2))
+NUMBER = declared("NoteAction", "note_action", field("text", "integer", 2), field("weight", "real", 3))
+ENUM = declared("NoteAction", "note_action", field("text", "enum", 2), field("weight", "real", 3))
+
+
+def bytes_of(*types: DesignatorTypeDeclared) -> list[bytes]:
+    return [encode(each) for each in types]
+
+
+def test_a_field_added_later_joins_the_earlier_ones() -> None:
+    united = unite(Layout(), bytes_of(TEXT, ENUM))
+    assert united.layout.leaves == {"note_action": {"text": "text", "weight": "real"}}
+    assert (united.accepted, united.refused) == ({name_of(TEXT): TEXT, name_of(ENUM): ENUM}, {})
+
+
+def test_a_declaration_that_contradicts_is_refused_with_all_its_fields() -> None:
+    united = unite(Layout(), bytes_of(TEXT, NUMBER))
+    assert united.layout.leaves == {"note_action": {"text": "text"}}
+    assert united.accepted == {name_of(TEXT): TEXT}
+    assert united.refused == {
+        name_of(NUMBER): "NoteAction.text is declared as text and as integer (types that share a name must agree:"
+        " rename one field or set another dtype)"
+    }
+
+
+def test_what_was_accepted_once_is_accepted_again_and_what_was_refused_is_refused_again() -> None:
+    payloads = bytes_of(TEXT, NUMBER, ENUM)
+    united = unite(Layout(), payloads)
+    assert set(united.refused) == {name_of(NUMBER)}
+    assert unite(united.layout, payloads) == united
