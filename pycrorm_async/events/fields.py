@@ -20,11 +20,11 @@ from pycrorm_async.events.ids import SLOT_FIRST_FIELD, SLOT_MAX
 
 __all__ = [
     "RESERVED_COLUMNS",
-    "RESERVED_TABLES",
     "table_name",
     "column_name",
     "fault_in_fields",
     "fault_in_table",
+    "is_reserved",
 ]
 
 RESERVED_COLUMNS = frozenset(
@@ -33,12 +33,14 @@ RESERVED_COLUMNS = frozenset(
 )
 """Every designator has these already."""
 
-RESERVED_TABLES = frozenset(
+_RESERVED_TABLES = frozenset(
     "event episode process_metadata task_tree_node designator action motion language robot_state pose position"
     " quaternion object object_removal object_part believe_object parameter_item attachment joint_change"
     " location_resolution location_candidate detection pick_up_with_context_view pickupwithcontextview".split()
 )
-"""Tables and views of the memory itself; names that begin with `pycrorm_`, `sqlite_` or `pg_` are taken as well."""
+"""Tables and views of the memory itself, the planned ones too."""
+_RESERVED_BEGINNINGS = ("pycrorm_", "sqlite_", "pg_")
+_OF_A_GENERATION = re.compile(r"__[0-9]+$")
 
 _NAME_LENGTH_MAX = 60
 _WORD_START = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
@@ -58,10 +60,23 @@ def column_name(field: str, kind: FieldType) -> str:
     return f"{field}_id" if kind in ("pose", "object") else field
 
 
+def is_reserved(name: str) -> bool:
+    """Whether a table or view of this name is the memory's own, or the database's.
+
+    >>> is_reserved("Pose"), is_reserved("pose__1"), is_reserved("saying_action")
+    (True, True, False)
+    """
+    lowered = name.lower()
+    return (
+        lowered in _RESERVED_TABLES
+        or lowered.startswith(_RESERVED_BEGINNINGS)
+        or _OF_A_GENERATION.search(lowered) is not None
+    )
+
+
 def fault_in_table(table: str) -> str | None:
     """Why a designator's table cannot have this name; None if it can."""
-    lowered = table.lower()
-    if lowered in RESERVED_TABLES or lowered.startswith(("pycrorm_", "sqlite_", "pg_")):
+    if is_reserved(table):
         return f"its table would be {table!r}, which the memory itself uses (set another dtype)"
     if len(table.encode()) > _NAME_LENGTH_MAX:
         return f"its table's name {table!r} is longer than {_NAME_LENGTH_MAX} bytes (set a shorter dtype)"

@@ -14,9 +14,9 @@ import msgspec
 
 from pycrorm_async.events.fields import fault_in_table, table_name
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldType
-from pycrorm_async.projections.tables import CORE, Storage
+from pycrorm_async.projections.tables import Storage
 
-__all__ = ["Layout", "DesignatorType", "Leaf", "Contradictory", "STORED_AS", "TAKEN_NAMES"]
+__all__ = ["Layout", "DesignatorType", "Leaf", "Contradictory", "STORED_AS"]
 
 STORED_AS: dict[FieldType, Storage] = {
     "integer": "integer",
@@ -31,9 +31,6 @@ STORED_AS: dict[FieldType, Storage] = {
 """A field's column; lists and dicts have none."""
 
 _BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Designator"}
-
-TAKEN_NAMES = frozenset(CORE) | {"designator", "action", "motion", "robot_state", "position", "quaternion"}
-"""Tables and views that are no designator's."""
 
 
 class Contradictory(ValueError):

@@ -15,8 +15,9 @@ from sqlalchemy import Dialect, Select, TableClause, column, select, table
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.fields import is_reserved
 from pycrorm_async.orm import Object, PickUpAction, Pose, TaskTreeNode
-from pycrorm_async.projections.layout import TAKEN_NAMES, Layout
+from pycrorm_async.projections.layout import Layout
 
 __all__ = ["UserView", "BUILT_IN_VIEWS", "view_texts", "view_text"]
 
@@ -46,11 +47,11 @@ def view_text(meaning: Any, dialect: Dialect) -> str:
 
 def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> dict[str, str]:
     """Name and SQL of these views. Raises `CallerError` for a name that is taken."""
-    taken = {name.lower() for name in (*TAKEN_NAMES, *layout.leaves)}
+    taken = {name.lower() for name in layout.leaves}
     texts: dict[str, str] = {}
     for view in views:
         lowered = view.name.lower()
-        if lowered in taken or lowered.startswith(("pycrorm_", "sqlite_")) or lowered in ("event", "episode"):
+        if lowered in taken or (is_reserved(view.name) and view not in BUILT_IN_VIEWS):
             raise CallerError(f"a view cannot be called {view.name!r}: the name is taken (choose another)")
         taken.add(lowered)
         texts[view.name] = view_text(view.meaning, dialect)

@@ -53,7 +53,7 @@ def test_more_fields_than_slots_are_refused() -> None:
     assert fault_in_fields([declared(f"f{n}") for n in range(31)]) == "it has 31 fields, 30 are the most"
 
 
-@pytest.mark.parametrize("table", ["action", "pose", "event", "pycrorm_log", "sqlite_master", "Object"])
+@pytest.mark.parametrize("table", ["action", "pose", "event", "pycrorm_log", "sqlite_master", "Object", "pose__1"])
 def test_a_table_of_the_memory_itself_is_refused(table: str) -> None:
     fault = fault_in_table(table)
     assert fault is not None

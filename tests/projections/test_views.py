@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from sqlalchemy import func, select
+from sqlalchemy.dialects import sqlite
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
@@ -18,8 +19,10 @@ from pycrorm_async.events.happenings import (
 )
 from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextView, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.projections.generations import current_generation
+from pycrorm_async.projections.layout import Contradictory
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.views import UserView
+from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.projections.asking import ask, stored_and_folded
@@ -100,8 +103,25 @@ async def test_a_view_of_a_user_stays_when_another_process_opens_the_memory_with
 
 
 @pytest.mark.parametrize(
-    "name", ["pose", "Action", "event", "episode", "pycrorm_x", "park_arms_action", "pickupWithContextView"]
+    "name",
+    ["pose", "Action", "event", "pycrorm_x", "pg_x", "pose__1", "x__12", "park_arms_action", "pickupWithContextView"],
 )
 async def test_a_view_cannot_take_a_name_that_is_taken(log: EventLog, name: str) -> None:
     with pytest.raises(CallerError, match=f"a view cannot be called '{name}'"):
         await Projector(log, views=[UserView(name, select(ParkArmsAction.arm))]).open()
+
+
+async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_views(log: EventLog) -> None:
+    await Projector(log).open()
+    names = {name for (name,) in await ask(log, "SELECT name FROM sqlite_master WHERE type IN ('table', 'view')")}
+    assert len(names) > 60
+    assert {"event", "pycrorm_generation", "designator", "pose", "pose__1", "PickUpWithContextView"} <= names
+    async with log.engine.connect() as connection:
+        generation = await current_generation(connection)
+    assert generation is not None
+    layout = generation.layout
+    for name in names:
+        with pytest.raises(Contradictory):
+            layout.with_declaration(declared("NobodysAction", name))
+        with pytest.raises(CallerError):
+            view_texts([*BUILT_IN_VIEWS, UserView(name, select(ParkArmsAction.arm))], layout, sqlite.dialect())
