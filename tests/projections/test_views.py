@@ -120,7 +120,9 @@ async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_vie
         generation = await current_generation(connection)
     assert generation is not None
     layout = generation.layout
-    for name in names:
+    # The table of an author's class waits for the designator that will name it.
+    waiting = layout.leaves.keys() - {table for each in layout.types.values() for table in each.tables}
+    for name in names - waiting:
         with pytest.raises(Contradictory):
             layout.with_declaration(declared("NobodysAction", name))
         with pytest.raises(CallerError):
