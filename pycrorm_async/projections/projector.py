@@ -11,8 +11,7 @@ may work on one memory, and none of them ever shows an event twice or half.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
@@ -38,7 +37,6 @@ from pycrorm_async.projections.write import write_rows
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import advance_folded, park
 from pycrorm_async.store.rows import StoredEvent
-from pycrorm_async.store.sqlite.faults import ours
 
 __all__ = ["Projector"]
 
@@ -83,7 +81,7 @@ class Projector:
 
         Raises `DatabaseForeign` for tables of another version, `CallerError` for a view whose name is taken.
         """
-        with self._translated():
+        with self._log.translated():
             async with self._log.engine.begin() as connection:
                 found = await current_generation(connection)
                 generation = found or await make_generation(connection, 1)
@@ -100,7 +98,7 @@ class Projector:
         go on. Raises `DatabaseUnavailable`; what was folded stays, and the call may be made again.
         """
         count = 0
-        with self._translated():
+        with self._log.translated():
             while events := await self._log.unfolded(self._batch_events):
                 count += await self._fold_batch(events)
         return count
@@ -163,13 +161,6 @@ class Projector:
             fault = error.orig if isinstance(error, DBAPIError) else error
             await park(connection, events[0].number, f"event {events[0].sequence}: the database refuses it: {fault}")
         return 0
-
-    @contextmanager
-    def _translated(self) -> Iterator[None]:
-        try:
-            yield
-        except DBAPIError as error:
-            raise ours(error, str(self._log.address)) from error
 
 
 def _folded(events: Sequence[StoredEvent], designators: Designators) -> _Folded:

@@ -8,12 +8,11 @@ async with Reading.open("sqlite:///memory.db") as reading:
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Self
 
 from sqlalchemy import Select
-from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncSession, async_sessionmaker
 
 from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
@@ -27,7 +26,6 @@ from pycrorm_async.query.frames import dataframe
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.sqlite.faults import ours
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,7 +88,7 @@ class Reading:
 
     async def dataframe(self, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
         """The answer as a pandas DataFrame, see `pycrorm_async.query.frames`. Raises `MissingExtra`."""
-        with self._translated():
+        with self._log.translated():
             return await dataframe(self._log.engine, statement)
 
     def mapped(self, designator: str | type) -> type[Designator]:
@@ -104,17 +102,17 @@ class Reading:
 
     async def episodes(self) -> list[EpisodeSummary]:
         """Every episode, the oldest first."""
-        with self._translated():
+        with self._log.translated():
             return await questions.episodes(self._log.engine)
 
     async def episode(self, name: str) -> EpisodeSummary:
         """The episode of that number, or id, or first digits of its id, or `last`. Raises `UnknownEpisode`."""
-        with self._translated():
+        with self._log.translated():
             return await questions.episode_named(self._log.engine, name)
 
     async def tree(self, number: int) -> list[NodeSummary]:
         """The task tree of an episode, each node before its children."""
-        with self._translated():
+        with self._log.translated():
             return await questions.task_tree(self._log.engine, number)
 
     async def number_of(self, episode: str) -> int:
@@ -127,7 +125,7 @@ class Reading:
     # --- inside -----------------------------------------------------------------------------------------------
 
     async def _generation(self) -> Generation:
-        with self._translated():
+        with self._log.translated():
             async with self._log.engine.connect() as connection:
                 generation = await current_generation(connection)
         if generation is None:
@@ -135,10 +133,3 @@ class Reading:
                 f"{self._log.address} has a log and no tables yet: `pycrorm writer --once` makes them"
             )
         return generation
-
-    @contextmanager
-    def _translated(self) -> Iterator[None]:
-        try:
-            yield
-        except DBAPIError as error:
-            raise ours(error, str(self._log.address)) from error

@@ -77,8 +77,14 @@ class EventLog:
             await engine.dispose()
             raise
 
+    @contextmanager
+    def translated(self) -> Iterator[None]:
+        """Inside, a fault of the database is raised as the error of ours it is: for what others do with `engine`."""
+        with _translated(str(self.address)):
+            yield
+
     async def close(self) -> None:
-        """Closes every connection. In a forked child it does nothing: the connections and their threads are the parent's."""
+        """Closes every connection. In a forked child it does nothing: connections and threads are the parent's."""
         if os.getpid() == self._process:
             await self.engine.dispose()
 
@@ -93,7 +99,7 @@ class EventLog:
         """
         if not records:
             return {}
-        with _translated(str(self.address)):
+        with self.translated():
             async with self.engine.begin() as connection:
                 refusals = await append_batch(connection, records)
         # SQLite goes on writing into a file that was removed or replaced, where nobody will find it.
@@ -133,7 +139,7 @@ class EventLog:
         return [bytes(row[0]) for row in await self._rows(sql.SELECT_DECLARATIONS)]
 
     async def _rows(self, statement: str, *parameters: Any) -> Sequence[Any]:
-        with _translated(str(self.address)):
+        with self.translated():
             async with self._reads.connect() as connection:
                 return (await connection.exec_driver_sql(statement, parameters)).all()
 
