@@ -54,6 +54,8 @@ def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
 
 
 def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: Designators, rows: Rows) -> None:
+    if event.number in rows.episodes:
+        raise CannotFold("the episode starts a second time")
     rows.episodes[event.number] = [
         event.number,
         microseconds(event.wall_ns),
@@ -95,7 +97,7 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     parameters = designator.parameters(event, started.parameters) if designator else Parameters()
     parent = row(number, started.parent) if started.parent is not None else None
     robot = _robot_columns(event, started.robot)
-    # Nothing raises from here on.
+    # Nothing raises from here on: an event leaves all of its rows or none.
     if started.robot is not None:
         rows.inserts["pose"].append(_pose_row(event, SLOT_ROBOT_POSE, started.robot.pose))
     if designator is not None:

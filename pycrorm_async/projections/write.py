@@ -24,7 +24,10 @@ often."""
 
 
 async def write_rows(connection: AsyncConnection, rows: Rows, generation: int) -> None:
-    """Inserts and updates all of it in this transaction. A row that is there already stays as it is."""
+    """Inserts and updates all of it in this transaction, which notes the progress too.
+
+    So no row is there already; one that is would be a fault of the fold or of the log, and raises `IntegrityError`.
+    """
     for (table, columns), made in rows.to_insert().items():
         await _insert(connection, physical_name(table, generation), columns, made)
     await _update(connection, physical_name("task_tree_node", generation), NodeEnd._fields, rows.node_ends)
@@ -43,9 +46,7 @@ async def _insert(
     quote = connection.dialect.identifier_preparer.quote
     into = f"INSERT INTO {quote(table)} ({', '.join(map(quote, columns))}) VALUES "  # noqa: S608
     for part in _parts(rows, len(columns)):
-        await connection.exec_driver_sql(
-            f"{into}{_placeholders(part)} ON CONFLICT DO NOTHING", tuple(chain.from_iterable(part))
-        )
+        await connection.exec_driver_sql(f"{into}{_placeholders(part)}", tuple(chain.from_iterable(part)))
 
 
 async def _update(

@@ -172,9 +172,7 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_g
         case "contradicting":
             first.put(NodeStarted("action", 2, name_of(numeric), {"text": 1}))
         case _:
-            nothing = ("description", "created_by", "host", "software", "python")
-            started = "{" + "".join(f'"{name}":"",' for name in nothing) + '"seed":18446744073709551615}'
-            first.put_payload("EpisodeStarted", started.encode())
+            first.put(LocationResolved("CostmapLocation", considered=2**64 - 1))
     first.put(NodeEnded(2, "SUCCEEDED"))
     second.put(NodeStarted("action", 2, name_of(SAYING), {"text": "hi"}))
     projector = await stored_and_folded(log, [*declarations(SAYING, numeric), *mixed(first, second)])
@@ -187,6 +185,26 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_g
     ]
     assert await ask(log, "SELECT * FROM saying_action") == [(row(3, number=2), "hi")]
     assert await projector.fold_behind() == 0
+
+
+@pytest.mark.parametrize("batch_events", [1, 2, 10_000])
+async def test_an_event_whose_row_is_there_already_parks_its_episode_and_changes_nothing(
+    log: EventLog, batch_events: int
+) -> None:
+    script = Script()
+    script.put(EpisodeStarted("the first", "me", "host", "1.0", "3.11"))
+    script.put(NodeStarted("root"))
+    script.put(EpisodeStarted("the second", "me", "host", "1.0", "3.11"))
+    script.put(NodeEnded(2, "SUCCEEDED"))
+    await log.append(script.records)
+    projector = Projector(log, batch_events=batch_events)
+    await projector.open()
+    await projector.fold_behind()
+    assert await ask(log, "SELECT description FROM process_metadata") == [("the first",)]
+    assert await ask(log, "SELECT status FROM task_tree_node") == [("RUNNING",)]
+    assert await ask(log, "SELECT folded FROM episode") == [(2,)]
+    ((reason,),) = await ask(log, "SELECT parked FROM episode")
+    assert reason.startswith("event 3: ")
 
 
 async def test_a_type_that_grows_gets_a_column_and_older_rows_stay(log: EventLog) -> None:
