@@ -7,7 +7,7 @@ and arms as they are now. Nothing is moved.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from pycrorm_async.plan.errors import NoWorldHere
 from pycrorm_async.plan.grasping import pick_up_poses, place_pose, retracted
@@ -23,9 +23,6 @@ __all__ = ["stands"]
 
 CELLS_MAX = 600
 VISIBLE_SHARE_MIN = 0.5
-
-Goals = Callable[[Arms, Pose], tuple[Pose, ...]]
-"""For an arm and a standing pose, the goals of its tool frame."""
 
 
 def stands(
