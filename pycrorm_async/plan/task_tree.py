@@ -31,7 +31,7 @@ NodeKind = Literal["root", "action", "motion", "language"]
 
 
 class TaskStatus(Enum):
-    """How far a node got. LOST is never seen by a plan: its process died while the node was running."""
+    """How far a node got."""
 
     RUNNING = "RUNNING"
     SUCCEEDED = "SUCCEEDED"
@@ -43,6 +43,7 @@ class TaskStatus(Enum):
     INTERRUPTED = "INTERRUPTED"
     """By a monitor."""
     LOST = "LOST"
+    """Nobody saw it end: its process died, or its episode ended while it was running. Never seen by a plan."""
 
 
 class TaskTreeNode:
