@@ -15,7 +15,7 @@ import msgspec
 
 from pycrorm_async.events.happenings import EVENT_TYPES, DesignatorTypeDeclared, Happening
 
-__all__ = ["NotEncodable", "encode", "decode", "fingerprint", "unwritable"]
+__all__ = ["NotEncodable", "encode", "decode", "fingerprint", "declaration_of", "unwritable"]
 
 
 class NotEncodable(ValueError):

@@ -125,7 +125,7 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
 
 
 def _robot_columns(event: StoredEvent, robot: RobotValue | None) -> Row:
-    """robot_pose_id to robot_object_id."""
+    """A node's columns robot_pose_id to robot_object_id."""
     if robot is None:
         return None, None, None, None
     pose = row(event.number, event.sequence, SLOT_ROBOT_POSE)

@@ -122,7 +122,7 @@ class Projector:
         generation = await current_generation(connection)
         if generation is None:
             raise InternalError("the tables are gone: open the memory again")
-        if self._generation is None or generation.revision != types.revision:
+        if generation.revision != types.revision:
             self._generation = generation
             return None
         if types.layout != generation.layout:
@@ -136,9 +136,7 @@ class Projector:
 
     async def _types_now(self) -> _Types:
         """Read after the events: a declaration is stored before the first event that needs it."""
-        if self._generation is None:
-            await self.open()
-        assert self._generation is not None
+        assert self._generation is not None, "opened before anything is folded"
         payloads = await self._log.declarations()
         types = self._types
         if types is None or types.revision != self._generation.revision or types.payloads != payloads:

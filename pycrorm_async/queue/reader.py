@@ -14,9 +14,9 @@ from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.frame import COMMIT, EVENT, Buffer, decode
-from pycrorm_async.queue.segment import SegmentHeader, decode_header, header_bytes, salt_of
+from pycrorm_async.queue.segment import decode_header, header_bytes, salt_of
 
-__all__ = ["Cursor", "Batch", "Opened", "Reader", "map_segment"]
+__all__ = ["Cursor", "Batch", "Reader", "map_segment"]
 
 
 class Cursor(NamedTuple):
@@ -34,18 +34,6 @@ class Batch(NamedTuple):
     payload_bytes: int
     after: Cursor
     complete: bool
-
-
-class Opened(NamedTuple):
-    """A segment with its header understood."""
-
-    path: Path
-    header: SegmentHeader
-    buffer: Buffer
-
-    @property
-    def first_frame(self) -> int:
-        return header_bytes(len(self.header.open))
 
 
 def map_segment(path: Path) -> mmap.mmap:
