@@ -20,6 +20,8 @@ from sqlalchemy import BigInteger, Dialect, String, Text
 from sqlalchemy.orm import Mapper
 from sqlalchemy.types import TypeDecorator
 
+from pycrorm_async.events.fields import table_name
+
 __all__ = ["Moment", "Named", "JsonText", "ClassOfRow", "KnownClasses", "known_classes"]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -101,7 +103,8 @@ class KnownClasses:
             }
             known = {name: name for name in mapped} | tables | self.own
             *names, root = lineage.split(" ")
-            fitting = (known[name] for name in names if name in known and _root(mapped[known[name]]) == root)
+            candidates = (known.get(each) for name in names for each in (name, table_name(name)))
+            fitting = (each for each in candidates if each is not None and _root(mapped[each]) == root)
             found = self._found[lineage] = next(fitting, root)
         return found
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sqlalchemy import BigInteger, Select, String, inspect, type_coerce
+from sqlalchemy import BigInteger, Boolean, Float, Integer, Select, String, inspect, type_coerce
 from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.errors import MissingExtra
@@ -21,13 +21,16 @@ if TYPE_CHECKING:
 
 __all__ = ["dataframe"]
 
+_MOMENT = "moment"
+_WITH_MISSING: tuple[tuple[type, str], ...] = ((Integer, "Int64"), (Boolean, "boolean"), (Float, "float64"))
+
 
 class _Asked(NamedTuple):
-    """One column of the answer: its name, what is asked for it, and whether it holds moments."""
+    """One column of the answer: its name, what is asked for it, and its type in the frame where a value is missing."""
 
     name: str
     expression: Any
-    moment: bool
+    dtype: str
 
 
 async def dataframe(engine: AsyncEngine, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
@@ -49,7 +52,7 @@ async def dataframe(engine: AsyncEngine, statement: Select[*tuple[Any, ...]]) ->
     by_column: Sequence[Sequence[Any]] = list(zip(*rows, strict=True)) or [()] * len(asked)
     return pd.DataFrame(
         {
-            each.name: _moments(values) if each.moment else pd.Series(values, dtype=None if values else object)
+            each.name: _moments(values) if each.dtype == _MOMENT else pd.Series(values, dtype=_dtype(each, values))
             for each, values in zip(asked, by_column, strict=True)
         }
     )
@@ -69,8 +72,16 @@ def _asked(statement: Select[*tuple[Any, ...]]) -> Iterator[_Asked]:
 def _column(name: str, expression: Any, kind: Any) -> _Asked:
     """The column as it is stored, where making Python values of it is of no use to a frame."""
     if isinstance(kind, Moment):
-        return _Asked(name, type_coerce(expression, BigInteger()), moment=True)
-    return _Asked(name, type_coerce(expression, String()) if isinstance(kind, Named) else expression, moment=False)
+        return _Asked(name, type_coerce(expression, BigInteger()), _MOMENT)
+    if isinstance(kind, Named):
+        return _Asked(name, type_coerce(expression, String()), "object")
+    with_missing = (dtype for types, dtype in _WITH_MISSING if isinstance(kind, types))
+    return _Asked(name, expression, next(with_missing, "object"))
+
+
+def _dtype(asked: _Asked, values: Sequence[Any]) -> str | None:
+    """Pandas' own choice where nothing is missing; without one it would make integers floats, which lose digits."""
+    return asked.dtype if not values or None in values else None
 
 
 def _distinct(asked: Iterator[_Asked]) -> Iterator[_Asked]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import func, select
-from sqlalchemy.orm import undefer
+from sqlalchemy import ForeignKey, func, select
+from sqlalchemy.orm import Mapped, mapped_column, undefer
 
 from pycrorm_async import Memory, Reading, Settings, UserView
 from pycrorm_async.errors import (
@@ -573,3 +573,57 @@ async def test_a_dropped_plan_that_is_closed_elsewhere_leaves_the_episode_there_
         await memory.flush()
         found = {each.description: each.nodes for each in await memory.reading.episodes()}
         assert found == {"HangAction": 2, "mine": 2}
+
+
+class ORMShout(Action):
+    """A mapped class of one's own whose table has the natural name of the type."""
+
+    __tablename__ = "shout_action"
+
+    id: Mapped[int] = mapped_column(ForeignKey(f"{Action.__tablename__}.id"), primary_key=True)
+    text: Mapped[str]
+
+
+@dataclass
+class ShoutActionPerformable(ActionAbstract):
+    text: str
+    orm_class = ORMShout
+
+    async def perform(self) -> None:
+        """Shouted."""
+
+
+async def test_a_mapped_class_of_ones_own_may_have_the_natural_table(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await ShoutActionPerformable("hey").perform()
+        await memory.flush()
+        async with memory.session() as session:
+            assert [each.text for each in await session.scalars(select(ORMShout))] == ["hey"]
+            assert [type(each) for each in await session.scalars(select(Action))] == [ORMShout]
+
+
+@dataclass
+class CountActionPerformable(ActionAbstract):
+    big: int | None
+    small: float | None
+    sure: bool | None
+
+    async def perform(self) -> None:
+        """Counted."""
+
+
+async def test_a_frame_keeps_integers_and_truth_values_where_others_are_missing(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode(description="e"):
+            await CountActionPerformable(2**53 + 1, 0.1, True).perform()
+            await CountActionPerformable(None, None, None).perform()
+        await memory.flush()
+        counted = memory.mapped(CountActionPerformable)
+        question = select(counted.big, counted.small, counted.sure).order_by(counted.id)
+        frame = await memory.dataframe(question)
+        assert [str(dtype) for dtype in frame.dtypes] == ["Int64", "float64", "boolean"]
+        assert frame.big[0] == 2**53 + 1
+        assert (frame.small[0], frame.sure[0]) == (0.1, True)
+        assert frame.isna().sum().to_list() == [1, 1, 1]
+        whole = await memory.dataframe(question.where(counted.big.is_not(None)))
+        assert [str(dtype) for dtype in whole.dtypes] == ["int64", "float64", "bool"]
