@@ -31,8 +31,7 @@ class Designator(ABC):
     Class attributes:
         kind: what its nodes are.
         dtype: its name in a memory, by default from the class' name, also for a class that descends from a
-        named
-            one: two types never share a name by accident. Set it to keep a name when a class is renamed.
+            named one: two types never share a name by accident. Set it to keep a name when a class is renamed.
         concept: the SOMA concept it stands for, if one is known.
         orm_class: a mapped class of one's own to ask for it with.
 

@@ -113,10 +113,10 @@ class CostmapLocation(LocationDesignator):
 
     Args:
         target: an object, to be picked up, or a pose, to bring the tool frame to or to put a held object
-        down at. reachable_for: the robot that is to reach it. For an object that means all three goals of a
-        pick-up from the
-            front (`Grasp.FRONT`), for a pose those of placing what the arm holds, with the torso and the
-            arms as they are now.
+            down at.
+        reachable_for: the robot that is to reach it. For an object that means all three goals of a pick-up
+            from the front (`Grasp.FRONT`), for a pose those of placing what the arm holds, with the torso
+            and the arms as they are now.
         visible_for: the robot that is to see it.
         reachable_arm: only places where this arm reaches; for BOTH, each of the two.
 
@@ -156,8 +156,7 @@ class SemanticCostmapLocation(LocationDesignator):
         urdf_link_name: the link; the top of its bounding box is the surface.
         part_of: the object that has the link.
         for_object: what is to be put there: its bottom will be on the surface, and it has room there.
-        Without it, the
-            poses are on the surface itself.
+            Without it, the poses are on the surface itself.
 
     The middle comes first, then places all over the surface in a fixed order. Resolving raises
     `ObjectUnavailable` if there is no room, `PerceptionObjectNotInWorld` and `UnknownLink`.

@@ -1,8 +1,8 @@
-"""Are the fields of a designator of the types it declares? Checked when a motion is built, and said by name.
+"""Are the fields of a designator of the types it declares? Checked when a motion or a built-in action is built.
 
-A field may hold what its annotation names: classes, unions, None where it is in the union; of a list or dict
-also the items. Whole numbers are fine where a float is declared; an annotation that cannot be read (a class
-that is local to a function) is not checked.
+What does not fit is refused by name. A field may hold what its annotation names: classes, unions, None where
+it is in the union; of a list or dict also the items. Whole numbers are fine where a float is declared; an
+annotation that cannot be read (a class that is local to a function) is not checked.
 """
 
 from __future__ import annotations
