@@ -30,7 +30,7 @@ from pycrorm_async.plan.descriptions import (
     SetGripperAction,
 )
 from pycrorm_async.plan.designator import ActionAbstract, BaseMotion, Designator
-from pycrorm_async.plan.errors import NoRobotChosen, NoWorldHere, PerformNotAsync, ResolutionError
+from pycrorm_async.plan.errors import NoRobotChosen, NoRobotHere, PerformNotAsync, ResolutionError
 from pycrorm_async.plan.failures import IKError, PlanFailure
 from pycrorm_async.plan.locations import (
     CostmapLocation,
@@ -102,7 +102,7 @@ __all__ = [
     "CostmapLocation",
     "SemanticCostmapLocation",
     "NoRobotChosen",
-    "NoWorldHere",
+    "NoRobotHere",
     "PerformNotAsync",
     "ResolutionError",
 ]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["PerformNotAsync", "ResolutionError", "NoRobotChosen", "NoWorldHere"]
+__all__ = ["PerformNotAsync", "ResolutionError", "NoRobotChosen", "NoRobotHere"]
 
 
 class PerformNotAsync(CallerError, TypeError):
@@ -46,5 +46,5 @@ class NoRobotChosen(CallerError):
         self.motion = motion
 
 
-class NoWorldHere(CallerError):
-    """The call needs a world, or a robot in it, and this context has none."""
+class NoRobotHere(CallerError):
+    """The call needs a robot of a kind that is known here, and finds none."""

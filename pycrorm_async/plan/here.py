@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan.errors import NoWorldHere
+from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.errors import NoWorld
 from pycrorm_async.world.robot import ArmDescription, RobotDescription
 from pycrorm_async.world.watch import current_world
 
@@ -32,19 +33,19 @@ class RobotHere(NamedTuple):
 
 
 def world_here() -> BulletWorld:
-    """The world of the innermost `with BulletWorld()` of this context. Raises `NoWorldHere`."""
+    """The world of the innermost `with BulletWorld()` of this context. Raises `NoWorld`."""
     world = current_world.get()
     if world is None:
-        raise NoWorldHere("no world to act in: run the plan inside `with BulletWorld() as world:`")
+        raise NoWorld("the plan")
     return world
 
 
 def robot_here() -> RobotHere:
-    """The robot in that world. Raises `NoWorldHere`."""
+    """The robot in that world. Raises `NoWorld`, `NoRobotHere`."""
     body = world_here().robot
     if body is None:
-        raise NoWorldHere('no robot in the world: add one, e.g. Object("pr2", ObjectType.ROBOT)')
+        raise NoRobotHere('no robot in the world: add one, e.g. Object("pr2", ObjectType.ROBOT)')
     description = body.robot_description
     if description is None:
-        raise NoWorldHere(f"the robot {body.name!r} is not of a kind that is known here")
+        raise NoRobotHere(f"the robot {body.name!r} is not of a kind that is known here")
     return RobotHere(body, description)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from pycrorm_async.plan.errors import NoWorldHere
+from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.grasping import pick_up_poses, place_pose, retracted
 from pycrorm_async.plan.here import RobotHere, world_here
 from pycrorm_async.plan.objects import ObjectLike, designator_of, in_world
@@ -52,7 +52,7 @@ def stands(
 def _robot(meant: ObjectLike) -> RobotHere:
     body = in_world(meant)
     if body.robot_description is None:
-        raise NoWorldHere(f"{body.name!r} is not a robot of a kind that is known here")
+        raise NoRobotHere(f"{body.name!r} is not a robot of a kind that is known here")
     return RobotHere(body, body.robot_description)
 
 

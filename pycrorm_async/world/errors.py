@@ -34,10 +34,10 @@ class WorldClosed(WorldError):
 
 
 class NoWorld(WorldError):
-    """No world is entered in this context and none was given."""
+    """No world is entered in this context, and none was given."""
 
     def __init__(self, wanted_for: str) -> None:
-        super().__init__(f"no world for {wanted_for}: make it inside `with BulletWorld():` or pass world=")
+        super().__init__(f"no world for {wanted_for}: act inside `with BulletWorld() as world:`")
 
 
 class ObjectNotInWorld(WorldError):

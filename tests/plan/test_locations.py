@@ -13,7 +13,7 @@ from pycrorm_async.plan import (
     Location,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
-    NoWorldHere,
+    NoRobotHere,
     ObjectRelativeLocation,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
@@ -144,7 +144,7 @@ def test_a_target_that_is_gone_or_no_robot_is_said(scene: Scene) -> None:
     scene.world.remove(scene.milk)
     with pytest.raises(PerceptionObjectNotInWorld, match="milk"):
         SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk).resolve()
-    with pytest.raises(NoWorldHere, match="'cereal' is not a robot"):
+    with pytest.raises(NoRobotHere, match="'cereal' is not a robot"):
         CostmapLocation(scene.kitchen, reachable_for=scene.cereal).resolve()
     with pytest.raises(UnknownLink):
         SemanticCostmapLocation("attic", scene.kitchen).resolve()

@@ -8,7 +8,6 @@ import pytest
 
 from pycrorm_async.plan import (
     BelieveObject,
-    NoWorldHere,
     ObjectDesignator,
     ObjectDesignatorDescription,
     ObjectPart,
@@ -17,7 +16,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWorld
 from pycrorm_async.plan.objects import designator_of, in_world
 from pycrorm_async.world import ObjectType, Pose
-from pycrorm_async.world.errors import UnknownLink
+from pycrorm_async.world.errors import NoWorld, UnknownLink
 from tests.plan.conftest import Scene
 
 
@@ -46,7 +45,7 @@ def test_a_description_that_nothing_fits_says_what_there_is(scene: Scene) -> Non
 
 
 def test_a_description_needs_a_world() -> None:
-    with pytest.raises(NoWorldHere):
+    with pytest.raises(NoWorld):
         ObjectDesignatorDescription(names=["milk"]).resolve()
 
 

@@ -17,7 +17,7 @@ from pycrorm_async.plan import (
     MoveTCPMotion,
     NavigateActionPerformable,
     NoRobotChosen,
-    NoWorldHere,
+    NoRobotHere,
     PlanFailure,
     TaskStatus,
     collected_tree,
@@ -25,6 +25,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.failures import GripperGoalNotReached
 from pycrorm_async.world import Arms, BulletWorld, GripperState, Object, ObjectType, Pose, WorldMode
+from pycrorm_async.world.errors import NoWorld
 from tests.plan.conftest import Scene
 
 THERE = Pose([0.6, 0.4, 0])
@@ -67,13 +68,13 @@ async def test_a_motion_outside_of_any_choice_says_what_to_write() -> None:
 
 async def test_without_a_world_or_a_robot_the_caller_is_told() -> None:
     with simulated_robot:
-        with pytest.raises(NoWorldHere, match="with BulletWorld"):
+        with pytest.raises(NoWorld, match=r"the plan.*with BulletWorld"):
             await MoveMotion(THERE).perform()
         with BulletWorld(mode=WorldMode.DIRECT):
-            with pytest.raises(NoWorldHere, match="no robot"):
+            with pytest.raises(NoRobotHere, match="no robot"):
                 await MoveMotion(THERE).perform()
             Object("walle", ObjectType.ROBOT, '<robot name="walle"><link name="walle"/></robot>')
-            with pytest.raises(NoWorldHere, match="'walle' is not of a kind"):
+            with pytest.raises(NoRobotHere, match="'walle' is not of a kind"):
                 await MoveMotion(THERE).perform()
 
 
