@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
 
-from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, OperationalError
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import InternalError
+from pycrorm_async.errors import DatabaseError, InternalError
 from pycrorm_async.projections.classes import mapped_leaves
 from pycrorm_async.projections.fold import CannotFold, fold
 from pycrorm_async.projections.generations import (
@@ -126,7 +126,14 @@ class Projector:
             self._generation = generation
             return None
         if types.layout != generation.layout:
-            generation = await grow(connection, generation, types.layout)
+            try:
+                generation = await grow(connection, generation, types.layout)
+            except OperationalError as error:
+                if "already exists" not in str(error.orig):
+                    raise
+                raise DatabaseError(
+                    f"{self._log.address}: {error.orig}, and the memory needs that name: rename yours, then flush again"
+                ) from error
         if not await advance_folded(connection, folded.steps):
             return None
         await write_rows(connection, folded.rows, generation.number)

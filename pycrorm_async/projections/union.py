@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import msgspec
+
 from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.events.happenings import DesignatorTypeDeclared
 from pycrorm_async.projections.layout import Contradictory, Layout
@@ -29,10 +31,13 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
     accepted: dict[str, DesignatorTypeDeclared] = {}
     refused: dict[str, str] = {}
     for payload in payloads:
-        name, declared = fingerprint(payload), declaration_of(payload)
+        name = fingerprint(payload)
         try:
+            declared = declaration_of(payload)
             layout = layout.with_declaration(declared)
             accepted[name] = declared
         except Contradictory as reason:
             refused[name] = str(reason)
+        except msgspec.DecodeError as error:  # a newer version's
+            refused[name] = f"this version cannot read the declaration of its type: {error}"
     return Union(layout, accepted, refused)

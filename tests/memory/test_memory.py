@@ -18,6 +18,7 @@ from sqlalchemy.orm import Mapped, mapped_column, undefer
 from pycrorm_async import Memory, Reading, Settings, UserView
 from pycrorm_async.errors import (
     CallerError,
+    DatabaseError,
     DatabaseForeign,
     DatabaseUnavailable,
     EpisodeParked,
@@ -26,6 +27,9 @@ from pycrorm_async.errors import (
     UnknownEpisode,
     UnknownUrl,
 )
+from pycrorm_async.events.codec import encode, fingerprint
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.happenings import NodeStarted
 from pycrorm_async.orm import Action, Designator, PickUpAction, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable, PlanFailure
 from pycrorm_async.plan.objects import BelieveObject
@@ -627,3 +631,32 @@ async def test_a_frame_keeps_integers_and_truth_values_where_others_are_missing(
         assert frame.isna().sum().to_list() == [1, 1, 1]
         whole = await memory.dataframe(question.where(counted.big.is_not(None)))
         assert [str(dtype) for dtype in whole.dtypes] == ["int64", "float64", "bool"]
+
+
+async def test_a_table_of_the_users_own_in_the_way_is_named_and_nothing_is_lost(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with sqlite3.connect(tmp_path / "memory.db") as plain:
+            plain.execute("CREATE TABLE note_action (mine TEXT)")
+        await NoteActionPerformable("a").perform()
+        with pytest.raises(DatabaseError, match=r"note_action already exists, .* rename yours, then flush again"):
+            await memory.flush()
+        with plain:
+            plain.execute("ALTER TABLE note_action RENAME TO my_notes")
+        plain.close()
+        await memory.flush()
+        assert await texts(memory) == ["a"]
+
+
+async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        queue = memory._now.queue
+        payload = b'{"kind":"action","dtype":"DreamAction","table":"dream_action","fields":[{"type":"dream"}]}'
+        queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), payload)
+        with pytest.raises(EpisodeParked, match="cannot read the declaration of its type"):
+            async with memory.episode(description="newer") as episode:
+                started = NodeStarted("action", 2, fingerprint(payload))
+                queue.put_nowait(Heading(episode.id, "NodeStarted", 1), encode(started))
+                await memory.flush()
+        await NoteActionPerformable("fine").perform()
+        await memory.flush()
+        assert await texts(memory) == ["fine"]
