@@ -1,0 +1,126 @@
+"""A recorder on a queue that is a list: what was told, in order, and what is wrong with it."""
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import SpoolFull
+from pycrorm_async.events.codec import decode
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.happenings import (
+    Happening,
+)
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.order import OrderCheck
+from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.episode import Episode
+from pycrorm_async.hooks.recorder import Recorder, current_episode
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
+from pycrorm_async.plan.ports import recorder
+from pycrorm_async.world.watch import watcher
+
+
+class ListSink:
+    """The queue's promise in a list: sequences without gaps, room or none."""
+
+    def __init__(self) -> None:
+        self.records: list[tuple[EpisodeId | None, int, Happening]] = []
+        self.sequences: dict[EpisodeId, int] = {}
+        self.full = False
+        self.broken = False
+        self.broken_starts = 0
+        self.space = asyncio.Event()
+
+    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+        if heading.type == "NodeStarted" and self.broken_starts and b'"action"' in payload:
+            self.broken_starts -= 1
+            raise RuntimeError("the disk is on fire")
+        if self.broken:
+            raise RuntimeError("the disk is on fire")
+        if self.full and not reserved:
+            raise SpoolFull("full")
+        sequence = 0
+        if heading.episode is not None:
+            sequence = self.sequences[heading.episode] = self.sequences.get(heading.episode, 0) + 1
+        self.records.append((heading.episode, sequence, decode(heading.type, payload)))
+        return sequence
+
+    async def room(self) -> None:
+        await self.space.wait()
+
+    def block_until_room(self, timeout_s: float) -> bool:
+        return True
+
+    def of(self, episode: Episode | EpisodeId) -> list[tuple[int, Happening]]:
+        name = episode.id if isinstance(episode, Episode) else episode
+        return [(sequence, event) for owner, sequence, event in self.records if owner == name]
+
+    def only(self) -> list[tuple[int, Happening]]:
+        (name,) = self.sequences
+        return self.of(name)
+
+
+class Rig:
+    def __init__(self, settings: Settings) -> None:
+        self.sink = ListSink()
+        self.emitter = Emitter(self.sink, settings)
+        self.recorder = Recorder(self.emitter, clock=SYSTEM_CLOCK, software="test")
+
+    @contextmanager
+    def episode(self) -> Iterator[Episode]:
+        episode = self.recorder.open_episode(description="d")
+        token = current_episode.set(episode)
+        try:
+            yield episode
+        except BaseException as failure:
+            self.recorder.close_episode(episode, failure)
+            raise
+        else:
+            self.recorder.close_episode(episode, None)
+        finally:
+            current_episode.reset(token)
+
+
+@contextmanager
+def rigged(settings: Settings | None = None) -> Iterator[Rig]:
+    rig = Rig(settings or Settings())
+    tokens = recorder.set(rig.recorder), watcher.set(rig.recorder)
+    try:
+        yield rig
+    finally:
+        recorder.reset(tokens[0])
+        watcher.reset(tokens[1])
+
+
+def findings(events: list[tuple[int, Happening]]) -> list[Any]:
+    check = OrderCheck()
+    return [found for sequence, event in events for found in check.read(sequence, event)]
+
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str = ""
+    weight: float = 0.0
+    ran: bool = False
+
+    async def perform(self) -> Any:
+        self.ran = True
+        return self.text
+
+
+@dataclass
+class CarryActionPerformable(ActionAbstract):
+    what: ObjectDesignator
+    part: ObjectPart | None = None
+
+    async def perform(self) -> None:
+        """Nothing."""
+
+
+def kinds(events: list[tuple[int, Happening]]) -> list[str]:
+    return [type(event).__name__ for _, event in events]

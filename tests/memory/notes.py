@@ -1,0 +1,28 @@
+"""What the tests of a memory perform: notes, and what a memory remembers of them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.plan import ActionAbstract
+
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+
+    async def perform(self) -> None:
+        """Noted."""
+
+
+async def texts(memory: Memory | Reading) -> list[str]:
+    async with memory.session() as session:
+        notes: Any = memory.mapped(NoteActionPerformable)
+        return list(await session.scalars(select(notes.text).order_by(notes.id)))
+
+
+def url_of(folder: Path) -> str:
+    return f"sqlite:///{folder}/memory.db"

@@ -1,0 +1,204 @@
+"""What a memory refuses, and how it says so; nothing recorded is lost by it."""
+
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async import Memory, Settings
+from pycrorm_async.errors import (
+    CallerError,
+    DatabaseError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    EpisodeParked,
+    FlushTimeout,
+    SpoolForeign,
+    UnknownUrl,
+)
+from pycrorm_async.events.codec import encode, fingerprint
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.happenings import NodeStarted
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.plan.ports import recorder
+from tests.memory.notes import NoteActionPerformable, texts, url_of
+
+
+async def test_a_memory_that_is_not_open_says_how_to_open_it(tmp_path: Path) -> None:
+    memory = Memory.open(url_of(tmp_path))
+    with pytest.raises(CallerError, match=r"async with Memory\.open"):
+        await memory.flush()
+    async with memory:
+        pass
+    with pytest.raises(CallerError, match=r"async with Memory\.open"):
+        async with memory.episode(description="e"):
+            pass
+
+
+async def test_bad_addresses_are_refused_with_their_class(tmp_path: Path) -> None:
+    with pytest.raises(UnknownUrl):
+        Memory.open("mysql://lab/memory")
+    for url, error in (
+        (f"sqlite:///{tmp_path}/none/memory.db", DatabaseUnavailable),
+        ("postgresql://ada:secret@lab/memory", DatabaseUnavailable),
+    ):
+        with pytest.raises(error) as refused:
+            async with Memory.open(url):
+                pass
+        assert "secret" not in str(refused.value)
+    (tmp_path / "text.db").write_text("no database at all, and rather more than a hundred bytes of it" * 10)
+    with pytest.raises(DatabaseForeign):
+        async with Memory.open(f"sqlite:///{tmp_path}/text.db"):
+            pass
+    assert not (tmp_path / "text.db.spool").exists()
+    assert recorder.get() is None
+
+
+async def test_a_spool_belongs_to_one_database(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=tmp_path / "spool"):
+        await NoteActionPerformable("a").perform()
+    with pytest.raises(SpoolForeign):
+        async with Memory.open(f"sqlite:///{tmp_path}/2.db", spool=tmp_path / "spool"):
+            pass
+
+
+async def test_a_flush_that_cannot_reach_the_database_gives_up_and_loses_nothing(tmp_path: Path) -> None:
+    settings = Settings(flush_timeout_s=0.3)
+    async with Memory.open(url_of(tmp_path), settings=settings) as memory:
+        await NoteActionPerformable("before").perform()
+        await memory.flush()
+        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        await NoteActionPerformable("meanwhile").perform()
+        with pytest.raises(FlushTimeout, match="safe in the spool"):
+            await memory.flush()
+        other.execute("ROLLBACK")
+        other.close()
+        for _ in range(100):
+            try:
+                await memory.flush()
+                break
+            except FlushTimeout:
+                continue
+        assert await texts(memory) == ["before", "meanwhile"]
+
+
+async def test_a_type_that_contradicts_the_tables_parks_its_episode_with_both_types_named(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)):
+        await NoteActionPerformable("text").perform()
+
+    def other() -> type[ActionAbstract]:
+        @dataclass
+        class NoteActionPerformable(ActionAbstract):
+            text: int
+
+            async def perform(self) -> None:
+                """Noted."""
+
+        return NoteActionPerformable
+
+    with pytest.raises(EpisodeParked, match=r"text.*integer|integer.*text"):
+        async with Memory.open(url_of(tmp_path)) as memory:
+            await other()(7).perform()  # type: ignore[call-arg]
+            await memory.flush()
+    async with Memory.open(url_of(tmp_path)) as memory:  # an episode that stopped earlier stops nobody
+        await NoteActionPerformable("later").perform()
+        await memory.flush()
+        assert await texts(memory) == ["text", "later"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"seed": 2**63}, "seed"),
+        ({"seed": "x"}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"description": 5}, "description"),
+        ({"description": "x" * 3_000_000}, "description"),
+        ({"plan": "x" * 3_000_000}, "plan"),
+    ],
+)
+async def test_what_an_episode_cannot_be_opened_with_is_refused_by_name(
+    tmp_path: Path, arguments: dict[str, Any], named: str
+) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with pytest.raises(CallerError, match=f"the {named} of an episode must be"):
+            async with memory.episode(**arguments):
+                pass
+        async with memory.episode(description="fine", seed=-1):
+            await NoteActionPerformable("a").perform()
+        await memory.flush()
+        assert [each.description for each in await memory.reading.episodes()] == ["fine"]
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"on_full": "waait"}, {"on_unrecordable": ""}, {"batch_events_max": 0}, {"flush_timeout_s": -1.0}]
+)
+def test_a_setting_that_cannot_work_is_refused_by_name(arguments: dict[str, Any]) -> None:
+    with pytest.raises(CallerError, match=rf"Settings\.{next(iter(arguments))} is "):
+        Settings(**arguments)
+
+
+async def test_nothing_of_a_memory_that_is_not_open_is_an_attribute_error(tmp_path: Path) -> None:
+    memory = Memory.open(url_of(tmp_path))
+    for use in (
+        lambda: memory.status,
+        lambda: memory.reading,
+        memory.session,
+        lambda: memory.mapped("NoteAction"),
+        lambda: memory.recent_episodes,
+    ):
+        with pytest.raises(CallerError, match=r"async with Memory\.open"):
+            use()
+
+
+async def test_a_parked_episode_is_told_once(tmp_path: Path) -> None:
+    def other() -> Any:
+        @dataclass
+        class NoteActionPerformable(ActionAbstract):
+            text: int
+
+            async def perform(self) -> None:
+                """Noted."""
+
+        return NoteActionPerformable
+
+    async with Memory.open(url_of(tmp_path)):
+        await NoteActionPerformable("text").perform()
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await other()(7).perform()
+        with pytest.raises(EpisodeParked):
+            await memory.flush()
+        await memory.flush()
+        assert memory.status.faults.total == 0
+
+
+async def test_a_table_of_the_users_own_in_the_way_is_named_and_nothing_is_lost(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with sqlite3.connect(tmp_path / "memory.db") as plain:
+            plain.execute("CREATE TABLE note_action (mine TEXT)")
+        await NoteActionPerformable("a").perform()
+        with pytest.raises(DatabaseError, match=r"note_action already exists, .* rename yours, then flush again"):
+            await memory.flush()
+        with plain:
+            plain.execute("ALTER TABLE note_action RENAME TO my_notes")
+        plain.close()
+        await memory.flush()
+        assert await texts(memory) == ["a"]
+
+
+async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        queue = memory._now.queue
+        payload = b'{"kind":"action","dtype":"DreamAction","table":"dream_action","fields":[{"type":"dream"}]}'
+        queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), payload)
+        with pytest.raises(EpisodeParked, match="cannot read the declaration of its type"):
+            async with memory.episode(description="newer") as episode:
+                started = NodeStarted("action", 2, fingerprint(payload))
+                queue.put_nowait(Heading(episode.id, "NodeStarted", 1), encode(started))
+                await memory.flush()
+        await NoteActionPerformable("fine").perform()
+        await memory.flush()
+        assert await texts(memory) == ["fine"]
