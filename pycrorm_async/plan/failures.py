@@ -15,6 +15,7 @@ from pycrorm_async.world.pose import Pose
 
 __all__ = [
     "PlanFailure",
+    "is_plan_failure",
     "IKError",
     "NotALanguageExpression",
     "FailureDiagnosis",
@@ -92,6 +93,13 @@ class PlanFailure(Exception):
 
     def __str__(self) -> str:
         return self.message
+
+
+def is_plan_failure(error: BaseException) -> bool:
+    """Whether it says that a plan failed: a plan failure, or a group of nothing else (what a `TaskGroup` raises)."""
+    if isinstance(error, ExceptionGroup):
+        return all(map(is_plan_failure, error.exceptions))
+    return isinstance(error, PlanFailure)
 
 
 class IKError(PlanFailure):

@@ -15,7 +15,7 @@ from contextvars import ContextVar, Token
 from typing import TYPE_CHECKING, Any
 
 from pycrorm_async.clock import monotonic_ns
-from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.plan.failures import is_plan_failure
 from pycrorm_async.plan.ports import recorder
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collecting, current_node
 
@@ -63,14 +63,11 @@ def as_node(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable[[Any
         try:
             node.result = result = await perform(self)
             node.status = TaskStatus.SUCCEEDED
-        except PlanFailure as failure:
-            node.status, node.failure = TaskStatus.FAILED, failure
-            raise
         except asyncio.CancelledError as cancelled:
             node.status, node.failure = TaskStatus.CANCELLED, cancelled
             raise
         except BaseException as error:
-            node.status, node.failure = TaskStatus.ERROR, error
+            node.status, node.failure = TaskStatus.FAILED if is_plan_failure(error) else TaskStatus.ERROR, error
             raise
         finally:
             node.ended_ns = monotonic_ns()

@@ -36,7 +36,7 @@ class TaskStatus(Enum):
     RUNNING = "RUNNING"
     SUCCEEDED = "SUCCEEDED"
     FAILED = "FAILED"
-    """A plan failure: `PlanFailure` or one of its kinds was raised."""
+    """A plan failure was raised, or a group of nothing but plan failures."""
     ERROR = "ERROR"
     """Any other exception was raised."""
     CANCELLED = "CANCELLED"

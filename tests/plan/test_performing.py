@@ -67,7 +67,11 @@ OUTCOMES = [
     (ValueError("bug"), TaskStatus.ERROR),
     (asyncio.CancelledError(), TaskStatus.CANCELLED),
     (Abort(), TaskStatus.ERROR),
-    (ExceptionGroup("several", [PlanFailure("a"), PlanFailure("b")]), TaskStatus.ERROR),
+    (ExceptionGroup("failures", [PlanFailure("a"), ObjectUnreachable("b")]), TaskStatus.FAILED),
+    (ExceptionGroup("nested", [ExceptionGroup("inner", [PlanFailure("a")]), PlanFailure("b")]), TaskStatus.FAILED),
+    (ExceptionGroup("mixed", [PlanFailure("a"), ValueError("bug")]), TaskStatus.ERROR),
+    (ExceptionGroup("nested", [ExceptionGroup("inner", [PlanFailure("a"), ValueError("bug")])]), TaskStatus.ERROR),
+    (BaseExceptionGroup("cancelled", [PlanFailure("a"), asyncio.CancelledError()]), TaskStatus.ERROR),
 ]
 
 
@@ -267,6 +271,27 @@ async def test_a_task_started_inside_an_action_belongs_to_it() -> None:
         ("Empty", 1),
         ("Raising", 1),
     ]
+
+
+async def test_a_plan_whose_parts_failed_at_the_same_time_failed() -> None:
+    failures = [ObjectUnreachable("milk"), PlanFailure("cereal")]
+
+    class AtOnce(ActionAbstract):
+        async def perform(self) -> None:
+            async with asyncio.TaskGroup() as group:
+                for failure in failures:
+                    group.create_task(Raising(failure).perform())
+                group.create_task(Waiting(asyncio.Event()).perform())
+
+    with collected_tree() as tree, pytest.raises(ExceptionGroup) as caught:
+        await AtOnce().perform()
+    assert list(caught.value.exceptions) == failures
+    assert [(type(node.designator).__name__, node.status, node.failure) for node in list(tree)[:3]] == [
+        ("AtOnce", TaskStatus.FAILED, caught.value),
+        ("Raising", TaskStatus.FAILED, failures[0]),
+        ("Raising", TaskStatus.FAILED, failures[1]),
+    ]
+    assert [node.status for node in list(tree)[3:]] == [TaskStatus.CANCELLED]
 
 
 async def test_a_suspended_plan_that_is_dropped_leaves_the_current_node_of_others_alone() -> None:
