@@ -28,6 +28,7 @@ from pycrorm_async.queue.frame import (
     HEADER_BYTES,
     NO_EPISODE,
     PADDING,
+    TYPE_BYTES_MAX,
     encode_commit,
 )
 from pycrorm_async.queue.segment import CLOSES, OPENS, Last, Segment, SegmentHeader, salt_of
@@ -111,6 +112,7 @@ class Appender:
             elif (last := self.open.get(episode)) is not None:
                 sequence = last[0] + 1
             elif type_name == OPENS:
+                self._refuse_one_too_many()
                 sequence = 1
             else:
                 raise EpisodeRefused(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
@@ -154,9 +156,14 @@ class Appender:
                 self._quiet = False
         return sequence
 
+    def _refuse_one_too_many(self) -> None:
+        """Every segment's header names the open episodes: with more, the largest record would not fit beside them."""
+        if len(self.open) >= self._capacity.episodes_max:
+            raise EpisodeRefused(f"{len(self.open):,} episodes are open: no more fit into a segment (segment_bytes)")
+
     def _encode_type(self, type_name: str) -> bytes:
         name = type_name.encode()
-        if not 0 < len(name) < 256:
+        if not 0 < len(name) <= TYPE_BYTES_MAX:
             raise CallerError(f"the name of an event type takes 1 to 255 bytes, not {len(name)}")
         self._type_names[type_name] = name
         return name

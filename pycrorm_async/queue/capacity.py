@@ -10,35 +10,46 @@ from typing import NamedTuple
 
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError
-from pycrorm_async.queue.frame import COMMIT_BYTES
+from pycrorm_async.queue.frame import COMMIT_BYTES, TYPE_BYTES_MAX, frame_bytes
 from pycrorm_async.queue.segment import header_bytes
 
 __all__ = ["Capacity"]
 
 _COMMITS_BYTES = 2 * COMMIT_BYTES
+_EPISODES_MIN = 16
 
 
 class Capacity(NamedTuple):
-    """What is allowed. `spare` below is how many segments may still be begun, `episodes` how many are open."""
+    """What is allowed. `spare` below is how many segments may still be begun, `episodes` how many are open.
+
+    With up to `episodes_max` open episodes, which every segment's header names, the largest record fits into a segment.
+    """
 
     segment_bytes: int
     segments_max: int
     reserve_bytes: int
+    episodes_max: int
 
     @classmethod
     def of(cls, settings: Settings) -> Capacity:
-        """Raises `CallerError` for settings with which a queue could fill up and never be emptied."""
+        """Raises `CallerError` for settings with which a queue could fill up and never be emptied, or lose a record."""
         if settings.spool_bytes_max - settings.spool_reserve_bytes < 3 * settings.segment_bytes:
             raise CallerError(
                 f"spool_bytes_max ({settings.spool_bytes_max:,}) must hold the reserve"
                 f" ({settings.spool_reserve_bytes:,}) and three segments ({settings.segment_bytes:,} each)"
             )
-        if settings.segment_bytes < header_bytes(1) + 2 * _COMMITS_BYTES:
-            raise CallerError(f"segment_bytes ({settings.segment_bytes:,}) holds no record")
+        least = header_bytes(_EPISODES_MIN) + frame_bytes(TYPE_BYTES_MAX, settings.record_bytes_max) + _COMMITS_BYTES
+        left = settings.segment_bytes - least
+        if left < 0:
+            raise CallerError(
+                f"segment_bytes ({settings.segment_bytes:,}) must hold a record of record_bytes_max"
+                f" ({settings.record_bytes_max:,}) and {_EPISODES_MIN} open episodes: {least:,} at least"
+            )
         return cls(
             settings.segment_bytes,
             settings.spool_bytes_max // settings.segment_bytes,
             settings.spool_reserve_bytes,
+            _EPISODES_MIN + left // (header_bytes(1) - header_bytes(0)),
         )
 
     @property

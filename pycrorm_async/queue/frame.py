@@ -17,6 +17,7 @@ __all__ = [
     "DECLARATION",
     "COMMIT",
     "HEADER_BYTES",
+    "TYPE_BYTES_MAX",
     "COMMIT_BYTES",
     "NO_EPISODE",
     "PADDING",
@@ -26,6 +27,7 @@ __all__ = [
     "encode_commit",
     "decode",
     "chain",
+    "frame_bytes",
 ]
 
 Buffer: TypeAlias = bytes | mmap.mmap
@@ -39,6 +41,7 @@ HEAD: Final = Struct("<BBHIQQqq16sI")
 CHECKSUM: Final = Struct("<I")
 HEADER_BYTES: Final = HEAD.size + CHECKSUM.size
 COMMIT_BYTES: Final = HEADER_BYTES + 8
+TYPE_BYTES_MAX: Final = 2**8 - 1
 NO_EPISODE: Final = bytes(16)
 PADDING: Final = tuple(bytes(count) for count in range(8))
 
@@ -137,6 +140,12 @@ def decode(buffer: Buffer, offset: int, salt: int) -> Frame | None:
         checksum,
         body_end - offset,
     )
+
+
+def frame_bytes(type_bytes: int, payload_bytes: int) -> int:
+    """The size of a frame with a type's name and a payload of these sizes."""
+    length = type_bytes + payload_bytes
+    return HEADER_BYTES + length + (-length & 7)
 
 
 def chain(checksum: int, span: int = 0) -> int:

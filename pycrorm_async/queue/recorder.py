@@ -96,7 +96,8 @@ class RecorderQueue:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
         From any thread, but not from a signal handler. An episode is open from its `EpisodeStarted` to its
-        `EpisodeEnded`; an event of any other is refused (`EpisodeRefused`), for it could have no sequence. Raises
+        `EpisodeEnded`; an event of any other is refused (`EpisodeRefused`), for it could have no sequence, and so is a
+        start when so many are open that the largest record would not fit into a segment beside their names. Raises
         `SpoolFull` when less than the reserve would stay free, with `reserved` when nothing would; `SpoolClosed` after
         `close` and in a forked child; `SpoolUnavailable` after the disk failed; `CallerError` for a record that no
         segment can hold. What is refused leaves no gap.

@@ -21,7 +21,7 @@ from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import RecorderQueue
 
 SETTINGS = Settings(
-    sync_interval_ms=2, segment_bytes=2**14, spool_bytes_max=2**26, spool_reserve_bytes=0, record_bytes_max=2**12
+    sync_interval_ms=2, segment_bytes=2**14, spool_bytes_max=2**26, spool_reserve_bytes=1, record_bytes_max=2**12
 )
 
 

@@ -21,6 +21,7 @@ SLOW = Settings(
     segment_bytes=SMALL.segment_bytes,
     spool_bytes_max=SMALL.spool_bytes_max,
     spool_reserve_bytes=SMALL.spool_reserve_bytes,
+    record_bytes_max=SMALL.record_bytes_max,
 )
 
 
@@ -98,7 +99,9 @@ def small_disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
     yield disk
 
 
-ON_A_SMALL_DISK = Settings(sync_interval_ms=5, segment_bytes=2**15, spool_bytes_max=2**30, spool_reserve_bytes=2**16)
+ON_A_SMALL_DISK = Settings(
+    sync_interval_ms=5, segment_bytes=2**15, spool_bytes_max=2**30, spool_reserve_bytes=2**16, record_bytes_max=2**12
+)
 
 
 async def test_a_full_disk_is_a_full_spool_and_goes_on_when_there_is_room(small_disk: Path) -> None:
@@ -129,7 +132,7 @@ def test_a_queue_that_does_not_fit_on_the_disk_is_one_clear_line_and_leaves_noth
     with pytest.raises(SpoolUnavailable, match="No space left on device") as refused:
         RecorderQueue.create(
             small_disk / "spool",
-            settings=Settings(segment_bytes=2**20),
+            settings=Settings(segment_bytes=2**20, record_bytes_max=2**12),
             clock=SYSTEM_CLOCK,
             recorder=RECORDER,
         )

@@ -1,5 +1,7 @@
 """What may be put: never more files than allowed, and the reserve is there for those it is kept for."""
 
+from dataclasses import replace
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,7 +10,7 @@ from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError
 from pycrorm_async.queue.capacity import Capacity
 
-SMALL = Capacity(segment_bytes=1000, segments_max=5, reserve_bytes=500)
+SMALL = Capacity(segment_bytes=1000, segments_max=5, reserve_bytes=500, episodes_max=10)
 
 
 def test_an_empty_segment_holds_all_but_its_header_and_two_commits() -> None:
@@ -44,6 +46,28 @@ def test_what_is_admitted_ordinarily_is_admitted_reserved_and_with_more_room(
 def test_settings_with_which_a_full_queue_could_never_be_emptied_are_refused() -> None:
     with pytest.raises(CallerError, match="three segments"):
         Capacity.of(Settings(segment_bytes=1000, spool_bytes_max=4000, spool_reserve_bytes=1001))
-    with pytest.raises(CallerError, match="holds no record"):
-        Capacity.of(Settings(segment_bytes=300, spool_bytes_max=4000, spool_reserve_bytes=0))
-    assert Capacity.of(Settings()) == Capacity(8 * 2**20, 512, 16 * 2**20)
+
+
+# The largest record: a header of 64 bytes, a type's name of 255, the payload, padding; two commits of 72 behind it,
+# and before it the segment's header, 56 bytes and 40 for each open episode.
+LARGEST_OF_1000 = 64 + 1256
+BESIDE_16_EPISODES = LARGEST_OF_1000 + 2 * 72 + 56 + 16 * 40
+
+
+def test_the_largest_record_fits_into_a_segment_beside_sixteen_open_episodes_or_the_settings_are_refused() -> None:
+    enough = Settings(segment_bytes=BESIDE_16_EPISODES, record_bytes_max=1000)
+    assert Capacity.of(enough).episodes_max == 16
+    assert Capacity.of(enough).frame_bytes_max(episodes=16) == LARGEST_OF_1000
+    with pytest.raises(CallerError) as refused:
+        Capacity.of(replace(enough, segment_bytes=BESIDE_16_EPISODES - 1))
+    assert str(refused.value) == (
+        "segment_bytes (2,159) must hold a record of record_bytes_max (1,000) and 16 open episodes: 2,160 at least"
+    )
+    with pytest.raises(CallerError, match="record_bytes_max"):
+        Capacity.of(Settings(segment_bytes=2**18))
+
+
+def test_with_the_default_settings_episodes_run_out_last() -> None:
+    episodes = (8 * 2**20 - 2 * 72 - 56 - 64 - (2**20 + 256)) // 40
+    assert Capacity.of(Settings()) == Capacity(8 * 2**20, 512, 16 * 2**20, episodes)
+    assert episodes > 180_000

@@ -110,7 +110,7 @@ async def test_a_waiter_that_gives_up_leaves_the_others_waiting(tmp_path: Path) 
 
 
 async def test_sequences_of_many_threads_have_no_gaps_and_no_doubles(tmp_path: Path) -> None:
-    queue = make(tmp_path, settings=Settings(segment_bytes=2**16))
+    queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12))
     queue.put_nowait(started(0), b"{}")
     returned: list[tuple[int, int]] = []
     begin = threading.Barrier(4)
@@ -159,6 +159,20 @@ async def test_a_record_that_no_segment_can_hold_is_refused_and_leaves_no_gap(qu
     assert queue.put_nowait(node(), bytes(largest)) == 2
     queue.close()
     assert [len(each.payload) for each in await drain(queue)] == [2, largest]
+
+
+async def test_as_many_episodes_are_open_as_leave_room_for_the_largest_record(queue: RecorderQueue) -> None:
+    most = (4096 - 2 * 72 - 56 - 64 - 2304) // 40
+    for number in range(most):
+        queue.put_nowait(started(number), b"{}")
+    with pytest.raises(EpisodeRefused, match=f"{most} episodes are open"):
+        queue.put_nowait(started(most), b"{}")
+    longest = Heading(started(0).episode, "x" * 255, 1)
+    assert [queue.put_nowait(longest, bytes(2048), reserved=True) for _ in range(3)] == [2, 3, 4]
+    queue.put_nowait(ended(1), b"{}")
+    assert queue.put_nowait(started(most), b"{}") == 1
+    queue.close()
+    assert len(await drain(queue)) == most + 5
 
 
 async def test_a_type_name_that_has_no_place_in_a_frame_is_refused(queue: RecorderQueue) -> None:
@@ -360,7 +374,7 @@ def test_a_spool_that_cannot_be_made_is_one_clear_line(tmp_path: Path, deep: boo
 
 
 async def test_an_interrupt_in_the_middle_of_putting_leaves_a_whole_queue(tmp_path: Path) -> None:
-    queue = make(tmp_path, settings=Settings(segment_bytes=2**16), clock=SYSTEM_CLOCK)
+    queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12), clock=SYSTEM_CLOCK)
     queue.put_nowait(started(), b"{}")
     returned = 0
 

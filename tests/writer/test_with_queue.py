@@ -17,7 +17,9 @@ from pycrorm_async.writer.thread import WriterThread
 from tests.store.making import ask, episode
 from tests.writer.ends import CountingFold, opener
 
-SETTINGS = Settings(segment_bytes=2**17, batch_events_max=700, sync_interval_ms=5, idle_ms=10**9)
+SETTINGS = Settings(
+    segment_bytes=2**17, record_bytes_max=2**12, batch_events_max=700, sync_interval_ms=5, idle_ms=10**9
+)
 STORED = "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY episode"
 
 
