@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 from typing import NamedTuple
 
 from pycrorm_async.config import Settings
@@ -17,6 +18,7 @@ __all__ = ["Emitter", "Faults"]
 
 _log = logging.getLogger("pycrorm_async")
 _BLOCK_S = 1.0
+_OUR_THREADS = "pycrorm "
 
 
 class Faults(NamedTuple):
@@ -58,6 +60,9 @@ class Emitter:
             try:
                 return self.sink.put_nowait(heading, payload, reserved=True)
             except SpoolFull:
+                # The collector may close a dropped plan in a thread of ours, and these are the ones that make room.
+                if threading.current_thread().name.startswith(_OUR_THREADS):
+                    raise
                 self.sink.block_until_room(_BLOCK_S)
 
     def note_fault(self, where: str, error: BaseException) -> None:

@@ -63,5 +63,6 @@ def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path,
     found = json.loads(done.stdout)
     assert found["rows"] == [total, 0, total - 1, total]
     assert found["done"] == total + 1  # the root of the episode as well
-    # 50,000 actions more, at the 32 kB a node of the reference system, would be 1.6 GB; at 100 bytes 5 MB.
-    assert found["sizes"][-1] - found["sizes"][4] < 5_000, found["sizes"]
+    # In KiB, over the second half. 32 kB a node, as in the reference system, would be 1.6 GB; the writer's largest batch
+    # comes and goes with some MB.
+    assert found["sizes"][-1] - found["sizes"][4] < 12_000, found["sizes"]
