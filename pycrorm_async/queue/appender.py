@@ -20,16 +20,16 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.capacity import Capacity
 from pycrorm_async.queue.frame import (
-    CHECKSUM,
+    CHECKSUM_START,
     COMMIT_BYTES,
     DECLARATION,
     EVENT,
-    HEAD,
     HEADER_BYTES,
     NO_EPISODE,
-    PADDING,
     TYPE_BYTES_MAX,
+    encode_body,
     encode_commit,
+    encode_header,
 )
 from pycrorm_async.queue.segment import CLOSES, OPENS, Last, Segment, SegmentHeader, salt_of
 
@@ -100,8 +100,7 @@ class Appender:
         """`RecorderQueue.put_nowait`. Not from a signal handler: the lock may be this thread's own."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
-        length = len(name) + len(payload)
-        body = b"".join((name, payload, PADDING[-length & 7]))
+        body = encode_body(name, payload)
         body_checksum = crc32(body)
         kind, owner, sequence = EVENT, episode or NO_EPISODE, 0
         with self._lock:
@@ -123,7 +122,7 @@ class Appender:
             offset = self._offset
             position = self.position + 1
             wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
-            head = HEAD.pack(
+            header = encode_header(
                 kind,
                 len(name),
                 version,
@@ -134,14 +133,14 @@ class Appender:
                 monotonic_ns,
                 owner,
                 self._salt,
+                body_checksum,
             )
-            checksum = CHECKSUM.pack(crc32(head, body_checksum))
-            span_checksum = crc32(checksum, self._span_checksum)
+            span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
             buffer = self._buffer
             # From here to the blank line nothing is called, so no KeyboardInterrupt can come between the steps: the
             # record and the bookkeeping are both there or both not. The header goes last: a body alone is no frame.
             buffer[offset + HEADER_BYTES : end] = body
-            buffer[offset : offset + HEADER_BYTES] = head + checksum
+            buffer[offset : offset + HEADER_BYTES] = header
             self._offset = end
             self.position = position
             self._span_count += 1
