@@ -169,7 +169,8 @@ class BulletWorld:
         """Make the objects of `saved` as they were then; tells what differed, and nothing else.
 
         An object that was added since stays where it is, detached from the others. Raises `ObjectNotInWorld` if one
-        of the state's objects is gone, `UnknownJoint` if another one has its name now; then nothing was touched.
+        of the state's objects is gone, `UnknownJoint` if another one has its name now, `PoseRefused` or
+        `JointLimitExceeded` if it was made by hand with a number that is not finite; then nothing was touched.
         """
         _ = self.client
         state.restore(self, saved)

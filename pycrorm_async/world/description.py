@@ -1,17 +1,19 @@
 """What must hold of a URDF before Bullet sees it, because Bullet dies of some faults instead of naming them.
 
-Two roots or two joints of one name end the process inside Bullet [both seen]; a mesh that is missing is named by Bullet
-only on stdout. So the tree of links, the names and the mesh files are checked here; the rest is left to Bullet.
+Two roots or two joints of one name end the process inside Bullet; a mesh that is missing is named by Bullet only on
+stdout; an origin that is not finite puts links nowhere. So the tree of links, the names, the mesh files and the origins
+are checked here; the rest is left to Bullet.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 
 from pycrorm_async.world.errors import DescriptionNotLoadable
+from pycrorm_async.world.pose import COORDINATE_MAX
 
 __all__ = ["urdf_text"]
 
@@ -87,6 +89,21 @@ def _check(robot: Element) -> None:
         raise _Fault(f"it must have one root link, and has {len(roots)}: {', '.join(roots) or 'a circle'}")
     for link in links:
         _climb(link, above)
+    for element in robot.iter():
+        for value in _numbers(element):
+            if not abs(value) <= COORDINATE_MAX:
+                raise _Fault(
+                    f"<{element.tag}> holds {value:g}; numbers must be finite, and none above {COORDINATE_MAX:g}"
+                )
+
+
+def _numbers(element: Element) -> Iterator[float]:
+    """What is given of places and directions; words that are no numbers are Bullet's affair."""
+    for word in f"{element.get('xyz', '')} {element.get('rpy', '')}".split():
+        try:
+            yield float(word)
+        except ValueError:
+            continue
 
 
 def _climb(link: str, above: dict[str, str]) -> None:

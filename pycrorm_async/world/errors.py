@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.world.pose import COORDINATE_MAX, Pose
 
 __all__ = [
     "WorldError",
     "WorldUnavailable",
     "WorldClosed",
     "NoWorld",
+    "ObjectRefused",
     "ObjectNotInWorld",
     "DuplicateName",
     "DescriptionNotLoadable",
@@ -38,6 +40,10 @@ class NoWorld(WorldError):
 
     def __init__(self, wanted_for: str) -> None:
         super().__init__(f"no world for {wanted_for}: act inside `with BulletWorld() as world:`")
+
+
+class ObjectRefused(WorldError):
+    """An object was to be made with a name that is no str, or a type that is no `ObjectType`."""
 
 
 class ObjectNotInWorld(WorldError):
@@ -85,10 +91,11 @@ class UnknownLink(WorldError):
 
 
 class JointLimitExceeded(WorldError):
-    """A joint position is outside the joint's hard limits (rad or m), or no number; nothing was moved."""
+    """A joint position is outside the joint's hard limits (rad or m), or not finite; nothing was moved."""
 
     def __init__(self, object_name: str, joint: str, value: float, limits: tuple[float, float]) -> None:
-        super().__init__(f"{object_name!r}: {joint} cannot be {value:g}; its limits are {limits[0]:g} to {limits[1]:g}")
+        lower, upper = max(limits[0], -COORDINATE_MAX), min(limits[1], COORDINATE_MAX)
+        super().__init__(f"{object_name!r}: {joint} cannot be {value:g}; its limits are {lower:g} to {upper:g}")
         self.object_name = object_name
         self.joint = joint
         self.value = value
@@ -96,7 +103,13 @@ class JointLimitExceeded(WorldError):
 
 
 class PoseRefused(WorldError):
-    """A pose is in another frame than "map", or holds a number that is not finite."""
+    """An object cannot be put at a pose in another frame than "map", or with a number that is not finite."""
+
+    def __init__(self, object_name: str, pose: Pose, reason: str) -> None:
+        super().__init__(f"{object_name!r} cannot be put at {pose!r}: {reason}")
+        self.object_name = object_name
+        self.pose = pose
+        self.reason = reason
 
 
 class AttachmentRefused(WorldError):

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,11 +22,12 @@ from pycrorm_async.world.errors import (
     JointLimitExceeded,
     NoWorld,
     ObjectNotInWorld,
+    ObjectRefused,
     PoseRefused,
     UnknownJoint,
     UnknownLink,
 )
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.pose import COORDINATE_MAX, Pose
 from pycrorm_async.world.robot import RobotDescription, robot_description
 from pycrorm_async.world.shapes import built_in_urdf
 from pycrorm_async.world.watch import current_world
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Object"]
 
-_SLACK = 1e-6  # rad or m: what rounding may put a joint past its limit
+_PAST_LIMIT_MAX = 1e-6  # rad or m: what rounding may put a joint past its limit
 
 
 class Object:
@@ -52,7 +52,7 @@ class Object:
         color: red, green, blue, opacity, 0 to 1.
 
     Raises:
-        NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused.
+        ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused.
     """
 
     name: str
@@ -74,6 +74,7 @@ class Object:
         world: BulletWorld | None = None,
         color: Color | None = None,
     ) -> None:
+        _check_identity(name, object_type)
         world = world if world is not None else current_world.get()
         if world is None:
             raise NoWorld(f"object {name!r}")
@@ -83,7 +84,7 @@ class Object:
         self.name = name
         self.object_type = object_type
         self.world = world
-        self.original_pose = _accepted(pose if pose is not None else Pose())
+        self.original_pose = _accepted(name, pose if pose is not None else Pose())
         self.description_text = urdf_text(
             name, built_in_urdf(name, object_type) if description is None else description
         )
@@ -110,7 +111,7 @@ class Object:
             PoseRefused, WorldClosed, ObjectNotInWorld: nothing was moved.
         """
         self.check_present()
-        self.body.place(_accepted(pose))
+        self.body.place(_accepted(self.name, pose))
         attachments = self.world.attachments
         if (held := attachments.of(self)) is not None:
             attachments.put(held.parent, self, held.link)
@@ -194,7 +195,8 @@ class Object:
         wanted = {joint: float(position) for joint, position in positions.items()}
         for joint, position in wanted.items():
             lower, upper = self.joint_limits(joint)
-            if not (lower - _SLACK <= position <= upper + _SLACK and math.isfinite(position)):
+            within = lower - _PAST_LIMIT_MAX <= position <= upper + _PAST_LIMIT_MAX
+            if not (within and abs(position) <= COORDINATE_MAX):
                 raise JointLimitExceeded(self.name, joint, position, (lower, upper))
         if wanted:
             self.body.turn(wanted)
@@ -277,10 +279,18 @@ class Object:
         return link
 
 
-def _accepted(pose: Pose) -> Pose:
-    """The same pose, if a thing can be put there."""
+def _check_identity(name: object, object_type: object) -> None:
+    """Raise `ObjectRefused`. What is written down of an object begins with these two."""
+    if not isinstance(name, str):
+        raise ObjectRefused(f"the name of an object is a str, not {name!r}")
+    if not isinstance(object_type, ObjectType):
+        raise ObjectRefused(f"the type of object {name!r} is one of ObjectType, not {object_type!r}")
+
+
+def _accepted(name: str, pose: Pose) -> Pose:
+    """The same pose, if the thing of that name can be put there."""
     if pose.frame != "map":
-        raise PoseRefused(f"{pose!r} is given in {pose.frame!r}: transform it into 'map' first")
-    if not math.isfinite(sum(pose.position) + sum(pose.orientation)):
-        raise PoseRefused(f"{pose!r} holds a number that is not finite")
+        raise PoseRefused(name, pose, f"it is given in {pose.frame!r}: transform it into 'map' first")
+    if not all(abs(value) <= COORDINATE_MAX for value in (*pose.position, *pose.orientation)):
+        raise PoseRefused(name, pose, f"its numbers must be finite, and none larger than {COORDINATE_MAX:g}")
     return pose

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 
-__all__ = ["Vector", "Quaternion", "Pose", "rotated", "product", "yaw_quaternion"]
+__all__ = ["Vector", "Quaternion", "IDENTITY", "COORDINATE_MAX", "Pose", "rotated", "product", "yaw_quaternion"]
 
 
 class Vector(NamedTuple):
@@ -36,6 +36,9 @@ class Quaternion(NamedTuple):
 
 
 IDENTITY = Quaternion(0.0, 0.0, 0.0, 1.0)
+
+COORDINATE_MAX = 1e9
+"""Metres, or rad: nothing is set to more, either way. So no sum of what is set is ever infinite."""
 
 
 def product(a: Sequence[float], b: Sequence[float]) -> Quaternion:
@@ -95,7 +98,7 @@ class Pose:
     ) -> None:
         x, y, z = position
         qx, qy, qz, qw = orientation
-        length = math.sqrt(qx * qx + qy * qy + qz * qz + qw * qw)
+        length = math.hypot(qx, qy, qz, qw)
         if length == 0:
             raise ValueError("an orientation needs a quaternion of length other than zero")
         unit = abs(length - 1.0) < 1e-15

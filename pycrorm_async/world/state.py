@@ -5,11 +5,13 @@ Not Bullet's own saving of states, which costs ten times as much and knows no at
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple
 
+from pycrorm_async.world.errors import JointLimitExceeded, PoseRefused
 from pycrorm_async.world.pose import Pose
 
 if TYPE_CHECKING:
@@ -57,12 +59,12 @@ def restore(world: BulletWorld, state: WorldState) -> None:
     """Make the objects of `state` as they were; tells what differed, after all of it is done.
 
     An object that was added since stays where it is, and is detached from the others. Raises `ObjectNotInWorld` if
-    one of the state's objects is gone, `UnknownJoint` if another one has its name now; then nothing was touched.
+    one of the state's objects is gone, `UnknownJoint` if another one has its name now, `PoseRefused` and
+    `JointLimitExceeded` if a state that was made by hand holds what is not finite; then nothing was touched.
     """
     then = {world.object(name): was for name, was in state.objects.items()}
     for thing, was in then.items():
-        for joint in was.joints:
-            thing.joint_position(joint)
+        _check(thing, was)
     for each in world.attachments:
         if each.child in then or each.parent in then:
             wanted = then[each.child].attached_to if each.child in then else None
@@ -79,6 +81,16 @@ def restore(world: BulletWorld, state: WorldState) -> None:
                 world.attachments.put(parent, child, link)
             else:
                 parent.attach(child, link)
+
+
+def _check(thing: Object, was: ObjectState) -> None:
+    """Raise if the object cannot be so."""
+    if not all(map(math.isfinite, (*was.pose.position, *was.pose.orientation))):
+        raise PoseRefused(thing.name, was.pose, "its numbers must be finite")
+    for joint, position in was.joints.items():
+        limits = thing.joint_limits(joint)
+        if not math.isfinite(position):
+            raise JointLimitExceeded(thing.name, joint, position, limits)
 
 
 def _apply(then: Mapping[Object, ObjectState]) -> _Differences:

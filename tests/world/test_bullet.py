@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import dataclasses
 import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -12,7 +13,16 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, watcher
-from pycrorm_async.world.errors import ObjectNotInWorld, UnknownJoint, WorldClosed, WorldError, WorldUnavailable
+from pycrorm_async.world.errors import (
+    JointLimitExceeded,
+    ObjectNotInWorld,
+    PoseRefused,
+    UnknownJoint,
+    WorldClosed,
+    WorldError,
+    WorldUnavailable,
+)
+from pycrorm_async.world.state import WorldState
 from tests.world.witness import CRANE, Witness
 
 # --- entering and leaving -------------------------------------------------------------------------------------
@@ -300,6 +310,25 @@ def test_a_state_is_not_put_upon_another_object_of_the_same_name(world: BulletWo
     with pytest.raises(UnknownJoint, match="'crane' has no movable joint 'turning'"):
         world.restore_state(state)
     assert cup.pose is THERE
+
+
+def test_a_state_made_by_hand_that_is_not_finite_is_refused_and_nothing_moves(
+    world: BulletWorld, witness: Witness
+) -> None:
+    crane, _, _ = scene()
+    crane.set_pose(THERE)
+    crane.set_joint_position("turning", 0.5)
+    crane_now, cup_now = (world.save_state().objects[name] for name in ("crane", "cup"))
+    nowhere = dataclasses.replace(cup_now, pose=Pose([0, math.nan, 0]))
+    turned = dataclasses.replace(crane_now, joints={"turning": math.inf})
+    elsewhere = dataclasses.replace(crane_now, pose=Pose())
+    witness.told.clear()
+    with pytest.raises(PoseRefused, match="'cup'"):
+        world.restore_state(WorldState({"crane": elsewhere, "cup": nowhere}))
+    with pytest.raises(JointLimitExceeded, match="'crane': turning cannot be inf"):
+        world.restore_state(WorldState({"cup": dataclasses.replace(cup_now, pose=THERE), "crane": turned}))
+    assert witness.told == []
+    assert world.save_state().objects["crane"] == crane_now
 
 
 # --- looking --------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from pycrorm_async.world.errors import (
     JointLimitExceeded,
     NoWorld,
     ObjectNotInWorld,
+    ObjectRefused,
     PoseRefused,
     UnknownJoint,
     UnknownLink,
@@ -116,6 +118,7 @@ def test_a_base_motion_is_told_once_even_to_where_it_was(world: BulletWorld, wit
         ("reaching", 5.0, (0.0, 0.6)),
         ("reaching", math.nan, (0.0, 0.6)),
         ("turning", math.inf, (-math.inf, math.inf)),
+        ("turning", -1.1e9, (-math.inf, math.inf)),
     ],
 )
 def test_a_joint_outside_its_limits_is_refused_and_nothing_moves(
@@ -129,6 +132,12 @@ def test_a_joint_outside_its_limits_is_refused_and_nothing_moves(
     assert refused.value.value == value or math.isnan(value)
     assert thing.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
     assert witness.told == []
+
+
+def test_a_joint_without_limits_is_refused_in_words_that_make_sense(world: BulletWorld) -> None:
+    with pytest.raises(JointLimitExceeded) as refused:
+        crane().set_joint_position("turning", math.inf)
+    assert str(refused.value) == "'crane': turning cannot be inf; its limits are -1e+09 to 1e+09"
 
 
 def test_rounding_past_a_limit_is_let_through_and_never_clamped(world: BulletWorld) -> None:
@@ -153,16 +162,58 @@ def test_unknown_names_are_refused_with_those_that_exist(world: BulletWorld) -> 
 
 
 @pytest.mark.parametrize(
-    "pose", [Pose([0, 0, math.nan]), Pose([math.inf, 0, 0]), Pose([1, 2, 3], frame="pr2/base_link")]
+    ("pose", "reason"),
+    [
+        (Pose([0, 0, math.nan]), "finite"),
+        (Pose([math.inf, -math.inf, 0]), "finite"),
+        (Pose([0, 0, -1.1e9]), "none larger than 1e+09"),
+        (Pose([0, 0, 0], [0, math.nan, 0, 1]), "finite"),
+        (Pose([0, 0, 0], [math.inf, 0, 0, 1]), "finite"),
+        (Pose([1, 2, 3], frame="pr2/base_link"), "'pr2/base_link'"),
+    ],
 )
-def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(world: BulletWorld, pose: Pose) -> None:
-    thing = crane(LEANING)
-    with pytest.raises(PoseRefused):
+def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(
+    world: BulletWorld, witness: Witness, pose: Pose, reason: str
+) -> None:
+    thing, milk = crane(LEANING), Object("milk", ObjectType.MILK)
+    thing.attach(milk, "hook")
+    witness.told.clear()
+    with pytest.raises(PoseRefused, match=reason.replace("+", r"\+")) as refused:
         thing.set_pose(pose)
-    assert thing.pose is LEANING
-    with pytest.raises(PoseRefused):
-        Object("milk", ObjectType.MILK, pose=pose)
-    assert [present.name for present in world.objects] == ["crane"]
+    assert (refused.value.object_name, refused.value.pose) == ("crane", pose) or math.nan in pose.orientation
+    assert str(refused.value).startswith(f"'crane' cannot be put at {pose!r}: ")
+    assert (thing.pose, milk.pose) == (LEANING, Pose())
+    with pytest.raises(PoseRefused, match="'cup'"):
+        Object("cup", ObjectType.JEROEN_CUP, pose=pose)
+    assert [present.name for present in world.objects] == ["crane", "milk"]
+    assert witness.told == []
+
+
+def test_what_is_carried_from_the_farthest_place_there_is_stays_finite(world: BulletWorld) -> None:
+    thing, milk = crane(), Object("milk", ObjectType.MILK, pose=Pose([-1e9, -1e9, -1e9]))
+    thing.attach(milk, "hook")
+    for place in (Pose([1e9, 1e9, 1e9], [0.2, -0.4, 0.1, 0.8]), Pose([-1e9, 0, 1e9], [0.2, 0.4, 0.1, -0.8])):
+        thing.set_pose(place)
+        thing.set_joint_position("turning", 1e9)
+        assert all(map(math.isfinite, (*milk.pose.position, *milk.pose.orientation)))
+
+
+@pytest.mark.parametrize(
+    ("name", "object_type", "words"),
+    [
+        (None, ObjectType.MILK, "the name of an object is a str, not None"),
+        (b"milk", ObjectType.MILK, "the name of an object is a str, not b'milk'"),
+        ("milk", "MILK", "the type of object 'milk' is one of ObjectType, not 'MILK'"),
+        ("milk", 3, "the type of object 'milk' is one of ObjectType, not 3"),
+    ],
+)
+def test_an_object_has_a_name_and_a_type(
+    world: BulletWorld, witness: Witness, name: Any, object_type: Any, words: str
+) -> None:
+    with pytest.raises(ObjectRefused) as refused:
+        Object(name, object_type)
+    assert str(refused.value) == words
+    assert (world.objects, witness.told) == ((), [])
 
 
 def test_a_name_is_given_once_in_a_world(world: BulletWorld) -> None:

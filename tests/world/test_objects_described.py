@@ -90,6 +90,9 @@ FAULTS = {
         f'<robot name="a"><link name="r"/><link name="m"/>{HINGE}</robot>',
         "does not specify limits",
     ),
+    "an origin that is nowhere": (with_mesh("none.stl").replace('"1 0 0"', '"1 nan 0"'), "<origin> holds nan"),
+    "a turn without end": (with_mesh("none.stl").replace('xyz="1 0 0"', 'rpy="0 0 1e999"'), "<origin> holds inf"),
+    "a place too far": (with_mesh("none.stl").replace('"1 0 0"', '"1.1e9 0 0"'), "<origin> holds 1.1e+09"),
     "a box without a size": (f'<robot name="a">{BOX}</robot>', "box requires a size"),
 }
 
