@@ -30,9 +30,8 @@ async def rollouts(world: BulletWorld, milk: Object, generator: np.random.Genera
         x, y = generator.uniform(-0.9, 0.9, 2)
         arm = (Arms.LEFT, Arms.RIGHT)[generator.integers(2)]
         grasp = tuple(Grasp)[generator.integers(4)]
-        with simulated_robot:
-            with suppress(PlanFailure):
-                await MoveAndPickUpPerformable(Pose([1.3 + x, 1.0 + y, 0.0]), target, arm, grasp).perform()
+        with simulated_robot, suppress(PlanFailure):
+            await MoveAndPickUpPerformable(Pose([1.3 + x, 1.0 + y, 0.0]), target, arm, grasp).perform()
         world.reset()
     return time.perf_counter() - began
 
