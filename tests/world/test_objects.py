@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 import numpy as np
@@ -178,9 +179,10 @@ def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(
     thing, milk = crane(LEANING), Object("milk", ObjectType.MILK)
     thing.attach(milk, "hook")
     witness.told.clear()
-    with pytest.raises(PoseRefused, match=reason.replace("+", r"\+")) as refused:
+    with pytest.raises(PoseRefused, match=re.escape(reason)) as refused:
         thing.set_pose(pose)
-    assert (refused.value.object_name, refused.value.pose) == ("crane", pose) or math.nan in pose.orientation
+    assert refused.value.object_name == "crane"
+    assert refused.value.pose is pose
     assert str(refused.value).startswith(f"'crane' cannot be put at {pose!r}: ")
     assert (thing.pose, milk.pose) == (LEANING, Pose())
     with pytest.raises(PoseRefused, match="'cup'"):
