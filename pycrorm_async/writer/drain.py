@@ -18,6 +18,7 @@ from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.writer.asking import answer_of
 from pycrorm_async.writer.backoff import PATIENT, Backoff
 from pycrorm_async.writer.ports import Destination, Source
 
@@ -125,21 +126,19 @@ class Drain:
         )
 
     async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        attempt = 0
-        while True:
-            try:
-                refusals = await to_the_end(self._destination.append(batch))
-            except DatabaseUnavailable as error:
-                attempt += 1
-                self._retries += 1
-                self._away = self._last_error = str(error)
-                pause_s = self._backoff.pause_s(attempt, self._randomness())
-                if pause_s is None:
-                    raise
-                await self._sleep(pause_s)
-            else:
-                self._away = None
-                return refusals
+        refusals = await answer_of(
+            lambda: to_the_end(self._destination.append(batch)),
+            backoff=self._backoff,
+            on_away=self._note_away,
+            randomness=self._randomness,
+            sleep=self._sleep,
+        )
+        self._away = None
+        return refusals
+
+    def _note_away(self, error: DatabaseUnavailable) -> None:
+        self._retries += 1
+        self._away = self._last_error = str(error)
 
     def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
         """How far the source may forget now."""

@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeVar
 
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
+from pycrorm_async.writer.asking import answer_of
 from pycrorm_async.writer.backoff import PATIENT
 from pycrorm_async.writer.drain import Drain, DrainState, to_the_end
 from pycrorm_async.writer.ports import Destination, Source
@@ -134,17 +135,12 @@ class LiveWriter:
 
     async def _patiently(self, ask: Callable[[], Awaitable[_T]]) -> _T:
         """Asks again while the database is away; the caller bounds the time."""
-        attempt = 0
-        while True:
-            try:
-                answer = await ask()
-            except DatabaseUnavailable as error:
-                attempt += 1
-                self._fold_error = str(error)
-                await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0)
-            else:
-                self._fold_error = None
-                return answer
+        answer = await answer_of(ask, backoff=PATIENT, on_away=self._note_away, randomness=self._randomness)
+        self._fold_error = None
+        return answer
+
+    def _note_away(self, error: DatabaseUnavailable) -> None:
+        self._fold_error = str(error)
 
     async def _fold_when_idle(self) -> None:
         self._news.set()  # something may have been left behind before

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DamageError, FilesError, PycrormError
+from pycrorm_async.writer.asking import answer_of
 from pycrorm_async.writer.backoff import BRIEF
 from pycrorm_async.writer.drain import Drain, DrainState
 from pycrorm_async.writer.ports import Destination, Source
@@ -34,7 +35,7 @@ class Recovered:
 async def drain_once(sources: Iterable[Source], destination: Destination, *, settings: Settings) -> Recovered:
     """Drains each source to its end, then folds. One that is damaged does not keep the others from being drained.
 
-    Raises `DatabaseUnavailable` if the database stays away for some attempts.
+    Raises `DatabaseUnavailable` if the database stays away for some attempts at any of this; what was stored stays.
     """
     drained: list[DrainState] = []
     failed: dict[str, PycrormError] = {}
@@ -45,5 +46,6 @@ async def drain_once(sources: Iterable[Source], destination: Destination, *, set
         except (DamageError, FilesError) as error:
             failed[source.name] = error
         drained.append(drain.state)
-    folded = await destination.fold()
-    return Recovered(drained=tuple(drained), failed=failed, folded=folded, stopped=dict(await destination.stopped()))
+    folded = await answer_of(destination.fold, backoff=BRIEF)
+    stopped = await answer_of(destination.stopped, backoff=BRIEF)
+    return Recovered(drained=tuple(drained), failed=failed, folded=folded, stopped=dict(stopped))

@@ -103,8 +103,9 @@ class CountingFold(Destination):
     async def fold(self) -> int:
         behind = await self.log.behind()
         if behind:
-            async with self.log.engine.begin() as connection:
-                assert await advance_folded(connection, [(row.number, row.folded, row.head) for row in behind])
+            with self.log.translated():
+                async with self.log.engine.begin() as connection:
+                    assert await advance_folded(connection, [(row.number, row.folded, row.head) for row in behind])
         return sum(row.head - row.folded for row in behind)
 
     async def stopped(self) -> Mapping[str, str]:

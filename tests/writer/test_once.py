@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -12,7 +12,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.once import drain_once
 from tests.store.making import ask, episode, run_of
-from tests.writer.ends import CountingFold, KeptSource
+from tests.writer.ends import CountingFold, KeptSource, Passing
 
 SETTINGS = Settings(batch_events_max=10)
 
@@ -72,3 +72,57 @@ async def test_a_database_that_stays_away_is_raised(log: EventLog) -> None:
         await drain_once([source], CountingFold(log), settings=SETTINGS)
     holder.close()
     assert source.kept == [1, 2, 3]
+
+
+class LockedAfterAppend(Passing):
+    """Another process writes into the database from the first fold on, until it was asked so often."""
+
+    def __init__(self, log: EventLog, *, folds_met: int) -> None:
+        super().__init__(CountingFold(log))
+        self.folds = 0
+        self._folds_met = folds_met
+        self._holder = sqlite3.connect(log.address.path, isolation_level=None)
+
+    async def fold(self) -> int:
+        if self.folds == 0:
+            self._holder.execute("BEGIN IMMEDIATE")
+        if self.folds == self._folds_met:
+            self.release()
+        self.folds += 1
+        return await super().fold()
+
+    def release(self) -> None:
+        self._holder.close()
+
+
+async def test_a_database_that_is_busy_when_it_is_to_fold_is_asked_again(log: EventLog) -> None:
+    destination = LockedAfterAppend(log, folds_met=2)
+    recovered = await drain_once([KeptSource(run_of(episode(1), 1, 3), closed=True)], destination, settings=SETTINGS)
+    assert (recovered.folded, destination.folds) == (3, 3)
+    assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 3)]
+
+
+async def test_a_database_that_stays_busy_when_it_is_to_fold_is_raised_and_what_was_stored_stays(log: EventLog) -> None:
+    destination = LockedAfterAppend(log, folds_met=99)
+    source = KeptSource(run_of(episode(1), 1, 3), closed=True)
+    with pytest.raises(DatabaseUnavailable, match="database is locked"):
+        await drain_once([source], destination, settings=SETTINGS)
+    destination.release()
+    assert (destination.folds, source.kept) == (5, [])
+    assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 0)]
+
+
+async def test_a_database_that_is_away_when_asked_what_is_stopped_is_asked_again(log: EventLog) -> None:
+    class AwayTwice(Passing):
+        asked = 0
+
+        async def stopped(self) -> Mapping[str, str]:
+            self.asked += 1
+            if self.asked < 3:
+                raise DatabaseUnavailable("the connection was closed")
+            return await super().stopped()
+
+    destination = AwayTwice(CountingFold(log))
+    source = KeptSource([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True)
+    recovered = await drain_once([source], destination, settings=SETTINGS)
+    assert recovered.stopped == {"00000000-0000-0000-0000-000000000001": "event 4 did not arrive before event 5"}
