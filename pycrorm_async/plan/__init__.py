@@ -53,7 +53,7 @@ from pycrorm_async.plan.objects import (
     ObjectDesignatorDescription,
     ObjectPart,
 )
-from pycrorm_async.plan.process_modules import ChosenRobot, ProcessModules, simulated_robot
+from pycrorm_async.plan.process_modules import ChosenRobot, ProcessModules, simulated_robot, simulated_robot_within
 from pycrorm_async.plan.task_tree import CollectedTree, TaskStatus, TaskTreeNode, collected_tree
 
 __all__ = [
@@ -63,6 +63,7 @@ __all__ = [
     "PlanFailure",
     "IKError",
     "simulated_robot",
+    "simulated_robot_within",
     "ProcessModules",
     "ChosenRobot",
     "collected_tree",

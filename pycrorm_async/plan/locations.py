@@ -116,7 +116,7 @@ class CostmapLocation(LocationDesignator):
             down at.
         reachable_for: the robot that is to reach it. For an object that means all three goals of a pick-up
             from the front (`Grasp.FRONT`), for a pose those of placing what the arm holds, with the torso
-            and the arms as they are now.
+            and the arms as they are now, within the limits of the chosen robot (`simulated_robot_within`).
         visible_for: the robot that is to see it.
         reachable_arm: only places where this arm reaches; for BOTH, each of the two.
 

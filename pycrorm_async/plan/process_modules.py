@@ -2,7 +2,8 @@
 context.
 
 The choice nests, ends with the block however it is left, and is inherited by tasks that start inside. A
-robot of one's own is a class with these methods: `with ChosenRobot("mine", MyModules()):`.
+robot of one's own is a class with these methods: `with ChosenRobot("mine", MyModules()):`. Arms keep to their
+soft limits; `with simulated_robot_within(Limits.HARD):` they go up to the stops.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 
 from pycrorm_async.plan.errors import NoRobotChosen
 from pycrorm_async.plan.simulated import SimulatedModules
+from pycrorm_async.world.robot import Limits
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import BaseMotion
@@ -25,7 +27,14 @@ if TYPE_CHECKING:
         MoveTCPMotion,
     )
 
-__all__ = ["ProcessModules", "ChosenRobot", "simulated_robot", "chosen_robot"]
+__all__ = [
+    "ProcessModules",
+    "ChosenRobot",
+    "simulated_robot",
+    "simulated_robot_within",
+    "chosen_robot",
+    "chosen_limits",
+]
 
 
 class ProcessModules(Protocol):
@@ -44,18 +53,25 @@ class ProcessModules(Protocol):
     async def move_joints(self, motion: MoveJointsMotion) -> None: ...
 
 
-_chosen: ContextVar[tuple[ProcessModules, ...]] = ContextVar("_chosen", default=())
+_chosen: ContextVar[tuple[ChosenRobot, ...]] = ContextVar("_chosen", default=())
 
 
 class ChosenRobot:
-    """A choice of process modules; `with` it, motions of this context are carried out by them."""
+    """A choice of process modules; `with` it, motions of this context are carried out by them.
 
-    def __init__(self, name: str, modules: ProcessModules) -> None:
+    Args:
+        name: for people.
+        modules: one robot's.
+        limits: what its arms keep to, for those who ask in advance what they can reach (`CostmapLocation`).
+    """
+
+    def __init__(self, name: str, modules: ProcessModules, *, limits: Limits = Limits.SOFT) -> None:
         self.name = name
-        self._modules = modules
+        self.modules = modules
+        self.limits = limits
 
     def __enter__(self) -> Self:
-        _chosen.set((*_chosen.get(), self._modules))
+        _chosen.set((*_chosen.get(), self))
         return self
 
     def __exit__(
@@ -67,7 +83,19 @@ class ChosenRobot:
         return f"<{self.name} robot>"
 
 
-simulated_robot = ChosenRobot("simulated", SimulatedModules())
+def simulated_robot_within(limits: Limits) -> ChosenRobot:
+    """As `simulated_robot`, with arms that keep to these limits.
+
+    Soft limits are those of the thesis' experiments. Within hard ones an arm reaches about twice as much, also
+    from above with the torso down.
+
+    >>> with simulated_robot_within(Limits.HARD):
+    ...     await MoveTCPMotion(Pose([0.9495, 0.188, 0.790675]), Arms.LEFT).perform()
+    """
+    return ChosenRobot(f"simulated ({limits.name.lower()} limits)", SimulatedModules(limits), limits=limits)
+
+
+simulated_robot = simulated_robot_within(Limits.SOFT)
 """The robot in the world of this context, moved kinematically: at once, exactly, without physics."""
 
 
@@ -76,4 +104,10 @@ def chosen_robot(motion: BaseMotion) -> ProcessModules:
     chosen = _chosen.get()
     if not chosen:
         raise NoRobotChosen(type(motion).__name__)
-    return chosen[-1]
+    return chosen[-1].modules
+
+
+def chosen_limits() -> Limits:
+    """What the arms of the innermost choice keep to; soft limits outside of any."""
+    chosen = _chosen.get()
+    return chosen[-1].limits if chosen else Limits.SOFT

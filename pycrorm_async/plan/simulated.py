@@ -13,7 +13,7 @@ from pycrorm_async.plan.failures import ConfigurationNotReached, IKError, TorsoG
 from pycrorm_async.plan.here import RobotHere, robot_here
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import JointLimitExceeded
-from pycrorm_async.world.kinematics import Unreachable, solve
+from pycrorm_async.world.kinematics import Limits, Unreachable, solve
 from pycrorm_async.world.pose import Pose
 
 if TYPE_CHECKING:
@@ -30,7 +30,10 @@ __all__ = ["SimulatedModules"]
 
 
 class SimulatedModules:
-    """The process modules of `with simulated_robot:`."""
+    """The process modules of `with simulated_robot:`, with arms that keep to these limits when they are to reach."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
 
     async def navigate(self, motion: MoveMotion) -> None:
         robot_here().body.set_pose(motion.target)
@@ -38,7 +41,7 @@ class SimulatedModules:
     async def move_tcp(self, motion: MoveTCPMotion) -> None:
         body, description = robot_here()
         try:
-            joints = solve(body, motion.arm, motion.target)
+            joints = solve(body, motion.arm, motion.target, limits=self._limits)
         except Unreachable as unreachable:
             tip = description.arms[motion.arm].tool_frame
             raise IKError(motion.target, motion.arm, tip, unreachable.reason) from unreachable

@@ -1,7 +1,7 @@
 """Where a robot can stand to reach or see something: the best cells of a costmap, each tried by inverse kinematics.
 
 What is tried is what the actions will do (`plan.grasping`), from where the robot would stand, with its torso
-and arms as they are now. Nothing is moved.
+and arms as they are now, within the limits of the chosen robot. Nothing is moved.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.grasping import pick_up_poses, place_pose, retracted
 from pycrorm_async.plan.here import RobotHere, world_here
 from pycrorm_async.plan.objects import ObjectLike, designator_of, in_world
+from pycrorm_async.plan.process_modules import chosen_limits
 from pycrorm_async.world.costmaps import Costmap, GaussianCostmap, OccupancyCostmap, VisibilityCostmap
 from pycrorm_async.world.enums import Arms, Grasp
-from pycrorm_async.world.kinematics import Unreachable, solve_from
+from pycrorm_async.world.kinematics import Unreachable, solve
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 
@@ -77,15 +78,14 @@ def _reaching(
     robot: RobotHere, stand: Pose, target: Pose | ObjectLike, goal: Pose, wanted: Arms | None
 ) -> tuple[Arms, ...] | None:
     """The arms that reach all goals from there; None if those that are wanted do not."""
-    body, description = robot
-    torso = body.joint_position(description.torso_joint)
+    limits = chosen_limits()
     arms = (Arms.LEFT, Arms.RIGHT) if wanted in (None, Arms.BOTH) else (wanted,)
     reaching = []
     for arm in arms:
         goals = _goals(robot, arm, stand, target, goal)
         try:
             for each in goals:
-                solve_from(description, arm, each, base=stand, torso_height=torso)
+                solve(robot.body, arm, each, base=stand, limits=limits)
         except Unreachable:
             continue
         reaching.append(arm)

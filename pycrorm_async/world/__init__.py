@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pycrorm_async.world.enums import Arms, Grasp, GripperState, JointType, ObjectType, WorldMode
     from pycrorm_async.world.objects import Object
     from pycrorm_async.world.pose import Pose, Quaternion, Vector
-    from pycrorm_async.world.robot import RobotDescription, robot_description
+    from pycrorm_async.world.robot import Limits, RobotDescription, robot_description
     from pycrorm_async.world.state import WorldState
     from pycrorm_async.world.watch import WorldObserver, WorldWatcher, current_world, watcher
 
@@ -44,6 +44,7 @@ __all__ = [
     "WorldMode",
     "WorldState",
     "BoundingBox",
+    "Limits",
     "RobotDescription",
     "robot_description",
     "Costmap",
@@ -64,7 +65,7 @@ _HOME = {
     "enums": ("Arms", "Grasp", "GripperState", "JointType", "ObjectType", "WorldMode"),
     "objects": ("Object",),
     "pose": ("Pose", "Quaternion", "Vector"),
-    "robot": ("RobotDescription", "robot_description"),
+    "robot": ("Limits", "RobotDescription", "robot_description"),
     "state": ("WorldState",),
     "watch": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),
 }

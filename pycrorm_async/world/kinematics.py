@@ -66,8 +66,10 @@ def forward(
     return base @ Pose([a + b for a, b in zip(shoulder, tool, strict=True)], turn, base.frame)
 
 
-def solve(robot: Object, arm: Arms, target: Pose, *, limits: Limits = Limits.SOFT) -> dict[str, float]:
-    """Joint name → rad for the arm of the robot as it stands in its world; moves nothing.
+def solve(
+    robot: Object, arm: Arms, target: Pose, *, base: Pose | None = None, limits: Limits = Limits.SOFT
+) -> dict[str, float]:
+    """Joint name → rad for the arm of the robot as it is in its world, or as it would be at `base`; moves nothing.
 
     Hard limits are those of the loaded model where they are narrower than the description's.
 
@@ -83,7 +85,7 @@ def solve(robot: Object, arm: Arms, target: Pose, *, limits: Limits = Limits.SOF
     if limits is Limits.HARD:
         bounds = [_narrowed(bound, robot.joint_limits(name)) for name, bound in zip(part.joints, bounds, strict=True)]
     height = robot.joint_position(description.torso_joint)
-    reach = _reach(description, part, target, base=robot.pose, torso_height=height)
+    reach = _reach(description, part, target, base=robot.pose if base is None else base, torso_height=height)
     return _solved(part, arm, target, reach, bounds, limits)
 
 

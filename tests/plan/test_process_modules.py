@@ -9,6 +9,8 @@ import pytest
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import (
     ChosenRobot,
+    CostmapLocation,
+    IKError,
     LookingMotion,
     MoveArmJointsMotion,
     MoveGripperMotion,
@@ -22,9 +24,10 @@ from pycrorm_async.plan import (
     TaskStatus,
     collected_tree,
     simulated_robot,
+    simulated_robot_within,
 )
-from pycrorm_async.plan.failures import GripperGoalNotReached
-from pycrorm_async.world import Arms, BulletWorld, GripperState, Object, ObjectType, Pose, WorldMode
+from pycrorm_async.plan.failures import GripperGoalNotReached, ReachabilityFailure
+from pycrorm_async.world import Arms, BulletWorld, GripperState, Limits, Object, ObjectType, Pose, WorldMode
 from pycrorm_async.world.errors import NoWorld
 from tests.plan.conftest import Scene
 
@@ -76,6 +79,35 @@ async def test_without_a_world_or_a_robot_the_caller_is_told() -> None:
             Object("walle", ObjectType.ROBOT, '<robot name="walle"><link name="walle"/></robot>')
             with pytest.raises(NoRobotHere, match="'walle' is not of a kind"):
                 await MoveMotion(THERE).perform()
+
+
+async def test_within_hard_limits_an_arm_reaches_what_soft_limits_forbid(scene: Scene) -> None:
+    """0.7195 m from the shoulder's lift axis to the wrist: elbow at -0.15 rad 0.7190 m, stretched 0.7210 m."""
+    stretched = MoveTCPMotion(Pose([0.9495, 0.188, 0.790675]), Arms.LEFT)
+    with simulated_robot_within(Limits.HARD):
+        with simulated_robot_within(Limits.SOFT), pytest.raises(IKError, match="too far"):
+            await stretched.perform()
+        assert not any(scene.robot.joint_positions().values())
+        await stretched.perform()
+    assert scene.robot.link_pose("l_gripper_tool_frame").distance(stretched.target) < 1e-6
+    assert -0.15 < scene.robot.joint_position("l_elbow_flex_joint") <= 0
+    with pytest.raises(IKError, match="too far"):
+        await stretched.perform()
+
+
+async def test_places_are_looked_for_within_the_limits_of_the_chosen_robot(scene: Scene) -> None:
+    """From above at 0.6 m with the torso down: not within soft limits."""
+    from_above = Pose([0, 3, 0.6], [0, 1, 0, 1])
+    location = CostmapLocation(from_above, reachable_for=scene.robot)
+    with pytest.raises(ReachabilityFailure):
+        location.resolve()
+    with simulated_robot_within(Limits.HARD):
+        stands = list(location)
+        assert len(stands) > 50
+        for stand in stands:
+            await MoveMotion(stand.pose).perform()
+            for arm in stand.reachable_arms:
+                await MoveTCPMotion(from_above, arm).perform()
 
 
 async def test_a_choice_nests_and_ends_with_its_block_also_by_an_exception(scene: Scene) -> None:
