@@ -11,7 +11,6 @@ from __future__ import annotations
 import asyncio
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 from pycrorm_async.config import Settings
@@ -122,7 +121,7 @@ class Drain:
             last_error=self._last_error,
             appended=self._appended,
             acknowledged=self._acknowledged,
-            refused=MappingProxyType(self._refused),
+            refused=dict(self._refused),  # one step of the interpreter, so whole from any thread
         )
 
     async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:

@@ -19,6 +19,9 @@ from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["WriterThread"]
 
+_LEAVE_S = 10.0
+"""How long `close` waits, when it is too late already, for the thread to let go of its database."""
+
 
 class WriterThread:
     """Drains one queue from a thread of its own.
@@ -86,7 +89,7 @@ class WriterThread:
         if not ended.done():
             late = self._too_late()
             self._ask_to_leave(cancel=True)
-            await asyncio.wait([ended], timeout=self._settings.connect_timeout_s)
+            await asyncio.wait([ended], timeout=_LEAVE_S)
             raise late
         self._thread.join()
         ended.result()

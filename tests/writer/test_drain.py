@@ -120,6 +120,18 @@ async def test_a_drain_that_may_give_up_raises_and_its_source_keeps_everything(l
     assert drain.state.retries == 2
 
 
+async def test_a_state_that_was_taken_stays_as_it_was(log: EventLog) -> None:
+    drain = Drain(
+        KeptSource([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9)], closed=True),
+        CountingFold(log),
+        settings=TENS,
+    )
+    before = drain.state
+    await drain.run()
+    assert drain.state.refused == {name(1): "event 5 did not arrive before event 6"}
+    assert before.refused == {}
+
+
 async def test_nothing_is_acknowledged_from_the_first_refused_record_on(log: EventLog) -> None:
     broken = [*run_of(episode(1), 1, 4, position=11), *run_of(episode(1), 6, 9, position=15)]
     records = [
