@@ -14,10 +14,11 @@ import math
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
+from xml.etree.ElementTree import Element, SubElement, fromstring, indent, tostring
 
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world.robot import FINGER_OPEN, PR2, ArmDescription, Bounds
+from pycrorm_async.world.shapes import INERTIA, numbers
 
 __all__ = ["pr2_urdf", "pr2_mesh_urdf_path"]
 
@@ -185,15 +186,13 @@ def _link(
 ) -> None:
     """A box around `centre`, or, without a size, a frame."""
     link = SubElement(robot, "link", name=name)
-    inertial = SubElement(link, "inertial")
-    SubElement(inertial, "mass", value="1")
-    SubElement(inertial, "inertia", ixx="0.01", ixy="0", ixz="0", iyy="0.01", iyz="0", izz="0.01")
+    link.append(fromstring(INERTIA))  # noqa: S314  our own text
     if size is None:
         return
     for purpose in ("visual", "collision"):
         shape = SubElement(link, purpose)
-        SubElement(shape, "origin", xyz=_numbers(centre))
-        SubElement(SubElement(shape, "geometry"), "box", size=_numbers(size))
+        SubElement(shape, "origin", xyz=numbers(centre))
+        SubElement(SubElement(shape, "geometry"), "box", size=numbers(size))
         if purpose == "visual":
             SubElement(SubElement(shape, "material", name=rgba), "color", rgba=rgba)
 
@@ -223,7 +222,7 @@ def _moving(
     endless = math.isinf(bounds.upper)
     kind = "continuous" if endless else "prismatic" if name == PR2.torso_joint else "revolute"
     joint = _joint(robot, kind, name, parent, child, origin, (0, 0, 0))
-    SubElement(joint, "axis", xyz=_numbers(axis))
+    SubElement(joint, "axis", xyz=numbers(axis))
     limit = SubElement(joint, "limit", effort="100", velocity="3")
     if not endless:
         limit.set("lower", repr(bounds.lower))
@@ -242,9 +241,6 @@ def _joint(
     joint = SubElement(robot, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
-    SubElement(joint, "origin", xyz=_numbers(origin), rpy=_numbers(turned))
+    # `numbers` rounds to a millionth: no longer a right angle
+    SubElement(joint, "origin", xyz=numbers(origin), rpy=" ".join(map(repr, turned)))
     return joint
-
-
-def _numbers(values: Sequence[float]) -> str:
-    return " ".join(repr(float(value)) for value in values)
