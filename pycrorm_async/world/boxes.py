@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.world.pose import Quaternion, Vector
 
-__all__ = ["BoundingBox", "Frame", "Solid", "solids_of", "box_around"]
+__all__ = ["BoundingBox", "Frame", "Solid", "solids_of", "box_around", "rotation_matrix"]
 
 Array = NDArray[np.float64]
 Frame = tuple[Vector, Quaternion]

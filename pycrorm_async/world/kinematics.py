@@ -33,8 +33,8 @@ __all__ = ["Limits", "Unreachable", "forward", "solve", "solve_from"]
 PAN_STEP_RAD = 0.01
 NEAR_MISS_RAD = 0.02
 """What lies no farther outside the limits than this is looked at again in steps fifty times finer."""
-EXACT = 1e-6
-"""Metres, and rad, between the target and where the answer leads."""
+EXACT_M = EXACT_RAD = 1e-6
+"""At most this is between the target and where the answer leads."""
 
 
 class Unreachable(Exception):
@@ -60,9 +60,9 @@ def forward(
         torso_height: m, the torso joint's position.
         base: where the robot's root link is.
     """
-    part = _one_arm(description, arm)
-    tool, turn = postures.hand(part, [joints[name] for name in part.joints])
-    shoulder = _shoulder(description, part, torso_height)
+    arm_description = _one_arm(description, arm)
+    tool, turn = postures.hand(arm_description, [joints[name] for name in arm_description.joints])
+    shoulder = _shoulder(description, arm_description, torso_height)
     return base @ Pose([a + b for a, b in zip(shoulder, tool, strict=True)], turn, base.frame)
 
 
@@ -80,13 +80,16 @@ def solve(
     description = robot.robot_description
     if description is None:
         raise CallerError(f"{robot.name!r} has no robot description, so nothing is known of its arms")
-    part = _one_arm(description, arm)
-    bounds = _bounds(part, limits)
+    arm_description = _one_arm(description, arm)
+    bounds = _bounds(arm_description, limits)
     if limits is Limits.HARD:
-        bounds = [_narrowed(bound, robot.joint_limits(name)) for name, bound in zip(part.joints, bounds, strict=True)]
+        bounds = [
+            _narrowed(bound, robot.joint_limits(name))
+            for name, bound in zip(arm_description.joints, bounds, strict=True)
+        ]
     height = robot.joint_position(description.torso_joint)
-    reach = _reach(description, part, target, base=robot.pose if base is None else base, torso_height=height)
-    return _solved(part, arm, target, reach, bounds, limits)
+    reach = _reach(description, arm_description, target, base=robot.pose if base is None else base, torso_height=height)
+    return _solved(arm_description, arm, target, reach, bounds, limits)
 
 
 def solve_from(
@@ -108,34 +111,36 @@ def solve_from(
     >>> forward(PR2, Arms.LEFT, joints, torso_height=0.0, base=Pose()).distance(target) < 1e-9
     True
     """
-    part = _one_arm(description, arm)
-    reach = _reach(description, part, target, base=base, torso_height=torso_height)
-    return _solved(part, arm, target, reach, _bounds(part, limits), limits)
+    arm_description = _one_arm(description, arm)
+    reach = _reach(description, arm_description, target, base=base, torso_height=torso_height)
+    return _solved(arm_description, arm, target, reach, _bounds(arm_description, limits), limits)
 
 
 def _solved(
-    part: ArmDescription, arm: Arms, target: Pose, reach: Reach, bounds: Sequence[Bounds], limits: Limits
+    arm_description: ArmDescription, arm: Arms, target: Pose, reach: Reach, bounds: Sequence[Bounds], limits: Limits
 ) -> dict[str, float]:
-    windows = postures.pan_windows(part, reach.wrist, bounds)
+    windows = postures.pan_windows(arm_description, reach.wrist, bounds)
     if not windows:
-        raise Unreachable(target, arm, _why_no_pan(part, reach.wrist, bounds, limits))
+        raise Unreachable(target, arm, _why_no_pan(arm_description, reach.wrist, bounds, limits))
     pans = np.concatenate([_steps(window, PAN_STEP_RAD) for window in windows])
-    upper, margin = _best(part, reach, pans, bounds)
+    upper, margin = _best(arm_description, reach, pans, bounds)
     if -NEAR_MISS_RAD < margin < 0:
         around = _narrowed(bounds[postures.PAN], (upper[0] - PAN_STEP_RAD, upper[0] + PAN_STEP_RAD))
-        upper, margin = _best(part, reach, _steps(around, PAN_STEP_RAD / 50), bounds)
+        upper, margin = _best(arm_description, reach, _steps(around, PAN_STEP_RAD / 50), bounds)
     angles = [*upper, *postures.wrist_angles(upper, reach.turn)]
     if margin < -postures.ROUNDING:
-        raise Unreachable(target, arm, _why_no_posture(part, angles, bounds, limits))
+        raise Unreachable(target, arm, _why_no_posture(arm_description, angles, bounds, limits))
     angles = [min(max(angle, lower), upper) for angle, (lower, upper) in zip(angles, bounds, strict=True)]
-    if not _leads_to(part, angles, reach):
+    if not _leads_to(arm_description, angles, reach):
         raise Unreachable(target, arm, "only the arm stretched out to the last micrometre would come there")
-    return dict(zip(part.joints, angles, strict=True))
+    return dict(zip(arm_description.joints, angles, strict=True))
 
 
-def _best(part: ArmDescription, reach: Reach, pans: Floats, bounds: Sequence[Bounds]) -> tuple[list[float], float]:
+def _best(
+    arm_description: ArmDescription, reach: Reach, pans: Floats, bounds: Sequence[Bounds]
+) -> tuple[list[float], float]:
     """Pan, lift, roll and elbow of the posture with the largest margin, and that margin."""
-    curve = postures.curve(part, reach, pans, bounds)
+    curve = postures.curve(arm_description, reach, pans, bounds)
     row, column = divmod(int(curve.margin.argmax()), len(pans))
     upper = (pans[column], curve.lift[row, column], curve.roll[row, column], curve.elbow[column])
     return [float(angle) for angle in upper], float(curve.margin[row, column])
@@ -146,14 +151,14 @@ def _steps(window: Bounds, step: float) -> Floats:
     return np.linspace(*window, max(2, 1 + math.ceil((window.upper - window.lower) / step)))
 
 
-def _leads_to(part: ArmDescription, angles: Sequence[float], reach: Reach) -> bool:
-    tool, turn = postures.hand(part, angles)
-    wanted = [at + part.tool_m * along for at, along in zip(reach.wrist, reach.ahead, strict=True)]
-    return math.dist(tool, wanted) <= EXACT and _angle_between(turn, reach.turn) <= EXACT
+def _leads_to(arm_description: ArmDescription, angles: Sequence[float], reach: Reach) -> bool:
+    tool, turn = postures.hand(arm_description, angles)
+    wanted = [at + arm_description.tool_m * along for at, along in zip(reach.wrist, reach.ahead, strict=True)]
+    return math.dist(tool, wanted) <= EXACT_M and _angle_between(turn, reach.turn) <= EXACT_RAD
 
 
 def _reach(
-    description: RobotDescription, part: ArmDescription, target: Pose, *, base: Pose, torso_height: float
+    description: RobotDescription, arm_description: ArmDescription, target: Pose, *, base: Pose, torso_height: float
 ) -> Reach:
     """The target in the axes of the torso."""
     if target.frame != base.frame:
@@ -163,40 +168,44 @@ def _reach(
     x, y, z, w = base.orientation
     back = Quaternion(-x, -y, -z, w)
     from_base = rotated(back, [a - b for a, b in zip(target.position, base.position, strict=True)])
-    shoulder = _shoulder(description, part, torso_height)
+    shoulder = _shoulder(description, arm_description, torso_height)
     tool = Vector(*(a - b for a, b in zip(from_base, shoulder, strict=True)))
-    return postures.reach(part, tool, product(back, target.orientation))
+    return postures.reach(arm_description, tool, product(back, target.orientation))
 
 
-def _shoulder(description: RobotDescription, part: ArmDescription, torso_height: float) -> Vector:
+def _shoulder(description: RobotDescription, arm_description: ArmDescription, torso_height: float) -> Vector:
     """The origin of the pan joint, as seen from the root link."""
-    torso, shoulder = description.torso_origin, part.shoulder
+    torso, shoulder = description.torso_origin, arm_description.shoulder
     return Vector(torso.x + shoulder.x, torso.y + shoulder.y, torso.z + torso_height + shoulder.z)
 
 
-def _why_no_pan(part: ArmDescription, wrist: Vector, bounds: Sequence[Bounds], limits: Limits) -> str:
-    folded, stretched = postures.stretches_m(part, bounds)
-    across, offset = math.hypot(wrist.x, wrist.y), part.shoulder_offset_m
+def _why_no_pan(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds], limits: Limits) -> str:
+    folded, stretched = postures.stretches_m(arm_description, bounds)
+    across, offset = math.hypot(wrist.x, wrist.y), arm_description.shoulder_offset_m
     nearest, farthest = math.hypot(across - offset, wrist.z), math.hypot(across + offset, wrist.z)
     if nearest > stretched:
         return f"too far: from shoulder to wrist {nearest:.3f} m or more, where the arm has {stretched:.3f} m"
     if farthest < folded:
         return f"too near: from shoulder to wrist {farthest:.3f} m or less, where the arm needs {folded:.3f} m"
-    return f"its wrist would come there only with {_outside(part, postures.PAN, bounds, limits)}"
+    return f"its wrist would come there only with {_outside(arm_description, postures.PAN, bounds, limits)}"
 
 
-def _why_no_posture(part: ArmDescription, angles: Sequence[float], bounds: Sequence[Bounds], limits: Limits) -> str:
+def _why_no_posture(
+    arm_description: ArmDescription, angles: Sequence[float], bounds: Sequence[Bounds], limits: Limits
+) -> str:
     """Names the joint that is farthest out in the posture that comes nearest to being possible."""
     beyond = [max(lower - angle, angle - upper) for angle, (lower, upper) in zip(angles, bounds, strict=True)]
     worst = beyond.index(max(beyond))
     if beyond[worst] <= 0:
         return "its wrist would have to be farther aside than the elbow can swing it"
-    return f"the posture that comes nearest has {_outside(part, worst, bounds, limits)}, at {angles[worst]:.3f}"
+    return (
+        f"the posture that comes nearest has {_outside(arm_description, worst, bounds, limits)}, at {angles[worst]:.3f}"
+    )
 
 
-def _outside(part: ArmDescription, joint: int, bounds: Sequence[Bounds], limits: Limits) -> str:
+def _outside(arm_description: ArmDescription, joint: int, bounds: Sequence[Bounds], limits: Limits) -> str:
     lower, upper = bounds[joint]
-    return f"{part.joints[joint]} outside its {limits.name.lower()} limits {lower:.3f}..{upper:.3f} rad"
+    return f"{arm_description.joints[joint]} outside its {limits.name.lower()} limits {lower:.3f}..{upper:.3f} rad"
 
 
 def _angle_between(a: Quaternion, b: Quaternion) -> float:
@@ -205,16 +214,16 @@ def _angle_between(a: Quaternion, b: Quaternion) -> float:
 
 
 def _one_arm(description: RobotDescription, arm: Arms) -> ArmDescription:
-    part = description.arms.get(arm)
-    if part is None:
+    arm_description = description.arms.get(arm)
+    if arm_description is None:
         raise CallerError(f"{description.name} has no single arm {arm.name}: ask for one arm at a time")
-    return part
+    return arm_description
 
 
-def _bounds(part: ArmDescription, limits: Limits) -> list[Bounds]:
+def _bounds(arm_description: ArmDescription, limits: Limits) -> list[Bounds]:
     """In the order of the joints."""
-    by_name = part.limits(limits)
-    return [by_name[name] for name in part.joints]
+    by_name = arm_description.limits(limits)
+    return [by_name[name] for name in arm_description.joints]
 
 
 def _narrowed(bound: Bounds, model: tuple[float, float]) -> Bounds:

@@ -24,7 +24,7 @@ __all__ = ["kitchen_urdf"]
 _FRONT, _ISLAND_FRONT = 1.05, -1.10
 _WOOD, _STEEL, _PALE = (0.62, 0.45, 0.28, 1.0), (0.7, 0.72, 0.75, 1.0), (0.93, 0.92, 0.88, 1.0)
 _DRAWER_TRAVEL_M, _DOOR_SWING_RAD = 0.35, 1.9
-_PANEL = 0.02
+_PANEL_M = 0.02
 
 
 class _Block(NamedTuple):
@@ -73,13 +73,13 @@ def _tap() -> Iterable[str]:
 def _drawer(name: str, *, front: tuple[float, float], turn: float, z: tuple[float, float]) -> Iterable[str]:
     """An open box 0.6 wide and 0.45 deep that slides out of the front by `<name>_joint`, and `<name>_handle`."""
     height, side = z[1] - z[0], 0.30
-    inner = (_PANEL, 0.45)
+    inner = (_PANEL_M, 0.45)
     blocks = [
-        _Block((-_PANEL, _PANEL), (-side, side), (0.0, height), _PALE),
-        _Block(inner, (-side + _PANEL, side - _PANEL), (0.0, _PANEL)),
-        _Block(inner, (-side + _PANEL, -side + 2 * _PANEL), (_PANEL, height - 0.03)),
-        _Block(inner, (side - 2 * _PANEL, side - _PANEL), (_PANEL, height - 0.03)),
-        _Block((0.43, 0.45), (-side + 2 * _PANEL, side - 2 * _PANEL), (_PANEL, height - 0.03)),
+        _Block((-_PANEL_M, _PANEL_M), (-side, side), (0.0, height), _PALE),
+        _Block(inner, (-side + _PANEL_M, side - _PANEL_M), (0.0, _PANEL_M)),
+        _Block(inner, (-side + _PANEL_M, -side + 2 * _PANEL_M), (_PANEL_M, height - 0.03)),
+        _Block(inner, (side - 2 * _PANEL_M, side - _PANEL_M), (_PANEL_M, height - 0.03)),
+        _Block((0.43, 0.45), (-side + 2 * _PANEL_M, side - 2 * _PANEL_M), (_PANEL_M, height - 0.03)),
     ]
     yield _link(name, blocks)
     yield _joint(name, "kitchen", "prismatic", (*front, z[0]), turn, axis=(-1, 0, 0), travel=_DRAWER_TRAVEL_M)

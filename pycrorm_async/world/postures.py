@@ -48,14 +48,14 @@ class Curve(NamedTuple):
     """How far the joint nearest to a limit is inside it, rad; negative: how far the worst one is outside."""
 
 
-def reach(part: ArmDescription, tool: Vector, turn: Quaternion) -> Reach:
+def reach(arm_description: ArmDescription, tool: Vector, turn: Quaternion) -> Reach:
     """What it takes to bring the tool frame to `tool` (m from the origin of the pan joint), turned so."""
     ahead = rotated(turn, (1.0, 0.0, 0.0))
-    wrist = Vector(*(at - part.tool_m * along for at, along in zip(tool, ahead, strict=True)))
+    wrist = Vector(*(at - arm_description.tool_m * along for at, along in zip(tool, ahead, strict=True)))
     return Reach(wrist, turn, ahead)
 
 
-def hand(part: ArmDescription, angles: Sequence[float]) -> tuple[Vector, Quaternion]:
+def hand(arm_description: ArmDescription, angles: Sequence[float]) -> tuple[Vector, Quaternion]:
     """Where seven joint angles bring the tool frame, m from the origin of the pan joint, and how it is turned."""
     pan, lift, _, _, forearm_roll, flex, wrist_roll = angles
     at_pan = _about_z(pan)
@@ -63,23 +63,23 @@ def hand(part: ArmDescription, angles: Sequence[float]) -> tuple[Vector, Quatern
     at_wrist = product(at_elbow, product(product(_about_x(forearm_roll), _about_y(flex)), _about_x(wrist_roll)))
     x = y = z = 0.0
     for turn, length in (
-        (at_pan, part.shoulder_offset_m),
-        (product(at_pan, _about_y(lift)), part.upper_arm_m),
-        (at_elbow, part.forearm_m),
-        (at_wrist, part.tool_m),
+        (at_pan, arm_description.shoulder_offset_m),
+        (product(at_pan, _about_y(lift)), arm_description.upper_arm_m),
+        (at_elbow, arm_description.forearm_m),
+        (at_wrist, arm_description.tool_m),
     ):
         step = rotated(turn, (length, 0.0, 0.0))
         x, y, z = x + step.x, y + step.y, z + step.z
     return Vector(x, y, z), at_wrist
 
 
-def pan_windows(part: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> list[Bounds]:
+def pan_windows(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> list[Bounds]:
     """The ranges of pan, within its limits, at which the elbow is within its own.
 
     The lift axis circles round the pan axis: how far it is from the wrist, and with it the elbow, depends only on how
     far pan is turned away from the wrist, to either side.
     """
-    swing = _swing(part, wrist, bounds)
+    swing = _swing(arm_description, wrist, bounds)
     if swing is None:
         return []
     towards = math.atan2(wrist.y, wrist.x)
@@ -95,10 +95,10 @@ def pan_windows(part: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -
     return windows
 
 
-def _swing(part: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> Bounds | None:
+def _swing(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> Bounds | None:
     """How far pan must and may be turned away from the wrist for the elbow's sake; None: no turn is right."""
-    folded, stretched = stretches_m(part, bounds)
-    across, offset = math.hypot(wrist.x, wrist.y), part.shoulder_offset_m
+    folded, stretched = stretches_m(arm_description, bounds)
+    across, offset = math.hypot(wrist.x, wrist.y), arm_description.shoulder_offset_m
     middle = across * across + wrist.z * wrist.z + offset * offset
     scale = max(2 * offset * across, _TINY)
     least, most = (middle - stretched**2) / scale, (middle - folded**2) / scale
@@ -107,22 +107,22 @@ def _swing(part: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> Bou
     return Bounds(math.acos(max(-1.0, min(1.0, most))), math.acos(max(-1.0, min(1.0, least))))
 
 
-def stretches_m(part: ArmDescription, bounds: Sequence[Bounds]) -> tuple[float, float]:
+def stretches_m(arm_description: ArmDescription, bounds: Sequence[Bounds]) -> tuple[float, float]:
     """From shoulder to wrist with the elbow at its lower limit, and at its upper one."""
-    a, b = part.upper_arm_m, part.forearm_m
+    a, b = arm_description.upper_arm_m, arm_description.forearm_m
     folded, stretched = (math.sqrt(a * a + b * b + 2 * a * b * math.cos(angle)) for angle in bounds[ELBOW])
     return folded, stretched
 
 
-def curve(part: ArmDescription, reach: Reach, pan: Floats, bounds: Sequence[Bounds]) -> Curve:
+def curve(arm_description: ArmDescription, reach: Reach, pan: Floats, bounds: Sequence[Bounds]) -> Curve:
     """For every pan the four joints up to the elbow, and the margin of these and the wrist's flex.
 
     Where no posture exists the nearest one stands in, with a negative margin.
     """
-    a, b = part.upper_arm_m, part.forearm_m
+    a, b = arm_description.upper_arm_m, arm_description.forearm_m
     (x, y, z), (ahead_x, ahead_y, ahead_z) = reach.wrist, reach.ahead
     cos_pan, sin_pan = np.cos(pan), np.sin(pan)
-    forth, aside = cos_pan * x + sin_pan * y - part.shoulder_offset_m, cos_pan * y - sin_pan * x
+    forth, aside = cos_pan * x + sin_pan * y - arm_description.shoulder_offset_m, cos_pan * y - sin_pan * x
 
     cos_elbow = _within_one((forth * forth + aside * aside + (z * z - a * a - b * b)) / (2 * a * b))
     elbow = -np.arccos(cos_elbow)

@@ -26,6 +26,7 @@ __all__ = [
     "Bounds",
     "Limits",
     "GRASP_ORIENTATIONS",
+    "FINGER_OPEN_RAD",
     "PR2",
     "robot_description",
 ]
@@ -98,7 +99,7 @@ class RobotDescription:
     """Between the lowest and the highest torso."""
 
 
-FINGER_OPEN = 0.548
+FINGER_OPEN_RAD = 0.548
 _TURN_FREE = Bounds(-math.inf, math.inf)
 
 
@@ -167,7 +168,7 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> ArmDescriptio
         hard_limits=MappingProxyType(dict(zip(joints, hard, strict=True))),
         gripper_joints=MappingProxyType(
             {
-                GripperState.OPEN: MappingProxyType(dict.fromkeys(fingers, FINGER_OPEN)),
+                GripperState.OPEN: MappingProxyType(dict.fromkeys(fingers, FINGER_OPEN_RAD)),
                 GripperState.CLOSE: MappingProxyType(dict.fromkeys(fingers, 0.0)),
             }
         ),

@@ -17,7 +17,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, fromstring, indent, tostring
 
 from pycrorm_async.errors import MissingExtra
-from pycrorm_async.world.robot import FINGER_OPEN, PR2, ArmDescription, Bounds
+from pycrorm_async.world.robot import FINGER_OPEN_RAD, PR2, ArmDescription, Bounds
 from pycrorm_async.world.shapes import INERTIA, numbers
 
 __all__ = ["pr2_urdf", "pr2_mesh_urdf_path"]
@@ -169,7 +169,7 @@ def _gripper(robot: Element, arm: ArmDescription, prefix: str, wrist_roll: str) 
             link,
             origin,
             axis,
-            Bounds(0.0, FINGER_OPEN),
+            Bounds(0.0, FINGER_OPEN_RAD),
         )
         _link(robot, link, (0.12, 0.02, 0.03), (0.06, side * 0.005, 0), _GREY)
 
