@@ -15,7 +15,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.errors import CallerError, EpisodeRefused, PycrormError, SpoolFull, SpoolUnavailable
+from pycrorm_async.errors import EpisodeRefused, InternalError, PycrormError, SpoolFull, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.capacity import Capacity
@@ -114,7 +114,7 @@ class Appender:
                 self._refuse_one_too_many()
                 sequence = 1
             else:
-                raise EpisodeRefused(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
+                raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
             end = self._offset + HEADER_BYTES + len(body)
             if end > (self._end if reserved else self._ordinary_end):
                 self._find_room(HEADER_BYTES + len(body), reserved=reserved)
@@ -163,7 +163,7 @@ class Appender:
     def _encode_type(self, type_name: str) -> bytes:
         name = type_name.encode()
         if not 0 < len(name) <= TYPE_BYTES_MAX:
-            raise CallerError(f"the name of an event type takes 1 to 255 bytes, not {len(name)}")
+            raise InternalError(f"the name of an event type takes 1 to 255 bytes, not {len(name)}")
         self._type_names[type_name] = name
         return name
 
@@ -171,7 +171,7 @@ class Appender:
         """A frame of this size fits at `_offset` afterwards, in a new segment if need be. Under the lock."""
         largest = self._capacity.frame_bytes_max(episodes=len(self.open))
         if frame_bytes > largest:
-            raise CallerError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
+            raise InternalError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
         if not self._admits(frame_bytes, reserved=reserved):
             self._refused_bytes = max(self._refused_bytes, frame_bytes)
             raise SpoolFull(f"spool {self._folder} is full: {self._disk_refused or 'spool_bytes_max is reached'}")

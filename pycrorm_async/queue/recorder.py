@@ -95,12 +95,12 @@ class RecorderQueue:
     def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
-        From any thread, but not from a signal handler. An episode is open from its `EpisodeStarted` to its
-        `EpisodeEnded`; an event of any other is refused (`EpisodeRefused`), for it could have no sequence, and so is a
-        start when so many are open that the largest record would not fit into a segment beside their names. Raises
-        `SpoolFull` when less than the reserve would stay free, with `reserved` when nothing would; `SpoolClosed` after
-        `close` and in a forked child; `SpoolUnavailable` after the disk failed; `CallerError` for a record that no
-        segment can hold. What is refused leaves no gap.
+        From any thread, but not from a signal handler. Raises `SpoolFull` when less than the reserve would stay free,
+        with `reserved` when nothing would; `SpoolClosed` after `close` and in a forked child; `SpoolUnavailable` after
+        the disk failed; `EpisodeRefused` for a start when so many episodes are open that the largest record would not
+        fit into a segment beside their names. `InternalError` for what our own hooks never put: an event of an episode
+        that is not between its `EpisodeStarted` and its `EpisodeEnded`, for it could have no sequence, and a record
+        above `record_bytes_max` that no segment can hold. What is refused leaves no gap.
         """
         return self._appender.put(heading, payload, reserved)
 

@@ -12,7 +12,7 @@ import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import CallerError, EpisodeRefused, SpoolClosed, SpoolUnavailable
+from pycrorm_async.errors import EpisodeRefused, InternalError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.hooks.ports import EventSink
 from pycrorm_async.queue import RecorderQueue, Spool
@@ -140,11 +140,11 @@ async def test_sequences_of_many_threads_have_no_gaps_and_no_doubles(tmp_path: P
 
 
 async def test_an_event_of_an_episode_that_is_not_open_is_refused_and_leaves_no_gap(queue: RecorderQueue) -> None:
-    with pytest.raises(EpisodeRefused, match="cannot take NodeStarted"):
+    with pytest.raises(InternalError, match="cannot take NodeStarted"):
         queue.put_nowait(node(1), b"{}")
     queue.put_nowait(started(1), b"{}")
     queue.put_nowait(ended(1), b"{}")
-    with pytest.raises(EpisodeRefused):
+    with pytest.raises(InternalError, match="is not open"):
         queue.put_nowait(node(1), b"straggler")
     assert queue.put_nowait(started(2), b"{}") == 1
     assert queue.written == 3
@@ -154,7 +154,7 @@ async def test_a_record_that_no_segment_can_hold_is_refused_and_leaves_no_gap(qu
     queue.put_nowait(started(), b"{}")
     largest = 4096 - 56 - 40 - 2 * 72 - 64 - len("NodeStarted")
     largest -= (largest + len("NodeStarted")) % 8
-    with pytest.raises(CallerError, match="does not fit into a segment"):
+    with pytest.raises(InternalError, match="does not fit into a segment"):
         queue.put_nowait(node(), bytes(largest + 8))
     assert queue.put_nowait(node(), bytes(largest)) == 2
     queue.close()
@@ -178,7 +178,7 @@ async def test_as_many_episodes_are_open_as_leave_room_for_the_largest_record(qu
 async def test_a_type_name_that_has_no_place_in_a_frame_is_refused(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
     for name in ("", "x" * 256, "ä" * 128):
-        with pytest.raises(CallerError, match="1 to 255 bytes"):
+        with pytest.raises(InternalError, match="1 to 255 bytes"):
             queue.put_nowait(Heading(started().episode, name, 1), b"{}")
     assert queue.put_nowait(Heading(started().episode, "ä" * 127, 1), b"{}") == 2
 
