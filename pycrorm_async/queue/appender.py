@@ -1,7 +1,7 @@
 """The end of the queue that grows: gives every record its place, sequence and time, and writes it into the mapping.
 
 All of it under one lock that is never held during a system call, but for the one case where records come faster than
-the sync thread can make the next segment ahead.
+the sync thread can make the next segment ahead. While it is held nothing is collected (`alone.py` says why).
 """
 
 from __future__ import annotations
@@ -9,8 +9,11 @@ from __future__ import annotations
 import errno
 import threading
 from collections.abc import Callable
+from functools import partial
+from gc import disable, enable, isenabled
 from itertools import pairwise
 from pathlib import Path
+from threading import get_ident
 from typing import NamedTuple
 from zlib import crc32
 
@@ -18,6 +21,7 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.errors import EpisodeRefused, InternalError, PycrormError, SpoolFull, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue.alone import Alone
 from pycrorm_async.queue.capacity import Capacity
 from pycrorm_async.queue.frame import (
     CHECKSUM_START,
@@ -74,7 +78,7 @@ class Appender:
         self._wall_ns, self._monotonic_ns = clock
         self._wake = wake
         self._hurry = hurry
-        self._lock = threading.Lock()
+        self._alone = Alone()
         self._making = threading.Lock()
         self._type_names: dict[str, bytes] = {}
 
@@ -103,56 +107,71 @@ class Appender:
         body = encode_body(name, payload)
         body_checksum = crc32(body)
         kind, owner, sequence = EVENT, episode or NO_EPISODE, 0
-        with self._lock:
-            if self._refusal is not None:
-                raise self._refusal()
-            if episode is None:
-                kind = DECLARATION
-            elif (last := self.open.get(episode)) is not None:
-                sequence = last[0] + 1
-            elif type_name == OPENS:
-                self._refuse_one_too_many()
-                sequence = 1
-            else:
-                raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
-            end = self._offset + HEADER_BYTES + len(body)
-            if end > (self._end if reserved else self._ordinary_end):
-                self._find_room(HEADER_BYTES + len(body), reserved=reserved)
-                end = self._offset + HEADER_BYTES + len(body)
-            offset = self._offset
-            position = self.position + 1
-            wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
-            header = encode_header(
-                kind,
-                len(name),
-                version,
-                len(payload),
-                position,
-                sequence,
-                wall_ns,
-                monotonic_ns,
-                owner,
-                self._salt,
-                body_checksum,
-            )
-            span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
-            buffer = self._buffer
-            # From here to the blank line nothing is called, so no KeyboardInterrupt can come between the steps: the
-            # record and the bookkeeping are both there or both not. The header goes last: a body alone is no frame.
-            buffer[offset + HEADER_BYTES : end] = body
-            buffer[offset : offset + HEADER_BYTES] = header
-            self._offset = end
-            self.position = position
-            self._span_count += 1
-            self._span_checksum = span_checksum
-            if episode is not None:
-                self.open[episode] = (sequence, wall_ns, monotonic_ns)
-                if type_name == CLOSES:
-                    del self.open[episode]
+        alone, me = self._alone, get_ident()
+        if alone.owner == me:
+            raise alone.reentered()
+        try:
+            with alone.lock:
+                try:
+                    alone.owner = me
+                    alone.paused = isenabled()
+                    disable()
+                    if self._refusal is not None:
+                        raise self._refusal()
+                    if episode is None:
+                        kind = DECLARATION
+                    elif (last := self.open.get(episode)) is not None:
+                        sequence = last[0] + 1
+                    elif type_name == OPENS:
+                        self._refuse_one_too_many()
+                        sequence = 1
+                    else:
+                        raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
+                    end = self._offset + HEADER_BYTES + len(body)
+                    if end > (self._end if reserved else self._ordinary_end):
+                        self._find_room(HEADER_BYTES + len(body), reserved=reserved)
+                        end = self._offset + HEADER_BYTES + len(body)
+                    offset = self._offset
+                    position = self.position + 1
+                    wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
+                    header = encode_header(
+                        kind,
+                        len(name),
+                        version,
+                        len(payload),
+                        position,
+                        sequence,
+                        wall_ns,
+                        monotonic_ns,
+                        owner,
+                        self._salt,
+                        body_checksum,
+                    )
+                    span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
+                    buffer = self._buffer
+                    # From here to the blank line nothing is called, so no KeyboardInterrupt can come between the
+                    # steps: the record and the bookkeeping are both there or both not. The header goes last: a body
+                    # alone is no frame.
+                    buffer[offset + HEADER_BYTES : end] = body
+                    buffer[offset : offset + HEADER_BYTES] = header
+                    self._offset = end
+                    self.position = position
+                    self._span_count += 1
+                    self._span_checksum = span_checksum
+                    if episode is not None:
+                        self.open[episode] = (sequence, wall_ns, monotonic_ns)
+                        if type_name == CLOSES:
+                            del self.open[episode]
 
-            if self._quiet:
-                self._wake()
-                self._quiet = False
+                    if self._quiet:
+                        self._wake()
+                        self._quiet = False
+                finally:
+                    if alone.paused:
+                        enable()
+        finally:
+            if alone.owner == me:
+                alone.owner = 0
         return sequence
 
     def _refuse_one_too_many(self) -> None:
@@ -213,57 +232,74 @@ class Appender:
 
     def begin_sync(self) -> Span:
         """What is there now; the next record begins a new span and wakes the sync thread again."""
-        with self._lock:
-            span = Span(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
-            self._span_count = self._span_checksum = 0
-            self._quiet = True
+        return self._alone.run(self._begin_sync)
+
+    def _begin_sync(self) -> Span:
+        span = Span(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
+        self._span_count = self._span_checksum = 0
+        self._quiet = True
         return span
 
     def append_commit(self, span: Span) -> Segment:
         """Appends the frame that says the span is on the disk; returns the segment that holds it, to be synced."""
-        with self._lock:
-            frame = encode_commit(
-                position=span.position,
-                count=span.records,
-                checksum=span.checksum,
-                wall_ns=self._wall_ns(),
-                monotonic_ns=self._monotonic_ns(),
-                salt=self._salt,
-            )
-            end = self._offset + COMMIT_BYTES
-            assert end <= self._capacity.segment_bytes, "room for commit frames is kept free"
-            self._buffer[self._offset : end] = frame
-            self._offset = end
-            return self._current
+        return self._alone.run(partial(self._append_commit, span))
+
+    def _append_commit(self, span: Span) -> Segment:
+        frame = encode_commit(
+            position=span.position,
+            count=span.records,
+            checksum=span.checksum,
+            wall_ns=self._wall_ns(),
+            monotonic_ns=self._monotonic_ns(),
+            salt=self._salt,
+        )
+        end = self._offset + COMMIT_BYTES
+        assert end <= self._capacity.segment_bytes, "room for commit frames is kept free"
+        self._buffer[self._offset : end] = frame
+        self._offset = end
+        return self._current
 
     def end_sync(self, span: Span) -> None:
         """The files that were full when the span was taken are safe, whole, and need not be open any more."""
-        with self._lock:
-            done = [segment for segment in self._sealed if segment in span.segments[:-1]]
-            self._sealed = [segment for segment in self._sealed if segment not in done]
-        for segment in done:
+        for segment in self._alone.run(partial(self._end_sync, span)):
             segment.close()
+
+    def _end_sync(self, span: Span) -> list[Segment]:
+        done = [segment for segment in self._sealed if segment in span.segments[:-1]]
+        self._sealed = [segment for segment in self._sealed if segment not in done]
+        return done
 
     # --- room --------------------------------------------------------------------------------------------------
 
     def prepare(self) -> bool:
         """Makes the next segment ahead if there is none; True if the disk has no room for it. Raises `OSError`."""
-        with self._making:
-            if self._prepared is not None or len(self.begun) >= self._capacity.segments_max:
-                return False
-            try:
-                self._prepared = self._allocate()
-            except OSError as error:
-                if error.errno not in _NOT_NOW:
-                    raise
-                refused: str | None = error.strerror
-            else:
-                refused = None
-        with self._lock:
-            self._disk_refused = refused
-            self._set_limits()
-            self._forget_refused()
+        if self._prepared is not None or len(self.begun) >= self._capacity.segments_max:
+            return False
+        try:
+            # Nothing may be put in this thread while it holds `_making`, and it must not hold the other lock so long.
+            self._alone.hold_off()
+            with self._making:
+                refused = self._prepare()
+        finally:
+            self._alone.go_on()
+        self._alone.run(partial(self._prepared_or, refused))
         return refused is not None
+
+    def _prepare(self) -> str | None:
+        if self._prepared is not None:
+            return None
+        try:
+            self._prepared = self._allocate()
+        except OSError as error:
+            if error.errno not in _NOT_NOW:
+                raise
+            return error.strerror
+        return None
+
+    def _prepared_or(self, refused: str | None) -> None:
+        self._disk_refused = refused
+        self._set_limits()
+        self._forget_refused()
 
     def trimmable(self, *, stored: int, safe_number: int) -> list[Begun]:
         """The segments that may go: all in them is stored, and the header after them is safe on the disk."""
@@ -276,24 +312,24 @@ class Appender:
 
     def trimmed(self, gone: list[Begun]) -> None:
         """These segments are deleted."""
-        with self._lock:
-            self.begun = [segment for segment in self.begun if segment not in gone]
-            self._set_limits()
-            self._forget_refused()
+        self._alone.run(partial(self._trimmed, gone))
+
+    def _trimmed(self, gone: list[Begun]) -> None:
+        self.begun = [segment for segment in self.begun if segment not in gone]
+        self._set_limits()
+        self._forget_refused()
 
     def admits_again(self, *, reserved: bool) -> bool:
         """Whether a record as large as the largest that was refused would be taken now."""
         frame_bytes = max(self._refused_bytes, HEADER_BYTES)
         if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
             return True
-        with self._lock:
-            return self._admits(frame_bytes, reserved=reserved)
+        return self._alone.run(partial(self._admits, frame_bytes, reserved=reserved))
 
     @property
     def bytes_held(self) -> int:
         """Bytes of segments with records in them; the last one counts as far as it is written."""
-        with self._lock:
-            return (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset
+        return self._alone.run(lambda: (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset)
 
     def _admits(self, frame_bytes: int, *, reserved: bool) -> bool:
         return self._capacity.admits(
@@ -328,18 +364,23 @@ class Appender:
 
     def refuse(self, refusal: Callable[[], PycrormError]) -> None:
         """No record is taken from now on; the first reason stays."""
-        with self._lock:
-            self._refusal = self._refusal or refusal
+        self._alone.run(partial(self._refuse, refusal))
+
+    def _refuse(self, refusal: Callable[[], PycrormError]) -> None:
+        self._refusal = self._refusal or refusal
 
     def close(self) -> None:
         """Gives up mappings and files, when refusing already."""
-        with self._lock:
-            for segment in (*self._sealed, self._current, self._prepared):
-                if segment is not None:
-                    segment.close()
+        self._alone.run(self._close)
+
+    def _close(self) -> None:
+        for segment in (*self._sealed, self._current, self._prepared):
+            if segment is not None:
+                segment.close()
 
     def abandon(self, refusal: Callable[[], PycrormError]) -> None:
         """In a forked child: nothing here is this process's; the locks may be held by threads it does not have."""
-        self._lock, self._making = threading.Lock(), threading.Lock()
+        self._alone.abandon()
+        self._alone, self._making = Alone(), threading.Lock()
         self._refusal = refusal
         self.close()

@@ -2,12 +2,14 @@
 
 A waiter asks for its ticket first, looks whether what it wants is there already, and only then waits: a ring between
 looking and waiting is not missed.
+
+There is no lock in it, for a thread could find that it holds it itself (`alone.py`): each step on the set of tickets is
+one that no other thread comes into.
 """
 
 from __future__ import annotations
 
 import asyncio
-import threading
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from concurrent.futures import TimeoutError as NotInTime
@@ -19,14 +21,15 @@ class Bell:
     """Rings for all who wait at that moment."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._tickets: set[Future[None]] = set()
 
     def ring(self) -> None:
         """Wakes everybody. From any thread."""
-        with self._lock:
-            tickets, self._tickets = self._tickets, set()
-        for ticket in tickets:
+        for ticket in list(self._tickets):
+            try:
+                self._tickets.remove(ticket)
+            except KeyError:  # another ring was first, or it is no longer wanted
+                continue
             if ticket.set_running_or_notify_cancel():
                 ticket.set_result(None)
 
@@ -56,10 +59,8 @@ class Bell:
 
     def _ticket(self) -> Future[None]:
         ticket: Future[None] = Future()
-        with self._lock:
-            self._tickets.add(ticket)
+        self._tickets.add(ticket)
         return ticket
 
     def _forget(self, ticket: Future[None]) -> None:
-        with self._lock:
-            self._tickets.discard(ticket)
+        self._tickets.discard(ticket)

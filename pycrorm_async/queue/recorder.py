@@ -114,7 +114,12 @@ class RecorderQueue:
         await self._room_bell.until(lambda: not self.full or self._over)
 
     def block_until_room(self, timeout_s: float) -> bool:
-        """Block this thread until even a reserved event fits; False if the time is over."""
+        """Block this thread until even a reserved event fits; False if the time is over.
+
+        False at once in the sync thread, which makes the room: the collector may have closed a plan there.
+        """
+        if self._syncer.is_this_thread:
+            return False
         end_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
         return self._room_bell.block_until(
             lambda: self._appender.admits_again(reserved=True) or self._over,

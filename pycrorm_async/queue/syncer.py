@@ -29,6 +29,11 @@ class Syncer:
     def start(self) -> None:
         self._thread.start()
 
+    @property
+    def is_this_thread(self) -> bool:
+        """Whether the caller runs in it: what the collector closes there must not wait for what only it does."""
+        return threading.current_thread() is self._thread
+
     def wake(self) -> None:
         """There is work: a turn begins within the interval. From any thread, at any moment."""
         self._calls.put(self._interval_s)

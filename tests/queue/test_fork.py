@@ -1,12 +1,15 @@
 """A forked child has no queue: it can neither write into the parent's files nor keep or free its locks."""
 
 import asyncio
+import gc
 import os
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from pycrorm_async.clock import Clock
 from pycrorm_async.errors import SpoolClosed
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.locks import is_locked
@@ -43,6 +46,28 @@ def test_a_child_can_neither_read_nor_wait_and_nothing_hangs_there(queue: Record
     assert in_child(lambda: asyncio.run(queue.synced_to(1000))) == 17
     assert in_child(lambda: asyncio.run(queue.room())) == 0
     assert in_child(lambda: queue.block_until_room(1000.0)) == 0
+
+
+def test_the_collector_runs_in_a_child_that_was_forked_while_another_thread_was_recording(spool: Path) -> None:
+    recording, forked = threading.Event(), threading.Event()
+
+    def wall_ns() -> int:
+        if threading.current_thread() is not threading.main_thread():
+            recording.set()
+            forked.wait()
+        return 0
+
+    queue = make(spool, clock=Clock(wall_ns=wall_ns, monotonic_ns=lambda: 0))
+    thread = threading.Thread(target=lambda: queue.put_nowait(started(), b"{}"))
+    thread.start()
+    recording.wait()
+    assert not gc.isenabled()
+    status = in_child(lambda: None if gc.isenabled() else os._exit(18))
+    forked.set()
+    thread.join()
+    assert status == 0
+    assert gc.isenabled()
+    queue.release()
 
 
 async def test_a_child_that_lets_go_takes_nothing_from_the_parent(queue: RecorderQueue) -> None:
