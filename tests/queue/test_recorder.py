@@ -3,7 +3,6 @@
 import asyncio
 import signal
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -204,14 +203,30 @@ async def test_a_batch_closes_at_its_bytes_and_a_larger_record_comes_alone(queue
     assert [len(each.payload) for each in await batch_of(queue, 99, bytes_max=250)] == [1]
 
 
-async def test_a_batch_closes_at_its_age_and_takes_what_came_until_then(queue: RecorderQueue) -> None:
+async def test_a_batch_closes_at_its_age_and_takes_what_came_until_then(
+    queue: RecorderQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = asyncio.get_running_loop()
+    now_s = loop.time()
+    monkeypatch.setattr(loop, "time", lambda: now_s)
     queue.put_nowait(started(), b"{}")
-    waiting = batch_of(queue, 3, age_s=0.5)
+    waiting = batch_of(queue, 3, age_s=LONG_S)
     await queue.synced_to()
-    await asyncio.sleep(0)
+    await steps(10)
     queue.put_nowait(node(), b"{}")
     await queue.synced_to()
+    await steps(10)
+    now_s += LONG_S - 0.5
+    await steps(10)
+    assert not waiting.done()
+    now_s += 1.0
     assert [each.position for each in await waiting] == [1, 2]
+
+
+async def steps(count: int) -> None:
+    """Whatever is ready in the loop takes its turn, so often."""
+    for _ in range(count):
+        await asyncio.sleep(0)
 
 
 async def test_a_cancelled_batch_is_given_again(queue: RecorderQueue) -> None:
@@ -373,6 +388,9 @@ def test_a_spool_that_cannot_be_made_is_one_clear_line(tmp_path: Path, deep: boo
     assert "\n" not in str(refused.value)
 
 
+INTERRUPTS = 2_000
+
+
 async def test_an_interrupt_in_the_middle_of_putting_leaves_a_whole_queue(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12), clock=SYSTEM_CLOCK)
     queue.put_nowait(started(), b"{}")
@@ -386,9 +404,8 @@ async def test_an_interrupt_in_the_middle_of_putting_leaves_a_whole_queue(tmp_pa
 
     before = signal.signal(signal.SIGALRM, interrupt)
     interrupts = 0
-    end_s = time.monotonic() + 0.5
     try:
-        while time.monotonic() < end_s:
+        while interrupts < INTERRUPTS:
             try:
                 signal.setitimer(signal.ITIMER_REAL, 0.000_05 + (interrupts % 97) * 0.000_001)
                 while True:
@@ -402,7 +419,6 @@ async def test_an_interrupt_in_the_middle_of_putting_leaves_a_whole_queue(tmp_pa
     queue.close()
     records = await drain(queue)
     queue.release()
-    assert interrupts > 50
     assert [each.position for each in records] == list(range(1, len(records) + 1))
     assert [each.sequence for each in records] == list(range(1, len(records) + 1))
-    assert returned + 1 <= len(records) <= returned + 1 + interrupts
+    assert returned + 1 <= len(records) <= returned + 1 + INTERRUPTS
