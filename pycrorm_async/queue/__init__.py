@@ -7,7 +7,7 @@
         drain                  locked by whoever drains the folder
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
         00000002.segment       the last one may be made ahead: all zero
-        00000001.segment.tail  what sealing cut off, kept for whoever wants to look
+        00000001.segment.tail  what sealing cut off, to be looked at until the folder is removed
 
 Everything below is little endian, and every structure begins at a multiple of 8 bytes.
 
