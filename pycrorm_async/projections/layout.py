@@ -81,12 +81,15 @@ class Layout(msgspec.Struct, frozen=True):
         if declared.kind != known.kind:
             raise Contradictory(f"{declared.dtype} is declared as {known.kind} and as {declared.kind}")
         self._refuse_taken(declared)
+        # All tables of a type agree, also in columns that an author's class brought: else an earlier declaration of the
+        # type, accepted before, would be refused the next time.
+        whole = self.leaves.get(declared.table, {}) | columns
         for table in (declared.table, *known.tables):
-            _refuse_different(declared.dtype, self.leaves.get(table, {}), columns)
+            _refuse_different(declared.dtype, self.leaves.get(table, {}), whole)
         tables = tuple(dict.fromkeys((*known.tables, declared.table)))
         return msgspec.structs.replace(
             self,
-            leaves=self.leaves | {declared.table: self.leaves.get(declared.table, {}) | columns},
+            leaves=self.leaves | {declared.table: whole},
             types=self.types | {declared.dtype: DesignatorType(declared.kind, tables, declared.bases or known.bases)},
         )
 

@@ -65,6 +65,13 @@ def test_a_contradiction_with_another_table_of_the_type_is_one_too() -> None:
         layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
 
 
+def test_a_table_that_an_authors_class_gave_a_contradicting_column_cannot_join_the_type() -> None:
+    layout = layout_of(SAYING).with_leaves([Leaf("ORMSaying", {"text": "real"})])
+    with pytest.raises(Contradictory, match=r"SayingAction\.text is declared as text and as real"):
+        layout.with_declaration(declared("SayingAction", "ORMSaying", field("volume", "real", 2)))
+    assert layout.with_declaration(SAYING) == layout
+
+
 def test_a_view_shows_the_type_all_its_tables_and_its_descendants() -> None:
     careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
     gentle = declared("GentlePickUpAction", "gentle", bases=("CarefulPickUpAction", "PickUpAction"))
