@@ -38,7 +38,7 @@ from pycrorm_async.hooks.values import (
     written_or_missing,
 )
 from pycrorm_async.hooks.world import WorldRecorder
-from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.plan.failures import is_plan_failure
 from pycrorm_async.plan.ports import Candidate
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
@@ -263,7 +263,7 @@ def _outcome(failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
     """How an exception that leaves the episode is written: its status, and that of the root node."""
     if failure is None:
         return "SUCCEEDED", "SUCCEEDED"
-    if isinstance(failure, PlanFailure):
+    if is_plan_failure(failure):
         return "FAILED", "FAILED"
     if isinstance(failure, asyncio.CancelledError | KeyboardInterrupt):
         return "INTERRUPTED", "CANCELLED"
