@@ -124,18 +124,21 @@ async def test_a_plan_that_is_collected_while_a_segment_is_made_may_need_that_se
     queue.put_nowait(started(), b"{}")
     allocate = Segment.allocate
     made: list[int] = []
+    third = threading.Event()
 
     def watched(folder: Path, *, number: int, size: int) -> Segment:
         if not made:
             leave_garbage(queue, 6, payload=b"x" * 900)  # more than one segment holds
         made.append(number)
-        return allocate(folder, number=number, size=size)
+        segment = allocate(folder, number=number, size=size)
+        if number == 3:
+            third.set()
+        return segment
 
     monkeypatch.setattr(Segment, "allocate", watched)
     assert finishes(lambda: [queue.put_nowait(node(), b"x" * 900) for _ in range(4)])
-    await asyncio.wait_for(queue.synced_to(), PATIENCE_S)
+    assert await asyncio.to_thread(third.wait, PATIENCE_S)
     monkeypatch.undo()
-    assert 3 in made
     assert finishes(lambda: queue.put_nowait(node(), b"after"))
     assert await asyncio.to_thread(finishes, queue.release)
 
