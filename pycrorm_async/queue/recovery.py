@@ -29,7 +29,8 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
     """The folder as a source, or None if its recorder lives, somebody drains it, or it is gone.
 
     Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte, some 300,000
-    records a second. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`, holding nothing.
+    records a second, and has the disk keep what is given away. Raises `SpoolDamaged`, `SpoolForeign` and
+    `SpoolUnavailable`, holding nothing.
     """
     with available(folder):
         alive = FileLock.take(folder / ALIVE, create=False)
@@ -42,7 +43,9 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
                 return None
             try:
                 recorder = parse_episode_id(folder.name)
-                return RecoveredQueue(folder, recorder, scan(folder, recorder), (drain, alive))
+                kept = scan(folder, recorder)
+                _make_safe(folder, kept)
+                return RecoveredQueue(folder, recorder, kept, (drain, alive))
             except BaseException:
                 drain.release()
                 raise
@@ -155,6 +158,22 @@ class RecoveredQueue:
     def _load(self, number: int) -> tuple[Path, Buffer]:
         path = segment_path(self.folder, number)
         return path, path.read_bytes()
+
+
+def _make_safe(folder: Path, kept: Kept) -> None:
+    """What is kept is on the disk, the lowest number first. Raises `OSError`.
+
+    A killed recorder's last records are there for all who read, and yet may be nowhere but in the page cache. If they
+    were given away like this and lost in a power cut, the log would hold events that the next computed ends replace.
+    """
+    for number in kept.numbers:
+        if number <= kept.cut.number:
+            descriptor = os.open(segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                os.fdatasync(descriptor)
+            finally:
+                os.close(descriptor)
+    sync_folder(folder)
 
 
 def _ends(kept: Kept) -> tuple[Record, ...]:

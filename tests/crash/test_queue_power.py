@@ -2,9 +2,11 @@
 
 The queue and its files are real; only its thread is not started, the test takes its turns, and each `fdatasync` is
 watched. A cut mixes, sector by sector, what the last sync of a file made safe with all its states since; a file deleted
-since the power was last sure may be there again.
+since the power was last sure may be there again. A recorder may also be killed, and the power fail when another
+program has recovered what it left.
 """
 
+import os
 import random
 from collections.abc import Iterator
 from dataclasses import replace
@@ -70,6 +72,25 @@ class Machine:
         for path, content in self._deleted[self._rng.randrange(len(self._deleted) + 1) :]:
             (folder / path.name).write_bytes(content)
         self.cuts.append((folder, self.queue.synced, self.queue.stored, len(self.put_so_far)))
+
+    def kill(self) -> Path:
+        """The folder as everybody finds it while there is power: all that was written is there."""
+        folder = self._place / "killed" / self.queue.name
+        folder.mkdir(parents=True)
+        (folder / "alive").touch()
+        for path in self._files():
+            (folder / path.name).write_bytes(path.read_bytes())
+        return folder
+
+    def cut_after_kill(self, killed: Path, *, safe: set[str]) -> Path:
+        """What is left of that folder without power, if whoever recovered it had the disk keep these files."""
+        folder = self._place / "cut" / self.queue.name
+        folder.mkdir(parents=True)
+        (folder / "alive").touch()
+        deleted = sum(not (killed / path.name).exists() for path in self._files())
+        for path in self._files()[self._rng.randrange(deleted + 1) :]:
+            (folder / path.name).write_bytes(path.read_bytes() if path.name in safe else self._mixed(path))
+        return folder
 
     def _files(self) -> list[Path]:
         return sorted(self.queue.folder.glob("*.segment"))
@@ -170,3 +191,41 @@ async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(
             spoil(folder, synced)
             with pytest.raises(SpoolDamaged):
                 open_dead(folder)
+
+
+@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(8, 200))])
+async def test_what_a_recovery_gave_away_after_a_kill_is_given_again_after_a_power_cut(
+    machine: Machine, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = random.Random(seed + 2000)
+    for number in (1, 2, 3):
+        machine.put(number, started(number), b"{}")
+    for _ in range(rng.randrange(3)):
+        for _ in range(rng.randrange(5)):
+            machine.put(1, node(1), b"synced")
+        machine.turn()
+    for _ in range(12):
+        number = rng.choice([1, 1, 2])
+        machine.put(number, node(number), b"never synced" * rng.randrange(100))
+    killed = machine.kill()
+    safe: set[str] = set()
+    fdatasync = os.fdatasync
+
+    def watched(descriptor: int) -> None:
+        fdatasync(descriptor)
+        safe.add(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+
+    whole = [*machine.put_so_far, *ends_of(machine.put_so_far)]
+    monkeypatch.setattr(os, "fdatasync", watched)
+    recovered = open_dead(killed)
+    assert recovered is not None
+    batch = await recovered.get_batch(events_max=rng.randrange(1, len(whole) + 1), bytes_max=2**20, age_s_max=0.0)
+    assert batch == whole[: len(batch)]
+    stored = rng.randrange(len(batch) + 1)
+    await recovered.acknowledge(stored)
+    recovered.release()
+    monkeypatch.undo()
+
+    again = await recover(machine.cut_after_kill(killed, safe=safe))
+    assert again[0].position <= stored + 1
+    assert again == whole[again[0].position - 1 :]

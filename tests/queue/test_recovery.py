@@ -1,5 +1,7 @@
 """What is whole is given, what is torn is left out, and what was safe and is missing is damage."""
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
@@ -340,6 +342,26 @@ def test_a_folder_that_cannot_be_read_is_one_clear_line(author: Author) -> None:
     with pytest.raises(SpoolUnavailable) as refused:
         open_dead(author.folder)
     assert "00000001.segment: Is a directory" in str(refused.value)
+
+
+async def test_a_disk_that_does_not_keep_what_is_left_is_told_before_anything_is_given(
+    author: Author, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for heading in (started(), *[node()] * 4):
+        author.put(heading, b"x" * 900)
+    synced: list[str] = []
+
+    def full(descriptor: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        if len(synced) == 2:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fdatasync", full)
+    with pytest.raises(SpoolUnavailable, match="Input/output error"):
+        open_dead(author.folder)
+    assert synced == ["00000001.segment", "00000002.segment"]
+    monkeypatch.undo()
+    assert await recover(author.folder) == [*author.records, lost(6, 1, 6)]
 
 
 # --- acknowledging and removing --------------------------------------------------------------------------------
