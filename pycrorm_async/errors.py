@@ -21,6 +21,7 @@ __all__ = [
     "FilesError",
     "SpoolUnavailable",
     "SpoolFull",
+    "SpoolStuck",
     "SpoolClosed",
     "SpoolForeign",
     "DatabaseError",
@@ -99,6 +100,10 @@ class SpoolUnavailable(FilesError):
 
 class SpoolFull(FilesError):
     """The spool holds as much as it may (`spool_bytes_max`) and the caller chose not to wait."""
+
+
+class SpoolStuck(FilesError):
+    """The spool is full and waiting is no use: nothing empties it any more; the message says why."""
 
 
 class SpoolClosed(FilesError):

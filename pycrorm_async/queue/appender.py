@@ -18,7 +18,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.errors import EpisodeRefused, InternalError, PycrormError, SpoolFull, SpoolUnavailable
+from pycrorm_async.errors import EpisodeRefused, InternalError, PycrormError, SpoolFull, SpoolStuck, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.alone import Alone
@@ -86,6 +86,7 @@ class Appender:
         self.open: dict[EpisodeId, tuple[int, int, int]] = {}
         self.begun: list[Begun] = []
         self._refusal: Callable[[], PycrormError] | None = None
+        self.stuck: str | None = None  # why nothing will be trimmed any more
         self._span_count = 0
         self._span_checksum = 0
         self._quiet = True
@@ -193,7 +194,7 @@ class Appender:
             raise InternalError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
         if not self._admits(frame_bytes, reserved=reserved):
             self._refused_bytes = max(self._refused_bytes, frame_bytes)
-            raise SpoolFull(f"spool {self._folder} is full: {self._disk_refused or 'spool_bytes_max is reached'}")
+            raise self.fullness(self._disk_refused or "spool_bytes_max is reached")
         if self._offset + frame_bytes > self._end:
             self._roll()
 
@@ -331,6 +332,12 @@ class Appender:
         """Bytes of segments with records in them; the last one counts as far as it is written."""
         return self._alone.run(lambda: (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset)
 
+    def fullness(self, reason: str) -> PycrormError:
+        """What a put into a full spool raises."""
+        if self.stuck is None:
+            return SpoolFull(f"spool {self._folder} is full: {reason}")
+        return SpoolStuck(f"spool {self._folder} is full ({reason}) and cannot be emptied: {self.stuck}")
+
     def _admits(self, frame_bytes: int, *, reserved: bool) -> bool:
         return self._capacity.admits(
             frame_bytes, offset=self._offset, spare=self._spare(), episodes=len(self.open), reserved=reserved
@@ -358,7 +365,7 @@ class Appender:
         self._disk_refused = reason
         self._set_limits()
         self._hurry()  # the sync thread tries again until there is room
-        return SpoolFull(f"spool {self._folder} is full: {reason}")
+        return self.fullness(reason)
 
     # --- ending ------------------------------------------------------------------------------------------------
 

@@ -96,7 +96,8 @@ class RecorderQueue:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
         From any thread, but not from a signal handler. Raises `SpoolFull` when less than the reserve would stay free,
-        with `reserved` when nothing would; `SpoolClosed` after `close` and in a forked child; `SpoolUnavailable` after
+        with `reserved` when nothing would, and `SpoolStuck` instead after `give_up`; `SpoolClosed` after `close` and in
+        a forked child; `SpoolUnavailable` after
         the disk failed; `EpisodeRefused` for a start when so many episodes are open that the largest record would not
         fit into a segment beside their names. `InternalError` for what our own hooks never put: an event of an episode
         that is not between its `EpisodeStarted` and its `EpisodeEnded`, for it could have no sequence, and a record
@@ -110,21 +111,34 @@ class RecorderQueue:
         return not self._appender.admits_again(reserved=False)
 
     async def room(self) -> None:
-        """Done when such an ordinary event fits again, or when there is no use in waiting: putting says why."""
-        await self._room_bell.until(lambda: not self.full or self._over)
+        """Done when such an ordinary event fits again, or nothing may be put any more: putting says why.
+
+        Raises `SpoolStuck` when there is no use in waiting (`give_up`).
+        """
+        await self._room_bell.until(lambda: self._room_is_decided(reserved=False))
+        self._refuse_to_wait(reserved=False)
 
     def block_until_room(self, timeout_s: float) -> bool:
-        """Block this thread until even a reserved event fits; False if the time is over.
+        """Block this thread until a reserved event fits; False if the time is over. Raises `SpoolStuck` as `room` does.
 
         False at once in the sync thread, which makes the room: the collector may have closed a plan there.
         """
         if self._syncer.is_this_thread:
             return False
         end_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
-        return self._room_bell.block_until(
-            lambda: self._appender.admits_again(reserved=True) or self._over,
+        decided = self._room_bell.block_until(
+            lambda: self._room_is_decided(reserved=True),
             remaining_s=lambda: (end_ns - self._clock.monotonic_ns()) / 1e9,
         )
+        self._refuse_to_wait(reserved=True)
+        return decided
+
+    def _room_is_decided(self, *, reserved: bool) -> bool:
+        return self._over or self._appender.stuck is not None or self._appender.admits_again(reserved=reserved)
+
+    def _refuse_to_wait(self, *, reserved: bool) -> None:
+        if self._appender.stuck is not None and not self._over and not self._appender.admits_again(reserved=reserved):
+            raise self._appender.fullness("spool_bytes_max is reached")
 
     # --- positions ---------------------------------------------------------------------------------------------
 
@@ -189,6 +203,14 @@ class RecorderQueue:
         self._stored = max(self._stored, position)
         if self._trimmable():
             self._syncer.hurry()
+
+    def give_up(self, reason: str) -> None:
+        """Nothing more will be acknowledged: from any thread. The first reason stays.
+
+        What fits is put all the same; whoever waits for room, now or later, gets `SpoolStuck`.
+        """
+        self._appender.stuck = self._appender.stuck or reason
+        self._room_bell.ring()
 
     def _read(self, begun: Batch | None, events_max: int, bytes_max: int) -> Batch:
         with available(self.folder):

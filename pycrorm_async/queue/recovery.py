@@ -111,6 +111,9 @@ class RecoveredQueue:
                     break
                 segment_path(self.folder, number).unlink(missing_ok=True)
 
+    def give_up(self, reason: str) -> None:
+        """Nobody puts into it, so nobody waits for room."""
+
     def seal(self) -> None:
         """Cuts the files where the records end; what is cut off is copied aside first, to `<segment>.tail`.
 

@@ -4,11 +4,13 @@ Killed or cancelled anywhere in between, the worst that follows is that a batch 
 stores it once. While the database is away the drain waits and the source keeps its records. Once an episode's record
 is refused nothing from that record on is ever acknowledged, whatever happens to later ones: a source forgets by
 position only, so this is how the refused records are kept. They are offered again by the source of the next process.
+The source is told at once, for it can only fill up from then on; so it is when the drain ends with an error.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
@@ -23,6 +25,7 @@ from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["Drain", "DrainState", "to_the_end"]
 
+_log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
 
 
@@ -81,6 +84,7 @@ class Drain:
         self._refused: dict[str, str] = {}
         self._moved = asyncio.Condition()
         self._over = False
+        self._refusal_told = False
 
     async def run(self) -> None:
         """Drains until the source is closed and empty.
@@ -99,7 +103,13 @@ class Drain:
                 self._batches += 1
                 self._appended = batch[-1].position
                 self._on_append()
+                if self._refused and not self._refusal_told:
+                    self._refusal_told = True
+                    self._give_up(_refusal(self._refused))
                 await self._tell()
+        except Exception as error:
+            self._give_up(f"the writer stopped: {error}")
+            raise
         finally:
             self._over = True
             await self._tell()
@@ -153,9 +163,18 @@ class Drain:
             await self._source.acknowledge(position)
             self._acknowledged = position
 
+    def _give_up(self, reason: str) -> None:
+        _log.error("nothing more is acknowledged to recorder %s: %s", self._source.name, reason)
+        self._source.give_up(reason)
+
     async def _tell(self) -> None:
         async with self._moved:
             self._moved.notify_all()
+
+
+def _refusal(refused: Mapping[str, str]) -> str:
+    episode, reason = next(iter(refused.items()))
+    return f"episode {episode} was refused: {reason}"
 
 
 async def to_the_end(work: Coroutine[Any, Any, _T]) -> _T:

@@ -31,6 +31,10 @@ class Source(Protocol):
         """Everything up to this position is stored for good: its segments may be deleted."""
         ...
 
+    def give_up(self, reason: str) -> None:
+        """From now on nothing more will be acknowledged: whoever waits for room is told why. The first reason stays."""
+        ...
+
 
 class Destination(Protocol):
     """The log in a database, and the tables behind it."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull
+from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
 from pycrorm_async.queue import RecorderQueue
 from tests.queue.writing import DECLARED, SMALL, drain, make, node, started
 
@@ -108,6 +108,43 @@ async def test_a_full_queue_gives_everything_away_and_goes_on(filled: RecorderQu
     filled.close()
     assert [each.position for each in await drain(filled)] == [filled.written]
     assert filled.written == 1 + ALL + 20
+
+
+async def test_who_waits_for_room_in_a_queue_that_nobody_empties_is_told_why(filled: RecorderQueue) -> None:
+    fill(filled, reserved=True)
+    waiting = asyncio.ensure_future(filled.room())
+    blocked = asyncio.ensure_future(asyncio.to_thread(filled.block_until_room, 1000.0))
+    await asyncio.sleep(0.01)
+    assert not waiting.done()
+    assert not blocked.done()
+    filled.give_up("the log is damaged")
+    filled.give_up("and something else happened later")
+    async with asyncio.timeout(20):
+        for each in (waiting, blocked, filled.room()):
+            with pytest.raises(SpoolStuck, match=r"is full .* and cannot be emptied: the log is damaged$"):
+                await each
+    with pytest.raises(SpoolStuck, match="the log is damaged"):
+        filled.block_until_room(1000.0)
+    with pytest.raises(SpoolStuck, match="the log is damaged"):
+        filled.put_nowait(node(), PAYLOAD, reserved=True)
+
+
+async def test_a_queue_that_nobody_empties_takes_what_it_has_room_for(queue: RecorderQueue) -> None:
+    queue.put_nowait(started(), b"{}")
+    queue.give_up("the log is damaged")
+    for _ in range(ORDINARY):
+        await asyncio.wait_for(queue.room(), 20)
+        queue.put_nowait(node(), PAYLOAD)
+    with pytest.raises(SpoolStuck):
+        queue.put_nowait(node(), PAYLOAD)
+    with pytest.raises(SpoolStuck):
+        await asyncio.wait_for(queue.room(), 20)
+    for _ in range(ALL - ORDINARY):
+        assert queue.block_until_room(0.0) is True
+        queue.put_nowait(node(), PAYLOAD, reserved=True)
+    queue.close()
+    assert await queue.room() is None  # type: ignore[func-returns-value]  # putting says that it is closed
+    assert len(await drain(queue)) == 1 + ALL
 
 
 def test_settings_that_cannot_work_are_refused_before_anything_is_made(tmp_path: Path) -> None:

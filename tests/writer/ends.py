@@ -30,6 +30,7 @@ class KeptSource(Source):
         self._lock = threading.Lock()
         self._wake: Callable[[], object] = lambda: None
         self.acknowledgements: list[int] = []
+        self.given_up: list[str] = []
 
     @property
     def name(self) -> str:
@@ -68,6 +69,9 @@ class KeptSource(Source):
             self._kept = self._kept[len(forgotten) :]
             self._given -= len(forgotten)
             self.acknowledgements.append(position)
+
+    def give_up(self, reason: str) -> None:
+        self.given_up.append(reason)
 
     def reopened(self) -> KeptSource:
         """What the next process finds: everything that was not acknowledged, closed."""

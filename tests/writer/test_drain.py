@@ -118,6 +118,7 @@ async def test_a_drain_that_may_give_up_raises_and_its_source_keeps_everything(l
     holder.close()
     assert source.kept == list(range(1, 26))
     assert drain.state.retries == 2
+    assert source.given_up == [f"the writer stopped: {log.address}: database is locked"]
 
 
 async def test_a_state_that_was_taken_stays_as_it_was(log: EventLog) -> None:
@@ -162,13 +163,38 @@ async def test_nothing_is_acknowledged_from_the_first_refused_record_on(log: Eve
     assert await log.stopped() == []
 
 
-async def test_damage_ends_the_drain_and_nothing_of_its_batch_is_acknowledged(log: EventLog) -> None:
+async def test_a_source_is_told_once_and_at_once_that_it_cannot_be_emptied(
+    log: EventLog, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = KeptSource([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9, position=5)])
+    running = asyncio.create_task(Drain(source, CountingFold(log), settings=TENS).run())
+    refused = f"episode {name(1)} was refused: event 5 did not arrive before event 6"
+    async with asyncio.timeout(60):
+        while not source.given_up:  # noqa: ASYNC110 - what is waited for is not ours to signal
+            await asyncio.sleep(0.001)
+    source.put([*run_of(episode(1), 11, 12, position=9), *run_of(episode(2), 1, 20, position=11)])
+    source.close()
+    await running
+    assert source.given_up == [refused]
+    assert [(each.levelname, each.getMessage()) for each in caplog.records] == [
+        ("ERROR", f"nothing more is acknowledged to recorder robot: {refused}")
+    ]
+
+
+async def test_damage_ends_the_drain_and_nothing_of_its_batch_is_acknowledged(
+    log: EventLog, caplog: pytest.LogCaptureFixture
+) -> None:
     await log.append([record(episode(1), 15, payload=b"{}")._replace(sequence=1)])
     source = KeptSource([*run_of(episode(2), 1, 10), *run_of(episode(1), 1, 10, position=11)], closed=True)
     with pytest.raises(LogDamaged):
         await Drain(source, CountingFold(log), settings=TENS).run()
     assert source.kept == list(range(11, 21))
     assert ask(log.address.path, STORED) == [(1, 1, 1, 1), (2, 10, 1, 10)]
+    damage = f"the writer stopped: episode {name(1)}, event 1: another event is stored under this number already"
+    assert source.given_up == [damage]
+    assert [each.getMessage() for each in caplog.records if each.levelname == "ERROR"] == [
+        f"nothing more is acknowledged to recorder robot: {damage}"
+    ]
 
 
 async def test_whoever_waits_for_a_position_is_told_when_it_is_stored_or_never_will_be(log: EventLog) -> None:

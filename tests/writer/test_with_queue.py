@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import sqlite3
+from dataclasses import replace
 from pathlib import Path
+
+import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
+from pycrorm_async.errors import EpisodeParked, SpoolFull, SpoolStuck
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.queue.recorder import RecorderQueue
@@ -23,9 +30,9 @@ SETTINGS = Settings(
 STORED = "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY episode"
 
 
-def queue_in(spool: Path) -> RecorderQueue:
+def queue_in(spool: Path, settings: Settings = SETTINGS) -> RecorderQueue:
     return RecorderQueue.create(
-        spool, settings=SETTINGS, clock=SYSTEM_CLOCK, recorder=episode_id(1_700_000_000_000_000_000, bytes(10))
+        spool, settings=settings, clock=SYSTEM_CLOCK, recorder=episode_id(1_700_000_000_000_000_000, bytes(10))
     )
 
 
@@ -60,6 +67,41 @@ async def test_what_is_put_into_the_queue_is_in_the_log_byte_for_byte(tmp_path: 
     ]
     assert ask(address.path, "SELECT payload FROM pycrorm_declaration") == [('{"dtype":"SayingAction"}',)]
     assert ask(address.path, "SELECT head, folded FROM episode ORDER BY number") == [(2001, 2001), (200, 200)]
+
+
+async def test_a_refused_episode_ends_the_waiting_for_room_of_all_others(
+    tmp_path: Path, address: DatabaseAddress
+) -> None:
+    settings = replace(SETTINGS, segment_bytes=2**14, spool_bytes_max=2**17, spool_reserve_bytes=2**15)
+    settings = replace(settings, record_bytes_max=2**12)
+    queue = queue_in(tmp_path / "spool", settings)
+    writer = WriterThread(source=queue, open_destination=opener(address), adopt=tuple, settings=settings)
+    for number in (1, 2, 3):
+        queue.put_nowait(kind(episode(1), number), payload(number))
+    await writer.start()
+    await writer.flush(3)
+    with sqlite3.connect(address.path, isolation_level=None) as restored:  # as after a backup was put back
+        restored.execute("UPDATE episode SET head = 1, folded = 1")
+    restored.close()
+    queue.put_nowait(kind(episode(1), 4), payload(4))
+    with pytest.raises(EpisodeParked):
+        await writer.flush(4)
+    queue.put_nowait(kind(episode(2), 1), payload(1))
+    put = 1
+    with pytest.raises(SpoolStuck, match=r"cannot be emptied: episode .* was refused: event 2 did not arrive"):
+        async with asyncio.timeout(60):
+            while True:
+                await queue.room()
+                put += 1
+                with contextlib.suppress(SpoolFull):
+                    queue.put_nowait(kind(episode(2), 2), payload(put))
+    assert put > 100
+    assert queue.block_until_room(60.0) is True  # the reserve is there still
+    queue.put_nowait(Heading(episode(2), "EpisodeEnded", 1), b'{"status":"FAILED"}', reserved=True)
+    queue.close()
+    with pytest.raises(EpisodeParked):
+        await writer.close()
+    queue.release()
 
 
 async def test_what_a_dead_recorder_left_is_stored_in_one_round(tmp_path: Path, log: EventLog) -> None:
