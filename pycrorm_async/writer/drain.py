@@ -114,6 +114,12 @@ class Drain:
             self._over = True
             await self._tell()
 
+    async def abandon(self, error: Exception) -> None:
+        """Instead of `run`, when it cannot be: who waits is told."""
+        self._give_up(f"the writer stopped: {error}")
+        self._over = True
+        await self._tell()
+
     async def reached(self, position: int) -> bool:
         """Waits until the log was given everything up to this position; False if the drain ended before."""
         async with self._moved:

@@ -70,7 +70,12 @@ class LiveWriter:
 
         Raises what stopped the appending, or `EpisodeParked` for episodes that stopped since this began.
         """
-        self._stopped_before = await self._patiently(self._destination.stopped)
+        try:
+            self._stopped_before = await self._patiently(self._destination.stopped)
+        except Exception as error:
+            self._failure = error
+            await self._drain.abandon(error)
+            raise
         async with asyncio.TaskGroup() as tasks:
             others = (
                 tasks.create_task(self._fold_when_idle(), name="pycrorm fold when idle"),

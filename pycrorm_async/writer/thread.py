@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine, Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
-from typing import Any
 
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable, FlushTimeout
@@ -52,7 +51,8 @@ class WriterThread:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._work: asyncio.Task[None] | None = None
         self._leave: asyncio.Event | None = None
-        self._flushes: set[asyncio.Task[None]] = set()
+        self._accepting = threading.Lock()
+        self._flushes: set[Future[None]] | None = set()  # None: the loop takes no more
         # A daemon: what it has not stored is safe in the spool, so it is no reason to keep a process from ending.
         self._thread = threading.Thread(target=self._run, name=f"pycrorm writer {source.name}", daemon=True)
 
@@ -69,14 +69,40 @@ class WriterThread:
             raise
 
     async def flush(self, position: int) -> None:
-        """Returns when everything up to this position is stored and visible in the tables; see `LiveWriter.flush`."""
-        writer = self._opened.result(timeout=0)
-        if self._ended.done():
-            self._ended.result()
-            return
-        assert self._loop is not None
-        flush = asyncio.run_coroutine_threadsafe(self._counted(writer.flush(position)), self._loop)
-        await asyncio.shield(asyncio.wrap_future(flush))
+        """Returns when everything up to this position is stored and visible in the tables; see `LiveWriter.flush`.
+
+        One that meets `close` ends as that does: raises what it raises, `FlushTimeout` too.
+        """
+        flush = self._begin_flush(self._opened.result(timeout=0), position)
+        waited_for = asyncio.wrap_future(self._ended if flush is None else flush)
+        try:
+            async with asyncio.timeout(None if flush else self._settings.flush_timeout_s):
+                await asyncio.shield(waited_for)
+        except asyncio.CancelledError:
+            if not waited_for.cancelled():
+                raise
+            raise self._too_late() from None
+        except TimeoutError:
+            if waited_for.done():
+                raise
+            raise self._too_late() from None
+
+    def _begin_flush(self, writer: LiveWriter, position: int) -> Future[None] | None:
+        """In the thread's loop, which does not end before it; None if the loop is ending."""
+        with self._accepting:
+            if self._flushes is None:
+                return None
+            assert self._loop is not None
+            flush = asyncio.run_coroutine_threadsafe(writer.flush(position), self._loop)
+            self._flushes.add(flush)
+            flush.add_done_callback(self._flushes.discard)
+        return flush
+
+    def _end_flushes(self) -> list[Future[None]]:
+        """No more are begun; gives those that were."""
+        with self._accepting:
+            begun, self._flushes = list(self._flushes or ()), None
+        return begun
 
     async def close(self) -> None:
         """Waits until the queue, which the caller closed, is drained and folded. The thread is gone afterwards.
@@ -90,6 +116,8 @@ class WriterThread:
             late = self._too_late()
             self._ask_to_leave(cancel=True)
             await asyncio.wait([ended], timeout=_LEAVE_S)
+            if ended.done():
+                ended.exception()  # the same, or what came of it
             raise late
         self._thread.join()
         ended.result()
@@ -120,8 +148,10 @@ class WriterThread:
         try:
             asyncio.run(self._main())
         except asyncio.CancelledError:
-            self._opened.cancel()
-            self._ended.set_result(None)  # whoever cancelled knows better what to raise
+            if self._opened.cancel():
+                self._ended.set_result(None)
+            else:
+                self._ended.set_exception(self._too_late())
         except BaseException as error:  # noqa: BLE001 - raised by `start`, or by `flush` and `close`
             if not self._opened.done():
                 self._opened.set_exception(error)
@@ -137,11 +167,14 @@ class WriterThread:
             destination = await self._open(stack)
             writer = LiveWriter(self._source, destination, adopt=self._adopt, settings=self._settings)
             self._opened.set_result(writer)
-            # A writer that failed stays until it is told to leave, so that every flush is told why.
-            [outcome] = await asyncio.gather(writer.run(), return_exceptions=True)
-            await self._leave.wait()
-            if self._flushes:
-                await asyncio.wait(self._flushes)
+            try:
+                # A writer that failed stays until it is told to leave, so that every flush is told why.
+                [outcome] = await asyncio.gather(writer.run(), return_exceptions=True)
+                await self._leave.wait()
+                await asyncio.gather(*map(asyncio.wrap_future, self._end_flushes()), return_exceptions=True)
+            finally:
+                if self._end_flushes():
+                    await asyncio.sleep(0)  # what was begun just now is a task afterwards, and ends with the loop
             if outcome is not None:
                 raise outcome
 
@@ -152,12 +185,3 @@ class WriterThread:
                 return await stack.enter_async_context(self._open_destination())
         except TimeoutError:
             raise DatabaseUnavailable(f"the database did not answer within {timeout_s:g} s") from None
-
-    async def _counted(self, flush: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.current_task()
-        assert task is not None
-        self._flushes.add(task)
-        try:
-            await flush
-        finally:
-            self._flushes.discard(task)

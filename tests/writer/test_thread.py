@@ -4,7 +4,7 @@ import asyncio
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -264,6 +264,86 @@ async def test_a_flush_that_takes_too_long_says_why_and_loses_nothing(address: D
     assert writers_alive() == []
     assert source.kept == [1, 2, 3, 4, 5]
     assert ask(address.path, "SELECT count(*) FROM event") == [(0,)]
+
+
+async def test_a_log_that_cannot_say_what_is_stopped_is_told_at_once_at_flush_and_at_close(
+    address: DatabaseAddress,
+) -> None:
+    class Unreadable(Passing):
+        async def stopped(self) -> Mapping[str, str]:
+            raise KeyError("no such column")
+
+    source = KeptSource(run_of(episode(1), 1, 5))
+    settings = Settings(flush_timeout_s=1000.0)
+    writer = WriterThread(
+        source=source, open_destination=opener(address, around=Unreadable), adopt=nobody, settings=settings
+    )
+    await writer.start()
+    async with asyncio.timeout(30):
+        with pytest.raises(KeyError, match="no such column"):
+            await writer.flush(5)
+    assert source.given_up == ["the writer stopped: 'no such column'"]
+    assert writer.state.failure == "'no such column'"
+    source.close()
+    with pytest.raises(KeyError, match="no such column"):
+        await writer.close()
+    assert source.kept == [1, 2, 3, 4, 5]
+    assert writers_alive() == []
+
+
+async def test_flushes_that_meet_the_closing_end_with_it(address: DatabaseAddress) -> None:
+    for _ in range(15):
+        source = KeptSource(run_of(episode(1), 1, 5))
+        writer = writer_for(source, address)
+        await writer.start()
+        over = threading.Event()
+        flushed: list[int] = []
+
+        async def flush_all_the_time(
+            writer: WriterThread = writer, over: threading.Event = over, flushed: list[int] = flushed
+        ) -> None:
+            while not over.is_set():
+                await writer.flush(5)
+                flushed.append(5)
+                await asyncio.sleep(0)
+
+        def beside(work: Callable[[], Coroutine[None, None, None]] = flush_all_the_time) -> None:
+            asyncio.run(work())
+
+        flushing = [asyncio.create_task(asyncio.to_thread(beside)) for _ in range(2)]
+        await until(lambda flushed=flushed: len(flushed) > 3)  # type: ignore[misc]
+        source.close()
+        await writer.close()
+        over.set()
+        async with asyncio.timeout(30):
+            await asyncio.gather(*flushing)
+
+
+async def test_a_flush_that_closing_does_not_wait_for_any_longer_says_so(address: DatabaseAddress) -> None:
+    entered = threading.Event()
+
+    class Endless(Passing):
+        async def fold(self) -> int:
+            entered.set()
+            await asyncio.Event().wait()
+            return 0
+
+    source = KeptSource(run_of(episode(1), 1, 5))
+    settings = Settings(idle_ms=10**9, flush_timeout_s=1.0)
+    writer = WriterThread(
+        source=source, open_destination=opener(address, around=Endless), adopt=nobody, settings=settings
+    )
+    await writer.start()
+    source.close()
+    closing = asyncio.create_task(writer.close())
+    await asyncio.to_thread(entered.wait)
+    await asyncio.sleep(0.5)
+    flushing = asyncio.create_task(writer.flush(5))
+    for each in (closing, flushing):
+        with pytest.raises(FlushTimeout, match="closed after 1 s with work left"):
+            await asyncio.wait_for(each, 30)
+    with pytest.raises(FlushTimeout, match="closed after 1 s with work left"):
+        await asyncio.wait_for(writer.flush(5), 30)
 
 
 async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) -> None:

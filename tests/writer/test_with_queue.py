@@ -88,7 +88,7 @@ async def test_a_refused_episode_ends_the_waiting_for_room_of_all_others(
         await writer.flush(4)
     queue.put_nowait(kind(episode(2), 1), payload(1))
     put = 1
-    with pytest.raises(SpoolStuck, match=r"cannot be emptied: episode .* was refused: event 2 did not arrive"):
+    with pytest.raises(SpoolStuck, match=r"cannot be emptied: episode .* was refused: events 2 to 3 did not arrive"):
         async with asyncio.timeout(60):
             while True:
                 await queue.room()
