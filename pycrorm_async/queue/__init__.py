@@ -1,7 +1,7 @@
 """The write-ahead queue: events in files that survive the process at once and the machine soon after.
 
     spool/                     one folder, bound to one database
-      log                      id of that database's log, one line; written by the first drain
+      log                      id of that database's log, one line; stays while a recorder's folder is here
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
         drain                  locked by whoever drains the folder

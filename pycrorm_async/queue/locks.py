@@ -6,16 +6,19 @@ letting go is said aloud (`LOCK_UN`) rather than left to the last copy being clo
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["FileLock", "is_locked", "in_forked_child"]
+__all__ = ["FileLock", "is_locked", "in_forked_child", "one_at_a_time"]
 
 _TRIES = 5
+_TRIES_IN_TURN = 10_000
 _TRY_AGAIN_S = 0.001
 
 
@@ -43,6 +46,30 @@ def is_locked(path: Path) -> bool:
         return True
     else:
         return False
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def one_at_a_time(folder: Path) -> Iterator[None]:
+    """What is done inside, no other process and no other thread does at the same time in this folder.
+
+    For moments: waits ten seconds for others, then raises `TimeoutError`. Raises other `OSError`.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        for _ in range(_TRIES_IN_TURN):
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                time.sleep(_TRY_AGAIN_S)
+        else:
+            raise TimeoutError(errno.ETIMEDOUT, "another process does not let go of it", str(folder))
+        try:
+            yield
+        finally:
+            fcntl.flock(descriptor, fcntl.LOCK_UN)
     finally:
         os.close(descriptor)
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import threading
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.queue.folder import ALIVE, MAKING, available
-from pycrorm_async.queue.locks import is_locked
-from pycrorm_async.queue.segment import sync_folder
+from pycrorm_async.queue.folder import ALIVE, available, write_safely
+from pycrorm_async.queue.locks import is_locked, one_at_a_time
 
 __all__ = ["Spool", "RecorderFolder"]
 
@@ -52,20 +49,27 @@ class Spool:
             return [path for path in self._entries() if path.name != BINDING and not _is_recorder(path)]
 
     def bind(self, log_id: str) -> None:
-        """Notes that this spool is drained into this log, for ever; the spool is made if need be.
+        """Notes that this spool is drained into this log; the spool is made if need be.
 
-        Raises `SpoolForeign` naming both if it was another before, `SpoolUnavailable` if it cannot be noted.
+        It stays so as long as a recorder's folder is in it: an empty one may be bound to another log. Whoever records
+        here binds it once more when his folder is there, so that nobody can have bound it to another in between.
+
+        Raises `SpoolForeign` naming both if it belongs to another, `SpoolUnavailable` if it cannot be noted.
         """
         if not log_id or log_id != log_id.strip() or "\n" in log_id:
             raise ValueError(f"not an id: {log_id!r}")
-        bound = self.log_id()
-        if bound is None:
-            with available(self.path):
-                self.path.mkdir(parents=True, exist_ok=True)
-                self._note(log_id)
-            bound = self.log_id()
-        if bound != log_id:
-            raise SpoolForeign(f"spool {self.path} belongs to log {bound}, not to log {log_id}")
+        with available(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            with one_at_a_time(self.path):
+                bound = self.log_id()
+                if bound == log_id:
+                    return
+                if bound is not None and any(_is_recorder(path) for path in self._entries()):
+                    raise SpoolForeign(
+                        f"spool {self.path} belongs to log {bound}, not to log {log_id}:"
+                        " open the database it belongs to, or choose another spool"
+                    )
+                write_safely(self.path / BINDING, f"{log_id}\n".encode())
 
     def log_id(self) -> str | None:
         """The log this spool is bound to. Raises `SpoolUnavailable`."""
@@ -74,21 +78,6 @@ class Spool:
                 return (self.path / BINDING).read_text(encoding="utf-8").strip()
             except FileNotFoundError:
                 return None
-
-    def _note(self, log_id: str) -> None:
-        """Writes the note whole or not at all; of two at once the first stays."""
-        unfinished = self.path / f"{BINDING}.{os.getpid()}.{threading.get_ident()}{MAKING}"
-        with unfinished.open("wb") as file:
-            file.write(f"{log_id}\n".encode())
-            file.flush()
-            os.fsync(file.fileno())
-        try:
-            os.link(unfinished, self.path / BINDING)
-        except FileExistsError:
-            pass
-        finally:
-            unfinished.unlink()
-        sync_folder(self.path)
 
     def _entries(self) -> list[Path]:
         try:

@@ -8,7 +8,9 @@ import pytest
 from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from tests.queue.writing import RECORDER, make, started
+from pycrorm_async.queue.folder import make_folder
+from pycrorm_async.queue.locks import FileLock
+from tests.queue.writing import RECORDER, episode, make, started
 
 
 def test_a_spool_that_is_not_there_has_no_recorders_and_is_not_made(spool: Path) -> None:
@@ -50,16 +52,33 @@ def test_looking_does_not_keep_a_dead_folder_from_being_opened(spool: Path) -> N
         thread.join()
 
 
-def test_a_spool_stays_with_the_first_log_that_drained_it(spool: Path) -> None:
+def test_a_spool_stays_with_its_log_as_long_as_a_recorder_is_in_it(spool: Path, queue: RecorderQueue) -> None:
     Spool(spool).bind("0190-log-of-a")
     Spool(spool).bind("0190-log-of-a")
     assert Spool(spool).log_id() == "0190-log-of-a"
-    with pytest.raises(SpoolForeign, match=r"memory\.db\.spool belongs to log 0190-log-of-a, not to log 0190-log-of-b"):
-        Spool(spool).bind("0190-log-of-b")
-    assert [path.name for path in spool.iterdir()] == ["log"]
+    queue.put_nowait(started(), b"{}")
+    for _ in ("alive", "dead"):
+        with pytest.raises(SpoolForeign) as refused:
+            Spool(spool).bind("0190-log-of-b")
+        assert str(refused.value) == (
+            f"spool {spool} belongs to log 0190-log-of-a, not to log 0190-log-of-b:"
+            " open the database it belongs to, or choose another spool"
+        )
+        queue.release()
+    assert sorted(path.name for path in spool.iterdir()) == [queue.name, "log"]
     assert (spool / "log").read_bytes() == b"0190-log-of-a\n"
 
 
+def test_an_empty_spool_is_bound_to_another_log(spool: Path) -> None:
+    Spool(spool).bind("0190-log-of-a")
+    make(spool).release()  # nothing was recorded: its folder is gone
+    (spool / "notes.txt").write_text("mine")
+    Spool(spool).bind("0190-log-of-b")
+    assert Spool(spool).log_id() == "0190-log-of-b"
+    assert sorted(path.name for path in spool.iterdir()) == ["log", "notes.txt"]
+
+
+@pytest.mark.usefixtures("queue")
 def test_of_many_logs_at_once_exactly_one_gets_the_spool(spool: Path) -> None:
     refused: list[str] = []
     begin = threading.Barrier(8)
@@ -79,6 +98,32 @@ def test_of_many_logs_at_once_exactly_one_gets_the_spool(spool: Path) -> None:
     bound = Spool(spool).log_id()
     assert bound is not None
     assert sorted([*refused, bound]) == [f"log-{number}" for number in range(8)]
+
+
+def test_of_many_recorders_for_different_logs_all_that_stay_are_for_one(spool: Path) -> None:
+    """Each binds, makes its folder, and binds again, as an opened memory does."""
+    stay: list[str] = []
+    alive: list[FileLock] = []
+    begin = threading.Barrier(6)
+
+    def record(number: int) -> None:
+        begin.wait()
+        try:
+            Spool(spool).bind(f"log-{number % 2}")
+            alive.append(make_folder(spool, episode_text(episode(number)))[1])
+            Spool(spool).bind(f"log-{number % 2}")
+        except SpoolForeign:
+            return
+        stay.append(f"log-{number % 2}")
+
+    threads = [threading.Thread(target=record, args=(number,)) for number in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for lock in alive:
+        lock.release()
+    assert set(stay) == {Spool(spool).log_id()}
 
 
 def test_strangers_in_the_spool_are_named_and_left_alone(spool: Path, queue: RecorderQueue) -> None:
