@@ -1,5 +1,6 @@
 """What a memory refuses, and how it says so; nothing recorded is lost by it."""
 
+import asyncio
 import sqlite3
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async import Memory, Settings
+from pycrorm_async import Memory, Reading, Settings
 from pycrorm_async.errors import (
     CallerError,
     DatabaseError,
@@ -16,6 +17,7 @@ from pycrorm_async.errors import (
     EpisodeParked,
     FlushTimeout,
     SpoolForeign,
+    SpoolStuck,
     UnknownUrl,
 )
 from pycrorm_async.events.codec import encode, fingerprint
@@ -202,3 +204,24 @@ async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tm
         await NoteActionPerformable("fine").perform()
         await memory.flush()
         assert await texts(memory) == ["fine"]
+
+
+async def test_a_spool_that_nobody_will_empty_fails_a_start_instead_of_making_it_wait_for_ever(tmp_path: Path) -> None:
+    settings = Settings(
+        segment_bytes=2**18, record_bytes_max=2**12, spool_bytes_max=2**20 + 2**18, spool_reserve_bytes=2**18
+    )
+    reached = 0
+    async with Memory.open(url_of(tmp_path), settings=settings) as memory:
+        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")  # nothing can be stored, so nothing is freed
+        with pytest.raises(SpoolStuck, match="the writer has stopped"):
+            async with memory.episode(description="e"):
+                memory._now.queue.give_up("the writer has stopped")
+                while True:
+                    await asyncio.wait_for(NoteActionPerformable("x" * 2_000).perform(), 30)
+                    reached += 1
+        other.execute("ROLLBACK")
+        other.close()
+    assert reached > 100
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert len(await texts(reading)) == reached
