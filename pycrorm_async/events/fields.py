@@ -36,7 +36,8 @@ RESERVED_COLUMNS = frozenset(
 _RESERVED_TABLES = frozenset(
     "event episode process_metadata task_tree_node designator action motion language robot_state pose position"
     " quaternion object object_removal object_part believe_object parameter_item attachment joint_change"
-    " location_resolution location_candidate detection pick_up_with_context_view pickupwithcontextview".split()
+    " location_resolution location_candidate detection state_sample designator_type pick_up_with_context_view"
+    " pickupwithcontextview".split()
 )
 """Tables and views of the memory itself, the planned ones too."""
 _RESERVED_BEGINNINGS = ("pycrorm_", "sqlite_", "pg_")

@@ -20,6 +20,8 @@ __all__ = [
     "FailureValue",
     "MissingValue",
     "CandidateValue",
+    "SeenValue",
+    "NodeReference",
     "FieldType",
     "ItemType",
     "FieldDeclared",
@@ -38,6 +40,8 @@ __all__ = [
     "NodeStarted",
     "NodeEnded",
     "LocationResolved",
+    "ObjectDetected",
+    "StateSampled",
     "EVENT_TYPES",
 ]
 
@@ -73,9 +77,12 @@ class ObjectReference(_Value, frozen=True):
 
 
 class ObjectValue(_Value, frozen=True):
-    """An object that has no row of its own yet: a part of one, a believed one, one outside the recorded world."""
+    """An object that has no row of its own yet: a part of one, a believed one, one outside the recorded world.
 
-    dtype: Literal["Object", "ObjectPart", "BelieveObject"]
+    `part_of` is the whole of an ObjectPart, and what the place of a LocatedObject is told relative to.
+    """
+
+    dtype: Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
     name: str
     object_type: str | None = None
     pose: PoseValue | None = None
@@ -107,10 +114,32 @@ class MissingValue(_Value, frozen=True):
 
 
 class CandidateValue(_Value, frozen=True):
-    """A pose that a location designator offered, with the arms that reach from there (names)."""
+    """A pose that a location designator offered, with the arms that reach from there (names).
+
+    A place that comes from experience also says with which grasp and torso height (m) it went well.
+    """
 
     pose: PoseValue
     arms: tuple[str, ...] = ()
+    grasp: str | None = None
+    torso_height: float | None = None
+
+
+class SeenValue(_Value, frozen=True):
+    """An object that was perceived: as it was, and the share of it that was seen, 0 to 1 (None: not looked at)."""
+
+    name: str
+    object_type: str
+    pose: PoseValue
+    object: ObjectReference | None = None
+    visible: float | None = None
+
+
+class NodeReference(_Value, frozen=True):
+    """A node of another episode: the episode's UUID as text, the sequence of its NodeStarted."""
+
+    episode: str
+    node: int
 
 
 class FieldDeclared(_Value, frozen=True):
@@ -142,7 +171,14 @@ class Happening(_Value, frozen=True):
 
 
 class EpisodeStarted(Happening, frozen=True):
-    """The first event of an episode: who, why, with what. `world` describes it in a line; `seed` is the plan's."""
+    """The first event of an episode: who, why, with what.
+
+    Attributes:
+        plan, seed: its name, that of its random numbers.
+        world: described in a line.
+        simulated: it is thought through in a copy of the world, and nothing of it happens.
+        thought_by: the node that thinks it through.
+    """
 
     description: str
     created_by: str
@@ -152,6 +188,8 @@ class EpisodeStarted(Happening, frozen=True):
     plan: str | None = None
     world: str | None = None
     seed: int | None = None
+    simulated: bool = False
+    thought_by: NodeReference | None = None
 
 
 class EpisodeEnded(Happening, frozen=True):
@@ -244,7 +282,7 @@ class NodeStarted(Happening, frozen=True):
             poses as `PoseValue`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of these; a
             `MissingValue` where the caller chose to record what cannot be recorded as missing.
         robot: at this moment; None without a robot.
-        simulated: thought through in a copy of the world.
+        simulated: thought through in a copy of the world; so are all nodes of its episode.
     """
 
     kind: NodeKind
@@ -282,6 +320,36 @@ class LocationResolved(Happening, frozen=True):
     node: int | None = None
 
 
+class ObjectDetected(Happening, frozen=True):
+    """Perception answered.
+
+    Attributes:
+        source: the head camera, or the state of the world itself.
+        object_type: what was looked for; None: anything.
+        seen: what was found, best seen first; empty if nothing.
+        node: the node that looked.
+    """
+
+    source: Literal["camera", "world_state"]
+    object_type: str | None = None
+    seen: tuple[SeenValue, ...] = ()
+    node: int | None = None
+
+
+class StateSampled(Happening, frozen=True):
+    """How the robot was at a moment of a motion: those channels that changed since its last sample.
+
+    Attributes:
+        object: the robot.
+        channels: `base.x`, `base.y`, `base.z` (m), `base.qx`, `base.qy`, `base.qz`, `base.qw`; joints by name (rad, m).
+        node: the motion.
+    """
+
+    object: ObjectReference
+    channels: dict[str, float]
+    node: int | None = None
+
+
 EVENT_TYPES: dict[str, type[Happening]] = {
     kind.__name__: kind
     for kind in (
@@ -297,6 +365,8 @@ EVENT_TYPES: dict[str, type[Happening]] = {
         NodeStarted,
         NodeEnded,
         LocationResolved,
+        ObjectDetected,
+        StateSampled,
     )
 }
 """The catalogue of event types by name: what a log of this version may hold."""

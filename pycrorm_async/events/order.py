@@ -7,7 +7,8 @@
 | NodeEnded | open; the node is open | the node is ended |
 | ObjectAdded | open | the object is there |
 | ObjectMoved, ObjectRemoved, ObjectAttached, ObjectDetached, JointsMoved | open; the objects they name were added | |
-| LocationResolved | open; the node it names, if any, started | |
+| LocationResolved, ObjectDetected | open; the node it names, if any, started | |
+| StateSampled | open; the object and the node it names are known | |
 | EpisodeEnded | open | the episode is closed: nothing follows |
 
 A structural break (a gap, an end without a start, an unknown parent) is *damage*; an order that is unusual but happens
@@ -30,8 +31,10 @@ from pycrorm_async.events.happenings import (
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
+    ObjectDetected,
     ObjectMoved,
     ObjectRemoved,
+    StateSampled,
 )
 
 __all__ = ["Finding", "OrderCheck"]
@@ -96,9 +99,10 @@ class OrderCheck:
                 return self._unknown_objects(event.object.object)
             case ObjectAttached() | ObjectDetached():
                 return self._unknown_objects(event.parent.object, event.child.object)
-            case LocationResolved():
-                if event.node is not None and event.node not in self._parents:
-                    return [("damage", f"node {event.node} never started")]
+            case StateSampled():
+                return [*self._unknown_objects(event.object.object), *self._unknown_node(event.node)]
+            case LocationResolved() | ObjectDetected():
+                return self._unknown_node(event.node)
         return []
 
     def _start(self, sequence: int, event: NodeStarted) -> list[tuple[Literal["damage", "remark"], str]]:
@@ -123,6 +127,10 @@ class OrderCheck:
         if parent is not None and parent not in self._open_nodes:
             return [("remark", f"node {event.node} ends after its parent {parent}")]
         return []
+
+    def _unknown_node(self, node: int | None) -> list[tuple[Literal["damage", "remark"], str]]:
+        known = node is None or node in self._parents
+        return [] if known else [("damage", f"node {node} never started")]
 
     def _unknown_objects(self, *objects: int) -> list[tuple[Literal["damage", "remark"], str]]:
         return [("damage", f"object {each} was never added") for each in objects if each not in self._objects]

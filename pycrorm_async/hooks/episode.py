@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import getpass
 import platform
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from msgspec.structs import replace
 
@@ -22,8 +22,10 @@ from pycrorm_async.events.happenings import (
     NodeEnded,
     NodeStarted,
     NodeStatus,
+    ObjectDetected,
     ObjectReference,
     RobotValue,
+    SeenValue,
 )
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.hooks.declaration import DeclaredType
@@ -39,9 +41,10 @@ from pycrorm_async.hooks.values import (
 )
 from pycrorm_async.hooks.world import WorldRecorder
 from pycrorm_async.plan.failures import is_plan_failure
-from pycrorm_async.plan.ports import Candidate
+from pycrorm_async.plan.ports import Candidate, Seen
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
+from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 
 __all__ = ["Episode", "NodeRecord", "EpisodeOpening", "current_task"]
@@ -168,13 +171,37 @@ class Episode:
             LocationResolved(
                 location=clean(location),
                 offered=tuple(
-                    CandidateValue(pose_value(each.pose), tuple(arm.name for arm in each.arms)) for each in offered
+                    CandidateValue(
+                        pose_value(each.pose),
+                        tuple(arm.name for arm in each.arms),
+                        each.grasp.name if each.grasp is not None else None,
+                        each.torso_height,
+                    )
+                    for each in offered
                 ),
                 taken=taken,
                 considered=considered,
                 node=self._sequence_of(node),
             ),
         )
+
+    def detect(
+        self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
+        node: TaskTreeNode | None,
+    ) -> None:  # fmt: skip
+        """Write down what perception was asked and what it found."""
+        found = tuple(
+            SeenValue(
+                clean(each.thing.name),
+                each.thing.object_type.name,
+                pose_value(each.thing.pose),
+                self.reference(each.thing),
+                each.visible,
+            )
+            for each in seen
+        )
+        looked_for = object_type.name if object_type is not None else None
+        self._emitter.put(self.id, ObjectDetected(source, looked_for, found, self._sequence_of(node)))
 
     def end(self, failure: BaseException | None) -> None:
         """The last event. Nodes that outlive the episode are out of its sight: LOST."""

@@ -10,6 +10,7 @@ import os
 from collections import deque
 from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
+from typing import Literal
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError, DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
@@ -18,9 +19,10 @@ from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode, EpisodeOpening, NodeRecord, current_task
-from pycrorm_async.plan.ports import Candidate
+from pycrorm_async.plan.ports import Candidate, Seen
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
+from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.watch import current_world
 
 __all__ = ["Recorder", "current_episode"]
@@ -161,6 +163,18 @@ class Recorder:
             episode.locate(location=location, offered=offered, taken=taken, considered=considered, node=node)
         except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
             self._emitter.note_fault("LocationResolved", error)
+
+    def object_detected(
+        self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
+        node: TaskTreeNode | None,
+    ) -> None:  # fmt: skip
+        episode = self._open_here()
+        if episode is None or self._emitter.over:
+            return
+        try:
+            episode.detect(source=source, object_type=object_type, seen=seen, node=node)
+        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            self._emitter.note_fault("ObjectDetected", error)
 
     def _declare(self, declared: DeclaredType) -> None:
         kind = type(declared.declaration)

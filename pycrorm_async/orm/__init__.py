@@ -23,7 +23,7 @@ from pycrorm_async.orm.actions import (
     TransportAction,
 )
 from pycrorm_async.orm.base import Base, Pose, Position, ProcessMetaData, Quaternion, RobotState
-from pycrorm_async.orm.designators import Action, Designator, Motion, ParameterItem
+from pycrorm_async.orm.designators import Action, Designator, DesignatorType, Motion, ParameterItem
 from pycrorm_async.orm.motions import (
     AccessingMotion,
     ClosingMotion,
@@ -41,10 +41,12 @@ from pycrorm_async.orm.objects import (
     Attachment,
     BelieveObject,
     JointChange,
+    LocatedObject,
     Object,
     ObjectPart,
     ObjectRemoval,
 )
+from pycrorm_async.orm.perception import Detection, StateSample
 from pycrorm_async.orm.tree import LocationCandidate, LocationResolution, TaskTreeNode
 from pycrorm_async.orm.views import PickUpWithContextView
 
@@ -58,12 +60,16 @@ __all__ = [
     "Object",
     "ObjectPart",
     "BelieveObject",
+    "LocatedObject",
     "ObjectRemoval",
     "Attachment",
     "JointChange",
     "TaskTreeNode",
     "LocationResolution",
     "LocationCandidate",
+    "Detection",
+    "StateSample",
+    "DesignatorType",
     "Designator",
     "ParameterItem",
     "Action",

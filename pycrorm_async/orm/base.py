@@ -70,6 +70,12 @@ class ProcessMetaData(Base):
     ended_at: Mapped[datetime | None]
     failure_type: Mapped[str | None]
     failure_message: Mapped[str | None]
+    simulated: Mapped[bool]
+    """It was thought through in a copy of the world, and nothing of it happened."""
+    thought_by: Mapped[str | None]
+    """UUID of the episode it was thought through in."""
+    thought_by_node: Mapped[int | None]
+    """The sequence, in that episode, of the node that thought it through."""
 
 
 class Position(Base):

@@ -26,7 +26,27 @@ from pycrorm_async.orm.types import ClassOfRow, JsonText
 if TYPE_CHECKING:
     from pycrorm_async.orm.tree import TaskTreeNode
 
-__all__ = ["ParameterItem", "Designator", "Action", "Motion"]
+__all__ = ["DesignatorType", "ParameterItem", "Designator", "Action", "Motion"]
+
+
+class DesignatorType(Base):
+    """A designator type as a process declared it; several rows of one `dtype` if its fields changed over time.
+
+    Attributes:
+        fingerprint: of the declaration.
+        leaf: the table its parameters are in.
+        concept: the SOMA concept it stands for, if one is known.
+        fields: name, column and type of each field.
+    """
+
+    __tablename__ = "designator_type"
+
+    fingerprint: Mapped[str] = mapped_column(primary_key=True)
+    dtype: Mapped[str]
+    kind: Mapped[str]
+    leaf: Mapped[str]
+    concept: Mapped[str | None]
+    fields: Mapped[list[Any]] = mapped_column(JsonText())
 
 
 class ParameterItem(Base):

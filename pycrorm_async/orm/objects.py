@@ -17,7 +17,7 @@ from pycrorm_async.orm.base import Base, Pose, ProcessMetaData
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
 
-__all__ = ["Object", "ObjectPart", "BelieveObject", "ObjectRemoval", "Attachment", "JointChange"]
+__all__ = ["Object", "ObjectPart", "BelieveObject", "LocatedObject", "ObjectRemoval", "Attachment", "JointChange"]
 
 
 class Object(Base):
@@ -58,6 +58,18 @@ class ObjectPart(Object):
     )
 
     __mapper_args__ = {"polymorphic_identity": "ObjectPart", "polymorphic_load": "inline"}  # noqa: RUF012
+
+
+class LocatedObject(Object):
+    """An object whose place was told relative to another one, `reference`; `pose` is where that is in the map."""
+
+    reference_id: Mapped[int | None] = mapped_column("part_of_id", ForeignKey("object.id"), use_existing_column=True)
+
+    reference: Mapped[Object | None] = relationship(
+        foreign_keys=reference_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=1
+    )
+
+    __mapper_args__ = {"polymorphic_identity": "LocatedObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
 
 class BelieveObject(Object):

@@ -12,7 +12,7 @@ from pycrorm_async.orm.base import Base, Pose, ProcessMetaData
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.plan.task_tree import TaskStatus
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.enums import Arms, Grasp
 
 __all__ = ["TaskTreeNode", "LocationResolution", "LocationCandidate"]
 
@@ -83,6 +83,9 @@ class LocationCandidate(Base):
     arms: Mapped[str]
     """Names of the arms that reach from there, with a comma between them."""
     taken: Mapped[bool]
+    grasp: Mapped[Grasp | None]
+    """Of a place from experience: the grasp it went well with, and the torso height (m)."""
+    torso_height: Mapped[float | None]
 
     @property
     def reachable_arms(self) -> list[Arms]:

@@ -10,23 +10,37 @@ from __future__ import annotations
 from collections.abc import Awaitable
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.task_tree import TaskTreeNode
 
-__all__ = ["PlanObserver", "Candidate", "recorder"]
+__all__ = ["PlanObserver", "Candidate", "Seen", "recorder"]
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place a location designator offers: a pose, and the arms that reach from there."""
+    """A place a location designator offers: a pose, and the arms that reach from there.
+
+    A place that comes from experience also says with which grasp and torso height (m) it went well.
+    """
 
     pose: Pose
     arms: tuple[Arms, ...] = ()
+    grasp: Grasp | None = None
+    torso_height: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """An object that was perceived, and the share of it that was seen, 0 to 1 (None: nobody looked)."""
+
+    thing: Object
+    visible: float | None = None
 
 
 class PlanObserver(Protocol):
@@ -58,6 +72,17 @@ class PlanObserver(Protocol):
         Called once for each time it is asked, perhaps in another context (a loop over places that is
         dropped).
         """
+        ...
+
+    def object_detected(
+        self,
+        *,
+        source: Literal["camera", "world_state"],
+        object_type: ObjectType | None,
+        seen: tuple[Seen, ...],
+        node: TaskTreeNode | None,
+    ) -> None:
+        """Perception answered: what was looked for, and what was found, best seen first."""
         ...
 
 

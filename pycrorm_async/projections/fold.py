@@ -23,9 +23,11 @@ from pycrorm_async.events.happenings import (
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
+    ObjectDetected,
     ObjectMoved,
     ObjectRemoved,
     RobotValue,
+    StateSampled,
 )
 from pycrorm_async.events.ids import SLOT_ROBOT_POSE
 from pycrorm_async.projections.parameters import Designators, Parameters
@@ -71,6 +73,9 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
         None,
         None,
         None,
+        started.simulated,
+        started.thought_by.episode if started.thought_by else None,
+        started.thought_by.node if started.thought_by else None,
     ]
 
 
@@ -217,8 +222,40 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
         (own, number, node, resolved.location, resolved.considered, len(offered), taken, pose_id, time)
     )
     rows.inserts["location_candidate"].extend(
-        (own, rank, number, *pose_columns(each.pose), ",".join(each.arms), rank == taken)
+        (own, rank, number, *pose_columns(each.pose), ",".join(each.arms), rank == taken, each.grasp, each.torso_height)
         for rank, each in enumerate(offered)
+    )
+
+
+# --- perception and the state stream --------------------------------------------------------------------------
+
+
+def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    asked = (number, _node(event, detected.node), detected.source, detected.object_type)
+    time = microseconds(event.wall_ns)
+    rows.inserts["detection"].extend(
+        (
+            own,
+            rank,
+            *asked,
+            row(number, each.object.row) if each.object is not None else None,
+            each.name,
+            each.object_type,
+            *pose_columns(each.pose),
+            each.visible,
+            time,
+        )
+        for rank, each in enumerate(detected.seen)
+    )
+
+
+def _state_sampled(event: StoredEvent, sampled: StateSampled, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    seen, node, time = row(number, sampled.object.row), _node(event, sampled.node), microseconds(event.wall_ns)
+    rows.inserts["state_sample"].extend(
+        (own, channel, number, seen, node, value, time, event.monotonic_ns)
+        for channel, value in sampled.channels.items()
     )
 
 
@@ -250,4 +287,6 @@ _FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {
     "ObjectDetached": _attachment,
     "JointsMoved": _joints_moved,
     "LocationResolved": _location_resolved,
+    "ObjectDetected": _object_detected,
+    "StateSampled": _state_sampled,
 }

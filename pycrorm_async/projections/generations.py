@@ -29,7 +29,7 @@ from pycrorm_async.projections.views import view_text
 __all__ = ["Generation", "PROJECTION", "PROJECTION_VERSION", "current_generation", "make_generation", "grow"]
 
 PROJECTION = "tables"
-PROJECTION_VERSION = 1
+PROJECTION_VERSION = 2
 """Counts what the fold means: tables of an older version must be rebuilt."""
 
 _CREATE = """

@@ -23,6 +23,7 @@ View: TypeAlias = Select[Any] | CompoundSelect[Any]
 
 _event = table("event", column("episode"), column("sequence"), column("payload"))
 _episode = table("episode", column("number"), column("id"))
+_declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
 
 
 def public_views(layout: Layout, generation: int) -> dict[str, View]:
@@ -39,6 +40,20 @@ def _process_metadata(core: dict[str, Table], _layout: Layout) -> View:
     first, *others = episodes.c
     return select(first, _episode.c.id.label("uuid"), *others).join_from(
         episodes, _episode, _episode.c.number == episodes.c.id
+    )
+
+
+def _designator_type(_core: dict[str, Table], _layout: Layout) -> View:
+    def said(name: str) -> ColumnElement[Any]:
+        return func.json_extract(_declaration.c.payload, f"$.{name}")
+
+    return select(
+        _declaration.c.fingerprint,
+        said("dtype").label("dtype"),
+        said("kind").label("kind"),
+        said("table").label("leaf"),
+        said("concept").label("concept"),
+        func.coalesce(said("fields"), "[]").label("fields"),
     )
 
 
@@ -117,6 +132,7 @@ def _quaternion(core: dict[str, Table], _layout: Layout) -> View:
 
 _CUT: dict[str, Callable[[dict[str, Table], Layout], View]] = {
     "process_metadata": _process_metadata,
+    "designator_type": _designator_type,
     "task_tree_node": _task_tree_node,
     "designator": _designator,
     "action": _of_kind("action"),

@@ -44,6 +44,9 @@ CORE: dict[str, dict[str, Storage]] = {
         "ended_at": "time",
         "failure_type": "text",
         "failure_message": "text",
+        "simulated": "boolean",
+        "thought_by": "text",
+        "thought_by_node": "integer",
     },
     "task_tree_node": {
         "id": "key",
@@ -141,13 +144,39 @@ CORE: dict[str, dict[str, Storage]] = {
         **_POSE,
         "arms": "text",
         "taken": "boolean",
+        "grasp": "text",
+        "torso_height": "real",
+    },
+    "detection": {
+        "id": "key",
+        "position": "key",
+        "process_metadata_id": "row",
+        "node_id": "row",
+        "source": "text",
+        "looked_for": "text",
+        "object_id": "object",
+        "name": "text",
+        "obj_type": "text",
+        **_POSE,
+        "visible": "real",
+        "time": "time",
+    },
+    "state_sample": {
+        "id": "key",
+        "channel": "key",
+        "process_metadata_id": "row",
+        "object_id": "object",
+        "node_id": "row",
+        "value": "real",
+        "time": "time",
+        "ns": "integer",
     },
 }
 """Table by table, column by column, in the order a fold gives the values."""
 
 COLUMNS = {table: tuple(columns) for table, columns in CORE.items()}
 
-_TEXT_KEYS = {("parameter_item", "field"), ("joint_change", "joint")}
+_TEXT_KEYS = {("parameter_item", "field"), ("joint_change", "joint"), ("state_sample", "channel")}
 
 _INDEXED = {
     "task_tree_node": ("process_metadata_id", "parent_id", "status", "dtype"),
@@ -159,6 +188,8 @@ _INDEXED = {
     "joint_change": ("process_metadata_id", "object_id"),
     "location_resolution": ("process_metadata_id", "node_id"),
     "location_candidate": ("process_metadata_id",),
+    "detection": ("process_metadata_id", "node_id"),
+    "state_sample": ("process_metadata_id", "node_id"),
 }
 
 

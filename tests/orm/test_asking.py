@@ -139,7 +139,8 @@ async def test_the_episode_says_who_did_what_and_how_it_ended(log: EventLog, scr
     assert repr(metadata) == (
         "ProcessMetaData(id=1, uuid='00000000-0000-7000-8000-000000000001',"
         f" created_at={moment(1)!r}, created_by='me', description='Tutorial', version='1.0', host='host',"
-        f" python='3.11', plan='breakfast', status='LOST', ended_at={moment(19)!r})"
+        f" python='3.11', plan='breakfast', status='LOST', ended_at={moment(19)!r},"
+        " simulated=False)"
     )
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
+from typing import Literal
 
-from pycrorm_async.plan.ports import Candidate, recorder
+from pycrorm_async.plan.ports import Candidate, Seen, recorder
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, current_node
+from pycrorm_async.world import ObjectType
 
 
 class OrderBroken(AssertionError):
@@ -65,6 +67,16 @@ class Recording:
     ) -> None:
         self.places.append((location, offered, taken, considered, node))
         self.told.append(f"place {location}")
+
+    def object_detected(
+        self,
+        *,
+        source: Literal["camera", "world_state"],
+        object_type: ObjectType | None,
+        seen: tuple[Seen, ...],
+        node: TaskTreeNode | None,
+    ) -> None:
+        self.told.append(f"saw {' '.join(each.thing.name for each in seen)}".strip())
 
     @contextmanager
     def listening(self) -> Iterator[Recording]:

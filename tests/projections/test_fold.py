@@ -16,16 +16,20 @@ from pycrorm_async.events.happenings import (
     LocationResolved,
     MissingValue,
     NodeEnded,
+    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
+    ObjectDetected,
     ObjectMoved,
     ObjectReference,
     ObjectRemoved,
     ObjectValue,
     PoseValue,
     RobotValue,
+    SeenValue,
+    StateSampled,
 )
 from pycrorm_async.projections.fold import CannotFold, fold
 from pycrorm_async.projections.parameters import Designators
@@ -83,13 +87,16 @@ def folded(script: Script, *types: DesignatorTypeDeclared, number: int = 1) -> R
 
 def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:
     script = Script()
-    script.put(EpisodeStarted("why", "me", "host", "1.2", "3.11.7", plan="breakfast", world="a kitchen", seed=42))
+    thinker = NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
+    script.put(
+        EpisodeStarted("why", "me", "host", "1.2", "3.11.7", "breakfast", "a kitchen", 42, True, thinker)  # noqa: FBT003
+    )
     script.put(EpisodeEnded("FAILED", FailureValue("plans.IKError", "too far")))
     assert rows_of(script, number=7) == {
         "process_metadata": [
             (
                 7, time_us(1), "me", "why", "1.2", "host", "3.11.7", "breakfast", "a kitchen", 42,
-                "FAILED", time_us(2), "plans.IKError", "too far",
+                "FAILED", time_us(2), "plans.IKError", "too far", True, "018bcfe5-6800-7000-8000-000000000001", 12,
             )
         ]
     }  # fmt: skip
@@ -277,7 +284,7 @@ def test_the_world_as_it_changes_is_one_row_a_change() -> None:
 def test_a_resolved_location_keeps_what_was_offered_and_what_was_taken() -> None:
     script = Script()
     root = script.put(NodeStarted("root"))
-    offered = (CandidateValue(pose(1, 1), ("LEFT", "RIGHT")), CandidateValue(pose(2, 2), ("LEFT",)))
+    offered = (CandidateValue(pose(1, 1), ("LEFT", "RIGHT")), CandidateValue(pose(2, 2), ("LEFT",), "TOP", 0.25))
     script.put(LocationResolved("CostmapLocation", offered, taken=1, considered=600, node=root))
     script.put(LocationResolved("AccessingLocation", considered=3))
     made = rows_of(script)
@@ -286,10 +293,44 @@ def test_a_resolved_location_keeps_what_was_offered_and_what_was_taken() -> None
         (row(3), 1, None, "AccessingLocation", 3, 0, None, None, time_us(3)),
     ]
     assert made["location_candidate"] == [
-        (row(2), 0, 1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT,RIGHT", False),
-        (row(2), 1, 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT", True),
+        (row(2), 0, 1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT,RIGHT", False, None, None),
+        (row(2), 1, 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT", True, "TOP", 0.25),
     ]
     assert made["pose"] == [(row(2), 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
+
+
+def test_what_was_seen_is_a_row_each_best_first() -> None:
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    root = script.put(NodeStarted("root"))
+    seen = (
+        SeenValue("milk", "MILK", pose(1, 2, 3), ObjectReference(milk, milk), 0.75),
+        SeenValue("ghost", "MILK", pose(4, 5, 6)),
+    )
+    script.put(ObjectDetected("camera", "MILK", seen, root))
+    script.put(ObjectDetected("world_state", None))
+    assert rows_of(script)["detection"] == [
+        (
+            row(3), 0, 1, row(2), "camera", "MILK", row(1), "milk", "MILK",
+            1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, "map", 0.75, time_us(3),
+        ),
+        (
+            row(3), 1, 1, row(2), "camera", "MILK", None, "ghost", "MILK",
+            4.0, 5.0, 6.0, 0.0, 0.0, 0.0, 1.0, "map", None, time_us(3),
+        ),
+    ]  # fmt: skip
+
+
+def test_a_sample_of_the_robot_is_a_row_for_each_channel() -> None:
+    script = Script()
+    robot = script.put(ObjectAdded("pr2", "ROBOT", pose()))
+    moved = script.put(ObjectMoved(robot, "pr2", "ROBOT", pose(1)))
+    node = script.put(NodeStarted("root"))
+    script.put(StateSampled(ObjectReference(robot, moved), {"base.x": 1.0, "torso_lift_joint": 0.25}, node))
+    assert rows_of(script)["state_sample"] == [
+        (row(4), "base.x", 1, row(2), row(3), 1.0, time_us(4), 4 * 10**9 + 5),
+        (row(4), "torso_lift_joint", 1, row(2), row(3), 0.25, time_us(4), 4 * 10**9 + 5),
+    ]
 
 
 def test_nodes_of_the_language_have_their_table_too() -> None:

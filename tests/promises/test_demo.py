@@ -103,6 +103,9 @@ class Witness:
     def location_resolved(self, **arguments: Any) -> None:
         self.memory.location_resolved(**arguments)
 
+    def object_detected(self, **arguments: Any) -> None:
+        self.memory.object_detected(**arguments)
+
 
 def tree_text(nodes: list[Any]) -> str:
     return "\n" + "".join(f"{'  ' * node.depth}{node.dtype or 'root'}\n" for node in nodes)
