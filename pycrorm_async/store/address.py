@@ -30,7 +30,7 @@ BUSY_TIMEOUT_S = 5.0
 
 _WHAT_WORKS = (
     "what works: sqlite:///memory.db (a file here), sqlite:////data/memory.db (a file by its absolute path),"
-    " sqlite:// (private, gone when closed), postgresql://user@host/database"
+    " sqlite:// (private, gone when closed)"
 )
 
 
