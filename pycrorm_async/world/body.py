@@ -71,9 +71,7 @@ class Body:
 
     def turn(self, positions: Mapping[str, float]) -> None:
         """Set these joints, all at once."""
-        numbers = [self._joint_numbers[joint] for joint in positions]
-        values = [[position] for position in positions.values()]
-        engine().resetJointStatesMultiDof(self.number, numbers, values, physicsClientId=self.client)
+        self._turn_in_bullet(positions)
         self.positions.update(positions)
 
     def link_frame(self, link: str) -> Frame:
@@ -83,6 +81,15 @@ class Body:
             return self.pose.position, self.pose.orientation
         state = engine().getLinkState(self.number, number, computeForwardKinematics=True, physicsClientId=self.client)
         return self._link_frame(number, state)
+
+    def link_frame_at(self, link: str, positions: Mapping[str, float]) -> Frame:
+        """Where the link's frame would be in "map" with these joints there; Bullet tries it and puts them back."""
+        now = {joint: self.positions[joint] for joint in positions}
+        try:
+            self._turn_in_bullet(positions)
+            return self.link_frame(link)
+        finally:
+            self._turn_in_bullet(now)
 
     def box(self, links: Iterable[str]) -> BoundingBox | None:
         """The box around the shapes of these links; None if they have none."""
@@ -101,6 +108,11 @@ class Body:
     def unload(self) -> None:
         """Take it out of Bullet; pose and positions stay readable."""
         engine().removeBody(self.number, physicsClientId=self.client)
+
+    def _turn_in_bullet(self, positions: Mapping[str, float]) -> None:
+        numbers = [self._joint_numbers[joint] for joint in positions]
+        values = [[position] for position in positions.values()]
+        engine().resetJointStatesMultiDof(self.number, numbers, values, physicsClientId=self.client)
 
     def _link_frame(self, number: int, state: Sequence[Any]) -> Frame:
         # Bullet also gives the link's own frame, but in single precision; its inertial frame is exact to a double

@@ -126,6 +126,18 @@ class Object:
         position, orientation = self.body.link_frame(link)
         return Pose(position, orientation)
 
+    def link_pose_at(self, link: str, positions: Mapping[str, float]) -> Pose:
+        """Where a link's frame would be in "map" if these joints (rad or m) stood there; moves nothing.
+
+        Limits are not looked at. Raises `UnknownLink`, `UnknownJoint`.
+        """
+        self._check_link(link)
+        for joint in positions:
+            self.joint_position(joint)
+        self.check_present()
+        position, orientation = self.body.link_frame_at(link, positions)
+        return Pose(position, orientation)
+
     def bounding_box(self, link: str | None = None) -> BoundingBox:
         """The box along map's axes around the whole object, or around one link, without margin.
 

@@ -57,6 +57,26 @@ def test_every_link_is_where_the_description_says(
         np.testing.assert_allclose(matrix(thing.link_pose(link)), where, atol=1e-9)
 
 
+@pytest.mark.parametrize("base", [Pose(), LEANING])
+def test_where_a_link_would_be_at_other_joint_positions_moves_nothing_and_is_told_to_nobody(
+    world: BulletWorld, base: Pose
+) -> None:
+    thing = crane(base)
+    thing.set_joint_positions({"turning": 0.4, "lifting": -0.5, "reaching": 0.1})
+    witness = Witness()
+    world.observe(witness)
+    before = {link: thing.link_pose(link) for link in thing.links}
+    expected = crane_links(base, turning=2.5, lifting=-0.5, reaching=0.25)
+    for link, where in expected.items():
+        there = thing.link_pose_at(link, {"turning": 2.5, "reaching": 0.25})
+        np.testing.assert_allclose(matrix(there), where, atol=1e-9)
+    assert {link: thing.link_pose(link) for link in thing.links} == before
+    assert thing.joint_positions() == {"turning": 0.4, "lifting": -0.5, "reaching": 0.1}
+    assert witness.told == []
+    with pytest.raises(UnknownJoint):
+        thing.link_pose_at("hook", {"rowing": 1.0})
+
+
 def test_links_follow_a_base_that_is_set_after_the_joints(world: BulletWorld) -> None:
     thing = crane()
     thing.set_joint_positions({"turning": 0.4, "reaching": 0.6})
