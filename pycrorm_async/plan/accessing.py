@@ -23,6 +23,7 @@ __all__ = [
     "closed_position",
     "handle_of",
     "handle_poses",
+    "moved_position",
     "opened_position",
 ]
 
@@ -31,6 +32,7 @@ OPENING_MARGIN = 0.05
 STEP_M_MAX = 0.05
 STEP_RAD_MAX = 0.1
 """So far apart, at most, are the points at which the way of a handle is looked at."""
+_ROUNDING = 1e-9
 
 
 class Handle(NamedTuple):
@@ -46,11 +48,12 @@ class Handle(NamedTuple):
         return self.whole.joint_position(self.joint)
 
 
-def handle_of(part: ObjectLike) -> Handle:
-    """The handle, with the nearest movable joint above it.
+def handle_of(part: ObjectLike, joint: str | None = None) -> Handle:
+    """The handle, with the nearest movable joint above it, or with the one that is named.
 
     Raises:
-        EnvironmentManipulationImpossible: it is no part of an object, or nothing above it can move.
+        EnvironmentManipulationImpossible: it is no part of an object; no joint moves it, or not the one that is
+            named.
         PerceptionObjectNotInWorld: the object it is part of is not in the world.
         UnknownLink: that object has no such link.
     """
@@ -60,9 +63,10 @@ def handle_of(part: ObjectLike) -> Handle:
         )
     whole = in_world(part.part_of)
     joints = whole.joints_above(part.name)
-    if not joints:
-        raise EnvironmentManipulationImpossible(f"no joint of {whole.name} moves {part.name}", part.name, whole.name)
-    return Handle(whole, part.name, joints[0])
+    if not joints or joint not in (None, *joints):
+        mover = "no joint" if joint is None else f"no joint {joint}"
+        raise EnvironmentManipulationImpossible(f"{mover} of {whole.name} moves {part.name}", part.name, whole.name)
+    return Handle(whole, part.name, joint or joints[0])
 
 
 def opened_position(handle: Handle) -> float:
@@ -81,6 +85,20 @@ def closed_position(handle: Handle) -> float:
     return lower
 
 
+def moved_position(handle: Handle, distance: float) -> float:
+    """Where its joint is after it moved by `distance`, m or rad.
+
+    Raises:
+        EnvironmentManipulationImpossible: that is beyond its limits.
+    """
+    lower, upper = handle.whole.joint_limits(handle.joint)
+    goal = handle.position + distance
+    if not lower - _ROUNDING <= goal <= upper + _ROUNDING:
+        message = f"{handle.joint} goes from {lower:g} to {upper:g}: from {handle.position:g} not by {distance:g}"
+        raise EnvironmentManipulationImpossible(message, handle.link, handle.joint, distance)
+    return min(max(goal, lower), upper)
+
+
 def handle_poses(handle: Handle, goal: float, start: float | None = None) -> list[Pose]:
     """Where the handle's frame is on the way of its joint to `goal`: the start, points between, the goal.
 
@@ -89,7 +107,7 @@ def handle_poses(handle: Handle, goal: float, start: float | None = None) -> lis
     """
     begin = handle.position if start is None else start
     step = STEP_M_MAX if handle.whole.joint_type(handle.joint) is JointType.PRISMATIC else STEP_RAD_MAX
-    count = max(1, math.ceil(abs(goal - begin) / step - 1e-9))
+    count = max(1, math.ceil(abs(goal - begin) / step - _ROUNDING))
     return [
         handle.whole.link_pose_at(handle.link, {handle.joint: begin + (goal - begin) * number / count})
         for number in range(count + 1)

@@ -1,8 +1,8 @@
-"""The actions that are there from the start: what a robot can be asked to do, and by which motions it does
-it.
+"""The first of the actions that are there from the start: posture, driving, looking, picking up and placing.
 
-Each is recorded with its fields; concepts are those of SOMA. Positions are in metres in the map, angles in
-rad. Descriptions with alternatives for each of them are in `pycrorm_async.plan.descriptions`.
+What one hand does with handles and things is in `plan.manipulation`, looking for and bringing things in
+`plan.fetching`. Each is recorded with its fields; concepts are those of SOMA. Positions are in metres in the
+map, angles in rad. Descriptions with alternatives for each of them are in `pycrorm_async.plan.descriptions`.
 
 >>> await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
 """
@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 
-class _Action(ActionAbstract):
+class CheckedAction(ActionAbstract):
     """Its fields are checked when it is built, as a motion's are. Raises `ResolutionError`."""
 
     def __post_init__(self) -> None:
@@ -52,7 +52,7 @@ class _Action(ActionAbstract):
 
 
 @dataclass
-class MoveTorsoActionPerformable(_Action):
+class MoveTorsoActionPerformable(CheckedAction):
     """Lift or lower the torso to `position` (m). Raises `TorsoGoalUnreachable`."""
 
     concept: ClassVar[str | None] = "MoveTorso"
@@ -64,7 +64,7 @@ class MoveTorsoActionPerformable(_Action):
 
 
 @dataclass
-class SetGripperActionPerformable(_Action):
+class SetGripperActionPerformable(CheckedAction):
     """Open or close a gripper."""
 
     concept: ClassVar[str | None] = "SettingGripper"
@@ -77,7 +77,7 @@ class SetGripperActionPerformable(_Action):
 
 
 @dataclass
-class ParkArmsActionPerformable(_Action):
+class ParkArmsActionPerformable(CheckedAction):
     """Fold an arm, or both, out of the way."""
 
     concept: ClassVar[str | None] = "ParkingArms"
@@ -85,14 +85,12 @@ class ParkArmsActionPerformable(_Action):
     arm: Arms
 
     async def perform(self) -> None:
-        arms = robot_here().description.arms
-        left = dict(arms[Arms.LEFT].park) if self.arm is not Arms.RIGHT else None
-        right = dict(arms[Arms.RIGHT].park) if self.arm is not Arms.LEFT else None
-        await MoveArmJointsMotion(left, right).perform()
+        parked = {arm: dict(each.park) for arm, each in robot_here().each_arm(self.arm).items()}
+        await MoveArmJointsMotion(parked.get(Arms.LEFT), parked.get(Arms.RIGHT)).perform()
 
 
 @dataclass
-class NavigateActionPerformable(_Action):
+class NavigateActionPerformable(CheckedAction):
     """Drive to a place."""
 
     concept: ClassVar[str | None] = "Navigating"
@@ -104,7 +102,7 @@ class NavigateActionPerformable(_Action):
 
 
 @dataclass
-class LookAtActionPerformable(_Action):
+class LookAtActionPerformable(CheckedAction):
     """Turn the head to a point."""
 
     concept: ClassVar[str | None] = "LookingAt"
@@ -116,7 +114,7 @@ class LookAtActionPerformable(_Action):
 
 
 @dataclass
-class PickUpActionPerformable(_Action):
+class PickUpActionPerformable(CheckedAction):
     """Take an object with one arm and lift it by 3 cm; the object is attached to the gripper afterwards.
 
     The gripper is turned as `grasp` says in the object's own axes. It opens 0.1 m before the object, seen
@@ -149,7 +147,7 @@ class PickUpActionPerformable(_Action):
 
 
 @dataclass
-class PlaceActionPerformable(_Action):
+class PlaceActionPerformable(CheckedAction):
     """Put the held object down: it ends at `target_location`, the gripper 7 cm behind.
 
     Raises:
@@ -178,8 +176,10 @@ class PlaceActionPerformable(_Action):
 
 
 @dataclass
-class FaceAtPerformable(_Action):
+class FaceAtPerformable(CheckedAction):
     """Turn on the spot to face a point, and look at it."""
+
+    concept: ClassVar[str | None] = "LookingAt"
 
     pose: Pose
 
@@ -192,8 +192,10 @@ class FaceAtPerformable(_Action):
 
 
 @dataclass
-class MoveAndPickUpPerformable(_Action):
+class MoveAndPickUpPerformable(CheckedAction):
     """Drive to a place, face the object there, and pick it up."""
+
+    concept: ClassVar[str | None] = "Fetching"
 
     standing_position: Pose
     object_designator: ObjectDesignator | Object

@@ -22,19 +22,34 @@ from pycrorm_async.plan.actions import (
     SetGripperActionPerformable,
 )
 from pycrorm_async.plan.failures import IllPosedGoalFailure
+from pycrorm_async.plan.fetching import DetectActionPerformable, TransportActionPerformable
+from pycrorm_async.plan.manipulation import (
+    CloseActionPerformable,
+    GraspingActionPerformable,
+    GripActionPerformable,
+    OpenActionPerformable,
+    ReleaseActionPerformable,
+)
 from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.pose import Pose
 
 __all__ = [
     "ActionDescription",
+    "CloseAction",
+    "DetectAction",
+    "GraspingAction",
+    "GripAction",
     "LookAtAction",
     "MoveTorsoAction",
     "NavigateAction",
+    "OpenAction",
     "ParkArmsAction",
     "PickUpAction",
     "PlaceAction",
+    "ReleaseAction",
     "SetGripperAction",
+    "TransportAction",
 ]
 
 P = TypeVar("P")
@@ -137,6 +152,71 @@ class PlaceAction(ActionDescription[PlaceActionPerformable]):
     ) -> None:
         super().__init__(
             PlaceActionPerformable,
+            object_designator=_objects(object_designator_description),
+            arm=arms,
+            target_location=target_locations,
+        )
+
+
+class GripAction(ActionDescription[GripActionPerformable]):
+    """Hold an object that is in the gripper, with one of these efforts (N)."""
+
+    def __init__(
+        self, grippers: Iterable[Arms], object_designator_description: Objects, efforts: Iterable[float]
+    ) -> None:
+        super().__init__(
+            GripActionPerformable,
+            gripper=grippers,
+            object_designator=_objects(object_designator_description),
+            effort=efforts,
+        )
+
+
+class ReleaseAction(ActionDescription[ReleaseActionPerformable]):
+    """Let go of an object."""
+
+    def __init__(self, grippers: Iterable[Arms], object_designator_description: Objects) -> None:
+        super().__init__(
+            ReleaseActionPerformable, gripper=grippers, object_designator=_objects(object_designator_description)
+        )
+
+
+class GraspingAction(ActionDescription[GraspingActionPerformable]):
+    """Close a gripper around an object or a handle."""
+
+    def __init__(self, arms: Iterable[Arms], object_description: Objects) -> None:
+        super().__init__(GraspingActionPerformable, arm=arms, object_desig=_objects(object_description))
+
+
+class OpenAction(ActionDescription[OpenActionPerformable]):
+    """Open a drawer or a door by one of these handles."""
+
+    def __init__(self, object_designator_description: Objects, arms: Iterable[Arms]) -> None:
+        super().__init__(OpenActionPerformable, object_designator=_objects(object_designator_description), arm=arms)
+
+
+class CloseAction(ActionDescription[CloseActionPerformable]):
+    """Close a drawer or a door by one of these handles."""
+
+    def __init__(self, object_designator_description: Objects, arms: Iterable[Arms]) -> None:
+        super().__init__(CloseActionPerformable, object_designator=_objects(object_designator_description), arm=arms)
+
+
+class DetectAction(ActionDescription[DetectActionPerformable]):
+    """Look for an object like one of these."""
+
+    def __init__(self, object_designator_description: Objects) -> None:
+        super().__init__(DetectActionPerformable, object_designator=_objects(object_designator_description))
+
+
+class TransportAction(ActionDescription[TransportActionPerformable]):
+    """Fetch an object and put it down at one of these poses."""
+
+    def __init__(
+        self, object_designator_description: Objects, arms: Iterable[Arms], target_locations: Iterable[Pose]
+    ) -> None:
+        super().__init__(
+            TransportActionPerformable,
             object_designator=_objects(object_designator_description),
             arm=arms,
             target_location=target_locations,

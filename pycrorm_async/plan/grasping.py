@@ -1,4 +1,4 @@
-"""Where the gripper has to be to pick an object up and to put it down. Pure geometry in the map, metres.
+"""Where the gripper has to be to pick an object up, put it down or hold on to it. Pure geometry in the map, metres.
 
 The same functions serve the actions and the search for a place to stand, so that what is offered is what
 will be done.
@@ -6,17 +6,32 @@ will be done.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+from pycrorm_async.world.boxes import BoundingBox
 from pycrorm_async.world.enums import Grasp
 from pycrorm_async.world.pose import Pose, product, rotated
 from pycrorm_async.world.robot import GRASP_ORIENTATIONS
 
-__all__ = ["APPROACH_M", "LIFT_M", "RETRACT_M", "PickUpPoses", "pick_up_poses", "place_pose", "retracted"]
+__all__ = [
+    "APPROACH_M",
+    "HOLD_DISTANCE_M_MAX",
+    "LIFT_M",
+    "RETRACT_M",
+    "PickUpPoses",
+    "approached",
+    "between",
+    "pick_up_poses",
+    "place_pose",
+    "retracted",
+]
 
 APPROACH_M = 0.1
 LIFT_M = 0.03
 RETRACT_M = 0.07
+HOLD_DISTANCE_M_MAX = 0.03
+"""A gripper can hold what its tool frame is no farther from than this."""
 
 
 class PickUpPoses(NamedTuple):
@@ -49,6 +64,18 @@ def place_pose(target: Pose, held: Pose, tool: Pose) -> Pose:
     return target @ tool.relative_to(held)
 
 
+def approached(tool: Pose) -> Pose:
+    """The tool frame before it goes straight ahead, along its fingers, to `tool`."""
+    return tool @ Pose((-APPROACH_M, 0.0, 0.0))
+
+
 def retracted(tool: Pose) -> Pose:
     """The tool frame after moving back along its fingers."""
     return tool @ Pose((-RETRACT_M, 0.0, 0.0))
+
+
+def between(tool: Pose, box: BoundingBox) -> float:
+    """How far the tool frame is from the box around something, m; 0 inside."""
+    return math.hypot(
+        *(max(low - at, at - high, 0.0) for at, low, high in zip(tool.position, box.min, box.max, strict=True))
+    )

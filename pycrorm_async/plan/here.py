@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from pycrorm_async.errors import CallerError
 from pycrorm_async.plan.errors import NoRobotHere
+from pycrorm_async.plan.failures import CapabilityAbsenceFailure, IllPosedGoalFailure
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import NoWorld
 from pycrorm_async.world.robot import ArmDescription, RobotDescription
@@ -25,11 +25,26 @@ class RobotHere(NamedTuple):
     description: RobotDescription
 
     def one_arm(self, arm: Arms) -> ArmDescription:
-        """The arm's description. Raises `CallerError` for `Arms.BOTH`."""
+        """The arm's description.
+
+        Raises:
+            IllPosedGoalFailure: it is `Arms.BOTH`.
+            CapabilityAbsenceFailure: the robot has no such arm.
+        """
+        if arm is Arms.BOTH:
+            raise IllPosedGoalFailure("this is done with one arm, LEFT or RIGHT, not with BOTH", arm)
         found = self.description.arms.get(arm)
         if found is None:
-            raise CallerError(f"this is done with one arm, LEFT or RIGHT, not with {arm.name}")
+            raise CapabilityAbsenceFailure(f"{self.body.name} has no {arm.name} arm", self.body.name, arm)
         return found
+
+    def each_arm(self, arm: Arms) -> dict[Arms, ArmDescription]:
+        """The arm, or for `Arms.BOTH` the two. Raises `CapabilityAbsenceFailure` for one that the robot lacks."""
+        return {each: self.one_arm(each) for each in ((Arms.LEFT, Arms.RIGHT) if arm is Arms.BOTH else (arm,))}
+
+    def with_load(self) -> frozenset[Object]:
+        """The robot and all that is attached to it, however deep."""
+        return frozenset({self.body, *self.body.world.attachments.below(self.body)})
 
 
 def world_here() -> BulletWorld:

@@ -1,5 +1,5 @@
 """The motions: what a robot's controllers do at once. Each is carried out by the robot chosen with
-`with simulated_robot:`, and recorded with its target.
+`with simulated_robot:`, and recorded with its target; concepts are the nearest ones of SOMA.
 
 >>> with simulated_robot:
 ...     await MoveMotion(Pose([0.6, 0.4, 0])).perform()
@@ -8,11 +8,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from pycrorm_async.plan.designator import BaseMotion
 from pycrorm_async.plan.errors import ResolutionError
+from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
+from pycrorm_async.plan.perceiving import perceived
 from pycrorm_async.plan.process_modules import chosen_robot
-from pycrorm_async.world.enums import Arms, GripperState
+from pycrorm_async.world.enums import Arms, GripperState, ObjectType
+from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
 __all__ = [
@@ -22,6 +26,11 @@ __all__ = [
     "MoveGripperMotion",
     "MoveArmJointsMotion",
     "MoveJointsMotion",
+    "DetectingMotion",
+    "WorldStateDetectingMotion",
+    "OpeningMotion",
+    "ClosingMotion",
+    "AccessingMotion",
 ]
 
 
@@ -29,55 +38,70 @@ __all__ = [
 class MoveMotion(BaseMotion):
     """Drive the base to a pose in the map."""
 
+    concept: ClassVar[str | None] = "Navigating"
+
     target: Pose
 
     async def perform(self) -> None:
-        await chosen_robot(self).navigate(self)
+        await chosen_robot(self, "navigate").navigate(self)
 
 
 @dataclass
 class MoveTCPMotion(BaseMotion):
-    """Bring the tool frame of one arm to a pose in the map. Raises `IKError`."""
+    """Bring the tool frame of one arm to a pose in the map.
+
+    Raises:
+        IKError: it is out of reach.
+        CapabilityAbsenceFailure, IllPosedGoalFailure: the robot has no such arm; one arm is needed, not BOTH.
+    """
+
+    concept: ClassVar[str | None] = "AssumingArmPose"
 
     target: Pose
     arm: Arms
     allow_gripper_collision: bool | None = None
 
     async def perform(self) -> None:
-        await chosen_robot(self).move_tcp(self)
+        await chosen_robot(self, "move_tcp").move_tcp(self)
 
 
 @dataclass
 class LookingMotion(BaseMotion):
     """Turn the head to a point in the map."""
 
+    concept: ClassVar[str | None] = "LookingAt"
+
     target: Pose
 
     async def perform(self) -> None:
-        await chosen_robot(self).looking(self)
+        await chosen_robot(self, "looking").looking(self)
 
 
 @dataclass
 class MoveGripperMotion(BaseMotion):
     """Open or close a gripper."""
 
+    concept: ClassVar[str | None] = "SettingGripper"
+
     motion: GripperState
     gripper: Arms
     allow_gripper_collision: bool | None = None
 
     async def perform(self) -> None:
-        await chosen_robot(self).move_gripper(self)
+        await chosen_robot(self, "move_gripper").move_gripper(self)
 
 
 @dataclass
 class MoveArmJointsMotion(BaseMotion):
     """Bring arm joints (by name) to positions in rad, both arms at once. Raises `ConfigurationNotReached`."""
 
+    concept: ClassVar[str | None] = "AssumingArmPose"
+
     left_arm_poses: dict[str, float] | None = None
     right_arm_poses: dict[str, float] | None = None
 
     async def perform(self) -> None:
-        await chosen_robot(self).move_arm_joints(self)
+        await chosen_robot(self, "move_arm_joints").move_arm_joints(self)
 
 
 @dataclass
@@ -90,6 +114,8 @@ class MoveJointsMotion(BaseMotion):
         ResolutionError: not one position for each name.
     """
 
+    concept: ClassVar[str | None] = "AssumingPose"
+
     names: list[str]
     positions: list[float]
 
@@ -100,4 +126,91 @@ class MoveJointsMotion(BaseMotion):
             raise ResolutionError(type(self).__name__, wrong=[f"positions: {counts}"])
 
     async def perform(self) -> None:
-        await chosen_robot(self).move_joints(self)
+        await chosen_robot(self, "move_joints").move_joints(self)
+
+
+@dataclass
+class DetectingMotion(BaseMotion):
+    """Look with the head's camera for objects of a type; returns the one that is seen best.
+
+    Raises `PerceptionObjectNotFound`, which says for each of that type why it is not seen.
+    """
+
+    concept: ClassVar[str | None] = "LookingFor"
+
+    object_type: ObjectType
+
+    async def perform(self) -> ObjectDesignator:
+        looking = chosen_robot(self, "detecting").detecting(self)
+        return await perceived(looking, source="camera", object_type=self.object_type)
+
+
+@dataclass
+class WorldStateDetectingMotion(BaseMotion):
+    """Ask the world itself for objects of a type, seen or not; returns the first. Raises `PerceptionObjectNotFound`."""
+
+    concept: ClassVar[str | None] = "CheckingObjectPresence"
+
+    object_type: ObjectType
+
+    async def perform(self) -> ObjectDesignator:
+        asking = chosen_robot(self, "world_state_detecting").world_state_detecting(self)
+        return await perceived(asking, source="world_state", object_type=self.object_type)
+
+
+@dataclass
+class OpeningMotion(BaseMotion):
+    """With the hand on a handle, open what it belongs to, up to 0.05 m or rad before its end; the hand goes along.
+
+    Raises:
+        EnvironmentManipulationImpossible: no joint moves that part, or the hand is not on it.
+        IKError: the hand cannot follow all the way; nothing was moved.
+        PerceptionObjectNotInWorld: the whole is not in the world.
+    """
+
+    concept: ClassVar[str | None] = "Opening"
+
+    object_part: ObjectPart
+    arm: Arms
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "open").open(self)
+
+
+@dataclass
+class ClosingMotion(BaseMotion):
+    """With the hand on a handle, close what it belongs to; the hand goes along. Raises as `OpeningMotion` does."""
+
+    concept: ClassVar[str | None] = "Closing"
+
+    object_part: ObjectPart
+    arm: Arms
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "close").close(self)
+
+
+@dataclass
+class AccessingMotion(BaseMotion):
+    """With the hand on a handle, move a joint by a distance; positive opens, negative closes. Raises as
+    `OpeningMotion` does, `EnvironmentManipulationImpossible` also for a distance beyond the joint's limits.
+
+    Attributes:
+        part_of: the furniture.
+        gripper: the tool frame of the arm.
+        drawer_joint: one of the joints above the handle.
+        drawer_handle: the link that the hand is on.
+        distance: m, or rad for a door.
+    """
+
+    concept: ClassVar[str | None] = "Accessing"
+
+    part_of: ObjectDesignator | Object
+    arm: Arms
+    gripper: str
+    drawer_joint: str
+    drawer_handle: str
+    distance: float
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "accessing").accessing(self)

@@ -2,32 +2,42 @@
 context.
 
 The choice nests, ends with the block however it is left, and is inherited by tasks that start inside. A
-robot of one's own is a class with these methods: `with ChosenRobot("mine", MyModules()):`. Arms keep to their
-soft limits; `with simulated_robot_within(Limits.HARD):` they go up to the stops.
+robot of one's own is a class with these methods: `with ChosenRobot("mine", MyModules()):`; a motion it has no
+method for fails with `CapabilityAbsenceFailure`. Arms keep to their soft limits; `with
+simulated_robot_within(Limits.HARD):` they go up to the stops.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextvars import ContextVar
 from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self, cast
 
 from pycrorm_async.plan.errors import NoRobotChosen
+from pycrorm_async.plan.failures import CapabilityAbsenceFailure
+from pycrorm_async.plan.ports import Seen
 from pycrorm_async.plan.simulated import SimulatedModules
 from pycrorm_async.world.robot import Limits
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import BaseMotion
     from pycrorm_async.plan.motions import (
+        AccessingMotion,
+        ClosingMotion,
+        DetectingMotion,
         LookingMotion,
         MoveArmJointsMotion,
         MoveGripperMotion,
         MoveJointsMotion,
         MoveMotion,
         MoveTCPMotion,
+        OpeningMotion,
+        WorldStateDetectingMotion,
     )
 
 __all__ = [
+    "MovingModules",
     "ProcessModules",
     "ChosenRobot",
     "simulated_robot",
@@ -37,8 +47,11 @@ __all__ = [
 ]
 
 
-class ProcessModules(Protocol):
-    """One method a motion; each returns when the motion is over and raises a `PlanFailure` when it did not succeed."""
+class MovingModules(Protocol):
+    """What the robot itself moves: the least that a robot of one's own has.
+
+    One method a motion; each returns when the motion is over and raises a `PlanFailure` when it did not succeed.
+    """
 
     async def navigate(self, motion: MoveMotion) -> None: ...
 
@@ -53,6 +66,23 @@ class ProcessModules(Protocol):
     async def move_joints(self, motion: MoveJointsMotion) -> None: ...
 
 
+class ProcessModules(MovingModules, Protocol):
+    """What a robot may also be able to do: perceive, open and close.
+
+    Perceiving returns what was found, the best seen first; `PerceptionObjectNotFound` says why nothing was.
+    """
+
+    async def detecting(self, motion: DetectingMotion) -> Sequence[Seen]: ...
+
+    async def world_state_detecting(self, motion: WorldStateDetectingMotion) -> Sequence[Seen]: ...
+
+    async def open(self, motion: OpeningMotion) -> None: ...
+
+    async def close(self, motion: ClosingMotion) -> None: ...
+
+    async def accessing(self, motion: AccessingMotion) -> None: ...
+
+
 _chosen: ContextVar[tuple[ChosenRobot, ...]] = ContextVar("_chosen", default=())
 
 
@@ -61,11 +91,11 @@ class ChosenRobot:
 
     Args:
         name: for people.
-        modules: one robot's.
+        modules: one robot's; those of `ProcessModules` that it has no method for are motions it cannot do.
         limits: what its arms keep to, for those who ask in advance what they can reach (`CostmapLocation`).
     """
 
-    def __init__(self, name: str, modules: ProcessModules, *, limits: Limits = Limits.SOFT) -> None:
+    def __init__(self, name: str, modules: MovingModules, *, limits: Limits = Limits.SOFT) -> None:
         self.name = name
         self.modules = modules
         self.limits = limits
@@ -99,12 +129,22 @@ simulated_robot = simulated_robot_within(Limits.SOFT)
 """The robot in the world of this context, moved kinematically: at once, exactly, without physics."""
 
 
-def chosen_robot(motion: BaseMotion) -> ProcessModules:
-    """The modules of the innermost choice. Raises `NoRobotChosen`."""
+def chosen_robot(motion: BaseMotion, module: str) -> ProcessModules:
+    """The modules of the innermost choice, which have the method of that name.
+
+    Raises:
+        NoRobotChosen: nothing says which robot moves.
+        CapabilityAbsenceFailure: the robot has no such method.
+    """
     chosen = _chosen.get()
     if not chosen:
         raise NoRobotChosen(type(motion).__name__)
-    return chosen[-1].modules
+    robot = chosen[-1]
+    if not hasattr(robot.modules, module):
+        name = type(motion).__name__
+        message = f"the {robot.name} robot cannot do {name}: {type(robot.modules).__name__} has no method {module!r}"
+        raise CapabilityAbsenceFailure(message, robot.name, name)
+    return cast("ProcessModules", robot.modules)
 
 
 def chosen_limits() -> Limits:

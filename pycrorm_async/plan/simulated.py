@@ -6,11 +6,29 @@ A motion either has its whole effect, which the world tells as one motion, or fa
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from pycrorm_async.plan.failures import ConfigurationNotReached, IKError, TorsoGoalUnreachable
+from pycrorm_async.plan.accessing import (
+    Handle,
+    closed_position,
+    handle_of,
+    handle_poses,
+    moved_position,
+    opened_position,
+)
+from pycrorm_async.plan.failures import (
+    ConfigurationNotReached,
+    EnvironmentManipulationImpossible,
+    IKError,
+    IllPosedGoalFailure,
+    TorsoGoalUnreachable,
+)
+from pycrorm_async.plan.grasping import HOLD_DISTANCE_M_MAX, between
 from pycrorm_async.plan.here import RobotHere, robot_here
+from pycrorm_async.plan.objects import ObjectPart
+from pycrorm_async.plan.perceiving import seen_by_camera, told_by_world
+from pycrorm_async.plan.ports import Seen
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import JointLimitExceeded
 from pycrorm_async.world.kinematics import Limits, Unreachable, solve
@@ -18,12 +36,17 @@ from pycrorm_async.world.pose import Pose
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.motions import (
+        AccessingMotion,
+        ClosingMotion,
+        DetectingMotion,
         LookingMotion,
         MoveArmJointsMotion,
         MoveGripperMotion,
         MoveJointsMotion,
         MoveMotion,
         MoveTCPMotion,
+        OpeningMotion,
+        WorldStateDetectingMotion,
     )
 
 __all__ = ["SimulatedModules"]
@@ -39,24 +62,19 @@ class SimulatedModules:
         robot_here().body.set_pose(motion.target)
 
     async def move_tcp(self, motion: MoveTCPMotion) -> None:
-        body, description = robot_here()
-        try:
-            joints = solve(body, motion.arm, motion.target, limits=self._limits)
-        except Unreachable as unreachable:
-            tip = description.arms[motion.arm].tool_frame
-            raise IKError(motion.target, motion.arm, tip, unreachable.reason) from unreachable
-        body.set_joint_positions(joints)
+        robot = robot_here()
+        robot.body.set_joint_positions(self._reaching(robot, motion.arm, motion.target))
 
     async def looking(self, motion: LookingMotion) -> None:
         robot = robot_here()
         robot.body.set_joint_positions(head_joints(robot, motion.target))
 
     async def move_gripper(self, motion: MoveGripperMotion) -> None:
-        body, description = robot_here()
+        robot = robot_here()
         joints: dict[str, float] = {}
-        for arm in single_arms(motion.gripper):
-            joints |= description.arms[arm].gripper_joints[motion.motion]
-        body.set_joint_positions(joints)
+        for arm in robot.each_arm(motion.gripper).values():
+            joints |= arm.gripper_joints[motion.motion]
+        robot.body.set_joint_positions(joints)
 
     async def move_arm_joints(self, motion: MoveArmJointsMotion) -> None:
         _set_joints(robot_here(), (motion.left_arm_poses or {}) | (motion.right_arm_poses or {}))
@@ -64,10 +82,49 @@ class SimulatedModules:
     async def move_joints(self, motion: MoveJointsMotion) -> None:
         _set_joints(robot_here(), dict(zip(motion.names, motion.positions, strict=True)))
 
+    async def detecting(self, motion: DetectingMotion) -> Sequence[Seen]:
+        return seen_by_camera(robot_here(), motion.object_type)
 
-def single_arms(arm: Arms) -> tuple[Arms, ...]:
-    """LEFT and RIGHT for BOTH."""
-    return (Arms.LEFT, Arms.RIGHT) if arm is Arms.BOTH else (arm,)
+    async def world_state_detecting(self, motion: WorldStateDetectingMotion) -> Sequence[Seen]:
+        return told_by_world(motion.object_type)
+
+    async def open(self, motion: OpeningMotion) -> None:
+        handle = handle_of(motion.object_part)
+        self._lead(robot_here(), motion.arm, handle, opened_position(handle))
+
+    async def close(self, motion: ClosingMotion) -> None:
+        handle = handle_of(motion.object_part)
+        self._lead(robot_here(), motion.arm, handle, closed_position(handle))
+
+    async def accessing(self, motion: AccessingMotion) -> None:
+        robot = robot_here()
+        tool_frame = robot.one_arm(motion.arm).tool_frame
+        if motion.gripper != tool_frame:
+            message = f"the gripper of the {motion.arm.name} arm is {tool_frame}, not {motion.gripper}"
+            raise IllPosedGoalFailure(message, motion.gripper)
+        handle = handle_of(ObjectPart(motion.drawer_handle, motion.part_of), motion.drawer_joint)
+        self._lead(robot, motion.arm, handle, moved_position(handle, motion.distance))
+
+    def _lead(self, robot: RobotHere, arm: Arms, handle: Handle, goal: float) -> None:
+        """Bring the handle's joint to `goal` with the hand that is on it; the hand is on it as before then."""
+        tool_frame = robot.one_arm(arm).tool_frame
+        tool = robot.body.link_pose(tool_frame)
+        apart = between(tool, handle.whole.bounding_box(handle.link))
+        if apart > HOLD_DISTANCE_M_MAX:
+            message = f"{tool_frame} is not on {handle.link} but {apart:.3f} m away: grasp it first"
+            raise EnvironmentManipulationImpossible(message, handle.link, apart)
+        grip = tool.relative_to(handle.whole.link_pose(handle.link))
+        way = [self._reaching(robot, arm, each @ grip) for each in handle_poses(handle, goal)]
+        robot.body.set_joint_positions(way[-1])
+        handle.whole.set_joint_position(handle.joint, goal)
+
+    def _reaching(self, robot: RobotHere, arm: Arms, target: Pose) -> dict[str, float]:
+        """The arm's joints with which its tool frame is at the target. Raises `IKError`."""
+        tool_frame = robot.one_arm(arm).tool_frame
+        try:
+            return solve(robot.body, arm, target, limits=self._limits)
+        except Unreachable as unreachable:
+            raise IKError(target, arm, tool_frame, unreachable.reason) from unreachable
 
 
 def head_joints(robot: RobotHere, target: Pose) -> dict[str, float]:

@@ -24,6 +24,7 @@ __all__ = [
     "RobotDescription",
     "ArmDescription",
     "Bounds",
+    "FieldOfView",
     "Limits",
     "GRASP_ORIENTATIONS",
     "FINGER_OPEN_RAD",
@@ -78,6 +79,13 @@ class ArmDescription:
         return self.soft_limits if limits is Limits.SOFT else self.hard_limits
 
 
+class FieldOfView(NamedTuple):
+    """Whole angles of a camera's picture, rad, half of each to either side of its axis."""
+
+    horizontal: float
+    vertical: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RobotDescription:
     """A mobile robot with a lifting torso, arms and a head that pans and tilts; root link on the floor."""
@@ -94,7 +102,8 @@ class RobotDescription:
     head_tilt_joint: str
     head_tilt_link: str
     camera_link: str
-    """Optical frame: z looks ahead."""
+    """Optical frame: z looks ahead, x to the right, y down."""
+    camera_view_rad: FieldOfView
     camera_height_m: Bounds
     """Between the lowest and the highest torso."""
 
@@ -192,6 +201,7 @@ PR2 = RobotDescription(
     head_tilt_joint="head_tilt_joint",
     head_tilt_link="head_tilt_link",
     camera_link="wide_stereo_optical_frame",
+    camera_view_rad=FieldOfView(0.99483, 0.75049),  # those that reference systems give for this camera
     camera_height_m=Bounds(1.27, 1.60),
 )
 

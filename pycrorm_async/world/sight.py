@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["first_met", "visible_share"]
+__all__ = ["first_met", "met_towards", "visible_share"]
 
 _RAYS_AT_ONCE = 16_000  # Bullet takes 16,384
 _SHAPES_LOOKED_THROUGH = 64  # in one ray's way; it meets a convex shape once
@@ -53,12 +53,20 @@ def first_met(
 
 def visible_share(world: BulletWorld, thing: Object, eye: Sequence[float], *, ignore: AbstractSet[Object]) -> float:
     """The share of rays into the object's shapes that reach it, as `BulletWorld.visible` promises."""
+    met = met_towards(world, thing, eye, ignore=ignore)
+    return sum(found is thing for found in met) / len(met) if met else 0.0
+
+
+def met_towards(
+    world: BulletWorld, thing: Object, eye: Sequence[float], *, ignore: AbstractSet[Object]
+) -> list[Object | None]:
+    """What each ray from the eye into the object's shapes meets first: the object itself, or what hides it.
+
+    None for the floor. Empty for an object without shapes.
+    """
     thing.check_present()
     points = [point for link, solids in thing.body.solids.items() if solids for point in _placed(thing, link)]
-    if not points:
-        return 0.0
-    met = first_met(world, [eye] * len(points), points, ignore=ignore - {thing})
-    return sum(found is thing for found in met) / len(met)
+    return first_met(world, [eye] * len(points), points, ignore=ignore - {thing}) if points else []
 
 
 def _placed(thing: Object, link: str) -> list[list[float]]:

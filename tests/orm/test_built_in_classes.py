@@ -8,11 +8,12 @@ from sqlalchemy import Table, inspect
 import pycrorm_async.orm
 from pycrorm_async.hooks.declaration import declared_type
 from pycrorm_async.orm import Action, Designator, Motion
-from pycrorm_async.plan import actions, motions
+from pycrorm_async.plan import actions, fetching, manipulation, motions
 from pycrorm_async.projections.classes import mapped_leaves
 from pycrorm_async.projections.layout import Layout
 
-PERFORMABLES = [getattr(module, name) for module in (actions, motions) for name in module.__all__]
+MODULES = (actions, manipulation, fetching, motions)
+PERFORMABLES = [getattr(module, name) for module in MODULES for name in module.__all__]
 
 
 @pytest.mark.parametrize("designator", PERFORMABLES, ids=lambda each: each.dtype)

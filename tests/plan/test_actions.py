@@ -7,7 +7,6 @@ from dataclasses import fields
 
 import pytest
 
-from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import (
     BelieveObject,
     FaceAtPerformable,
@@ -27,7 +26,12 @@ from pycrorm_async.plan import (
     collected_tree,
 )
 from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.failures import ObjectLost, PerceptionObjectNotInWorld, TorsoGoalUnreachable
+from pycrorm_async.plan.failures import (
+    IllPosedGoalFailure,
+    ObjectLost,
+    PerceptionObjectNotInWorld,
+    TorsoGoalUnreachable,
+)
 from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.plan.task_tree import CollectedTree
 from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose
@@ -55,11 +59,11 @@ def targets(tree: CollectedTree) -> list[Pose]:
         (PickUpActionPerformable, "PickUpAction", "PickingUp", ["object_designator", "arm", "grasp"]),
         (PlaceActionPerformable, "PlaceAction", "Placing", ["object_designator", "arm", "target_location"]),
         (LookAtActionPerformable, "LookAtAction", "LookingAt", ["target"]),
-        (FaceAtPerformable, "FaceAtAction", None, ["pose"]),
+        (FaceAtPerformable, "FaceAtAction", "LookingAt", ["pose"]),
         (
             MoveAndPickUpPerformable,
             "MoveAndPickUpAction",
-            None,
+            "Fetching",
             ["standing_position", "object_designator", "arm", "grasp"],
         ),
     ],
@@ -265,7 +269,7 @@ async def test_one_arm_at_a_time(scene: Scene) -> None:
         PickUpActionPerformable(scene.milk, Arms.BOTH, Grasp.FRONT),
         PlaceActionPerformable(scene.milk, Arms.BOTH, Pose()),
     ):
-        with pytest.raises(CallerError, match="one arm, LEFT or RIGHT, not with BOTH"):
+        with pytest.raises(IllPosedGoalFailure, match="one arm, LEFT or RIGHT, not with BOTH"):
             await action.perform()
 
 
