@@ -11,7 +11,7 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from pycrorm_async.events.happenings import (
     ObjectValue,
     PoseValue,
 )
-from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator, ObjectPart
+from pycrorm_async.plan.objects import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
@@ -43,6 +43,8 @@ __all__ = [
 
 OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
 """Field types that mean an object; parts and believed objects are object designators too."""
+
+ObjectDtype: TypeAlias = Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
 
 _TEXT_MAX = 2_000
 _REPR_MAX = 200
@@ -196,11 +198,11 @@ def _object(value: Any, _enum: type[Enum] | None, references: References) -> Obj
     if isinstance(value, Object):
         return references.reference(value) or _outside(value)
     if isinstance(value, ObjectPart):
-        return ObjectValue(
-            "ObjectPart", clean(value.name), _type_name(value), _maybe_pose(value), _whole(value, references)
-        )
+        return _told("ObjectPart", value, _in_force(value.part_of, references))
+    if isinstance(value, LocatedObject):
+        return _told("LocatedObject", value, _in_force(value.reference, references))
     if isinstance(value, BelieveObject):
-        return ObjectValue("BelieveObject", clean(value.name), _type_name(value), _maybe_pose(value))
+        return _told("BelieveObject", value)
     if isinstance(value, ObjectDesignator):
         known = references.reference(value.world_object) if value.world_object is not None else None
         return known or _outside(value)
@@ -208,13 +210,18 @@ def _object(value: Any, _enum: type[Enum] | None, references: References) -> Obj
 
 
 def _outside(value: Any) -> ObjectValue:
-    return ObjectValue("Object", clean(value.name), _type_name(value), _maybe_pose(value))
+    return _told("Object", value)
 
 
-def _whole(part: ObjectPart, references: References) -> ObjectReference | None:
-    whole = part.part_of
-    world_object = whole if isinstance(whole, Object) else whole.world_object
-    return references.reference(world_object) if world_object is not None else None
+def _told(dtype: ObjectDtype, value: Any, part_of: ObjectReference | None = None) -> ObjectValue:
+    return ObjectValue(dtype, clean(value.name), _type_name(value), _maybe_pose(value), part_of)
+
+
+def _in_force(meant: ObjectDesignator, references: References) -> ObjectReference | None:
+    """The row in force of the object of the world that is meant, or that the part belongs to."""
+    while isinstance(meant, ObjectPart):
+        meant = meant.part_of
+    return references.reference(meant.world_object) if meant.world_object is not None else None
 
 
 def _maybe_pose(value: Any) -> PoseValue | None:

@@ -1,8 +1,8 @@
 """How a plan names objects: a description finds them in the world, a designator stands for one of them.
 
-Wherever a designator is wanted, the world's own `Object` will do as well. Four classes tell apart what is
-meant: `Object` and `ObjectDesignator` one of the world, `ObjectPart` a link of one, `BelieveObject` one that
-nobody has seen.
+Wherever a designator is wanted, the world's own `Object` will do as well. Five classes tell apart what is
+meant: `Object` and `ObjectDesignator` one of the world, `ObjectPart` a link of one, `LocatedObject` one whose
+place was told relative to another, `BelieveObject` one that nobody has seen.
 
 >>> ObjectDesignatorDescription(names=["milk"]).resolve().pose
 Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
@@ -12,8 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from typing import TypeAlias
 
+from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.plan.errors import ResolutionError
 from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWorld
 from pycrorm_async.plan.here import world_here
@@ -24,8 +26,10 @@ from pycrorm_async.world.pose import Pose
 __all__ = [
     "ObjectDesignator",
     "ObjectPart",
+    "LocatedObject",
     "BelieveObject",
     "ObjectDesignatorDescription",
+    "LocatedObjectDescription",
     "ObjectLike",
     "designator_of",
     "in_world",
@@ -109,6 +113,68 @@ class ObjectPart(ObjectDesignator):
         return ObjectPart(self.name, self.part_of.frozen_copy(), self.object_type, self.pose)
 
 
+@dataclass(frozen=True, init=False)
+class LocatedObject(ObjectDesignator):
+    """An object whose place was told, at a moment, relative to another: "the milk is 20 cm left of the cereal".
+
+    Its pose is in the map and goes along with the reference; the pose's time is the moment it was told.
+
+    >>> cereal = ObjectDesignatorDescription(names=["cereal"]).resolve()
+    >>> LocatedObject("milk", ObjectType.MILK, Pose([0, 0.2, 0]), cereal).pose.position
+    Vector(x=1.3, y=0.9, z=0.95)
+
+    Attributes:
+        relative_pose: where it is as seen from the reference (m), whatever frame the pose names.
+        reference: another object, or a part of one.
+        timestamp: when it was told, with a time zone; now, if left out.
+        world_object: the object itself, if it is in the world; it may be elsewhere than it was told to be.
+    """
+
+    relative_pose: Pose = field(kw_only=True)
+    reference: ObjectDesignator = field(kw_only=True)
+    timestamp: datetime = field(kw_only=True)
+
+    def __init__(
+        self,
+        name: str,
+        object_type: ObjectType,
+        relative_pose: Pose,
+        reference: ObjectLike,
+        timestamp: datetime | None = None,
+        world_object: Object | None = None,
+        frozen_pose: Pose | None = None,
+    ) -> None:
+        told = timestamp if timestamp is not None else _moment(SYSTEM_CLOCK.wall_ns())
+        if told.tzinfo is None:
+            raise ResolutionError(type(self).__name__, wrong=["timestamp: expected a datetime with a time zone"])
+        put = object.__setattr__
+        put(self, "name", name)
+        put(self, "object_type", object_type)
+        put(self, "world_object", world_object)
+        put(self, "frozen_pose", frozen_pose)
+        put(self, "relative_pose", relative_pose)
+        put(self, "reference", designator_of(reference))
+        put(self, "timestamp", told)
+
+    @property
+    def pose(self) -> Pose:
+        """Where it is if it is where it was told to be; in a frozen copy, where that was."""
+        if self.frozen_pose is not None:
+            return self.frozen_pose
+        there = self.reference.pose @ self.relative_pose
+        return Pose(there.position, there.orientation, there.frame, _nanoseconds(self.timestamp))
+
+    def frozen_copy(self) -> LocatedObject:
+        return LocatedObject(
+            self.name,
+            self.object_type,
+            self.relative_pose,
+            self.reference.frozen_copy(),
+            self.timestamp,
+            frozen_pose=self.pose,
+        )
+
+
 class ObjectDesignatorDescription:
     """Describes objects by name or type; iterating it gives a designator for each that is in the world now.
 
@@ -150,6 +216,45 @@ class ObjectDesignatorDescription:
         return tuple(each.name for each in self.types) if self.types is not None else None
 
 
+class LocatedObjectDescription(ObjectDesignatorDescription):
+    """Describes objects as an `ObjectDesignatorDescription` does, and tells where each is relative to others.
+
+    Args:
+        references: alternatives for what the place is told relative to.
+        names, types: any of these.
+
+    Iterating it gives each object with each reference (never with itself), as they stand at that moment.
+    """
+
+    def __init__(
+        self,
+        references: Iterable[ObjectLike],
+        names: Iterable[str] | None = None,
+        types: Iterable[ObjectType] | None = None,
+    ) -> None:
+        super().__init__(names, types)
+        self.references = tuple(designator_of(each) for each in references)
+
+    def __iter__(self) -> Iterator[LocatedObject]:
+        for found in super().__iter__():
+            for reference in self.references:
+                if reference.world_object is None or reference.world_object is not found.world_object:
+                    relative = found.pose.relative_to(reference.pose)
+                    yield LocatedObject(
+                        found.name, found.object_type, relative, reference, world_object=found.world_object
+                    )
+
+    def resolve(self) -> LocatedObject:
+        """The first that fits. Raises `ObjectNotFound`."""
+        first = super().resolve()
+        assert isinstance(first, LocatedObject)
+        return first
+
+    def __str__(self) -> str:
+        others = " or ".join(each.name for each in self.references) or "nothing"
+        return f"{super().__str__()}, beside {others}"
+
+
 ObjectLike: TypeAlias = Object | ObjectDesignator
 """What stands for an object."""
 
@@ -167,3 +272,14 @@ def in_world(meant: ObjectLike) -> Object:
     if found is None or all(each is not found for each in found.world.objects):
         raise PerceptionObjectNotInWorld(f"{meant.name} is not an object of the world", meant.name)
     return found
+
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+def _moment(wall_ns: int) -> datetime:
+    return _EPOCH + timedelta(microseconds=wall_ns // 1000)
+
+
+def _nanoseconds(moment: datetime) -> int:
+    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
 
 from pycrorm_async.plan import (
     BelieveObject,
+    LocatedObject,
+    LocatedObjectDescription,
     ObjectDesignator,
     ObjectDesignatorDescription,
     ObjectPart,
@@ -17,6 +21,7 @@ from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWor
 from pycrorm_async.plan.objects import designator_of, in_world
 from pycrorm_async.world import ObjectType, Pose
 from pycrorm_async.world.errors import NoWorld, UnknownLink
+from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import Scene
 
 
@@ -94,3 +99,68 @@ def test_what_is_meant_is_found_in_the_world_or_is_a_failure(scene: Scene) -> No
     for gone in (milk, scene.milk, milk.frozen_copy(), ObjectPart("sink_area", scene.kitchen)):
         with pytest.raises(PerceptionObjectNotInWorld, match=gone.name):
             in_world(gone)
+
+
+NOON = datetime(2024, 7, 30, 14, 0, 0, 123456, timezone(timedelta(hours=2)))
+
+
+def test_a_located_object_is_where_its_reference_says_and_goes_along_with_it(scene: Scene) -> None:
+    cup = LocatedObject("cup", ObjectType.JEROEN_CUP, Pose([0, 0.2, 0.1]), scene.milk, NOON)
+    assert (cup.name, cup.object_type, cup.timestamp) == ("cup", ObjectType.JEROEN_CUP, NOON)
+    assert (cup.reference, cup.relative_pose) == (designator_of(scene.milk), Pose([0, 0.2, 0.1]))
+    assert cup.pose == Pose([1.3, 1.2, 1.0])
+    # 2024-07-30 12:00:00.123456 UTC, by `date -d`
+    assert cup.pose.time_ns == 1_722_340_800_123_456_000
+    before = cup.frozen_copy()
+    scene.milk.set_pose(Pose([1, 0, 0.5], yaw_quaternion(math.pi / 2)))
+    assert cup.pose.position == pytest.approx((0.8, 0, 0.6))
+    assert cup.pose.yaw == pytest.approx(math.pi / 2)
+    assert (before.pose, before.pose.time_ns) == (Pose([1.3, 1.2, 1.0]), 1_722_340_800_123_456_000)
+    assert isinstance(before, LocatedObject)
+    assert (before.reference.pose, before.relative_pose, before.timestamp) == (
+        Pose([1.3, 1, 0.9]),
+        cup.relative_pose,
+        NOON,
+    )
+
+
+def test_a_place_may_be_told_relative_to_a_part_or_to_another_place_that_was_told(scene: Scene) -> None:
+    island = ObjectPart("kitchen_island_surface", scene.kitchen)
+    plate = LocatedObject("plate", ObjectType.GENERIC_OBJECT, Pose([0.1, 0, 0]), island)
+    spoon = LocatedObject("spoon", ObjectType.SPOON, Pose([0, -0.3, 0]), plate)
+    assert plate.pose.position == pytest.approx((-1.35, 1.0, 0.9))
+    assert spoon.pose.position == pytest.approx((-1.35, 0.7, 0.9))
+
+
+def test_the_moment_of_a_place_is_now_or_has_a_time_zone(scene: Scene) -> None:
+    before = datetime.now(UTC)
+    cup = LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk)
+    assert before - timedelta(microseconds=1) <= cup.timestamp <= datetime.now(UTC)
+    with pytest.raises(ResolutionError, match=r"LocatedObject cannot be built; wrong: timestamp: .* time zone"):
+        LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk, datetime(2024, 7, 30))  # noqa: DTZ001
+
+
+def test_an_object_that_was_only_told_of_is_not_in_the_world(scene: Scene) -> None:
+    cup = LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk)
+    with pytest.raises(PerceptionObjectNotInWorld, match="cup is not an object of the world"):
+        in_world(cup)
+
+
+def test_objects_are_located_relative_to_each_of_the_others(scene: Scene) -> None:
+    scene.cereal.set_pose(Pose([1.3, 0.7, 0.95], yaw_quaternion(math.pi / 2)))
+    food = [ObjectType.MILK, ObjectType.BREAKFAST_CEREAL]
+    found = list(LocatedObjectDescription([scene.cereal, scene.kitchen], types=food))
+    assert [(each.name, each.reference.name) for each in found] == [
+        ("milk", "cereal"),
+        ("milk", "kitchen"),
+        ("cereal", "kitchen"),
+    ]
+    # the milk is 0.3 m along map's y from the cereal, which looks along y: straight ahead of it
+    assert found[0].relative_pose.position == pytest.approx((0.3, 0, -0.05))
+    for each in found:
+        assert each.pose.position == pytest.approx(in_world(each).pose.position)
+    assert in_world(found[0]) is scene.milk
+    milk = LocatedObjectDescription([scene.cereal], names=["milk"]).resolve()
+    assert (milk.name, milk.reference.name) == ("milk", "cereal")
+    with pytest.raises(ObjectNotFound, match="no object is named milk, beside milk; in the world: pr2, kitchen"):
+        LocatedObjectDescription([scene.milk], names=["milk"]).resolve()
