@@ -51,9 +51,9 @@ def about_objects() -> Iterator[Designator]:
     """One of each built-in action that is about an object: about the believed cup."""
     waiting: list[Any] = [ActionAbstract]
     while waiting:
-        kind = waiting.pop()
+        kind: Any = waiting.pop()
         waiting += kind.__subclasses__()
-        if kind.__module__.startswith("pycrorm_async.") and dataclasses.is_dataclass(kind):
+        if kind.__module__.startswith("pycrorm_async.") and "__dataclass_fields__" in vars(kind):
             hints = get_type_hints(kind)
             fields = [each.name for each in dataclasses.fields(kind) if each.init]
             about = [name for name in fields if "ObjectDesignator" in str(hints[name])]
