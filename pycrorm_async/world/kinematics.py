@@ -67,9 +67,17 @@ def forward(
 
 
 def solve(
-    robot: Object, arm: Arms, target: Pose, *, base: Pose | None = None, limits: Limits = Limits.SOFT
+    robot: Object,
+    arm: Arms,
+    target: Pose,
+    *,
+    base: Pose | None = None,
+    torso_height: float | None = None,
+    limits: Limits = Limits.SOFT,
 ) -> dict[str, float]:
     """Joint name → rad for the arm of the robot as it is in its world, or as it would be at `base`; moves nothing.
+
+    With `torso_height` (m) also as it would be with the torso there.
 
     Hard limits are those of the loaded model where they are narrower than the description's.
 
@@ -87,7 +95,7 @@ def solve(
             _narrowed(bound, robot.joint_limits(name))
             for name, bound in zip(arm_description.joints, bounds, strict=True)
         ]
-    height = robot.joint_position(description.torso_joint)
+    height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
     reach = _reach(description, arm_description, target, base=robot.pose if base is None else base, torso_height=height)
     return _solved(arm_description, arm, target, reach, bounds, limits)
 

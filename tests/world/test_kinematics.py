@@ -303,3 +303,14 @@ def test_hard_limits_double_the_default_policys_success_and_allow_grasps_from_ab
     assert 1.7 < hard / soft < 2.2
     assert soft_by_grasp[Grasp.TOP] == 0
     assert hard_by_grasp[Grasp.TOP] > 26
+
+
+def test_with_another_torso_height_the_answer_is_that_of_the_raised_torso_and_nothing_moves() -> None:
+    with BulletWorld():
+        robot = Object("pr2", ObjectType.ROBOT)
+        asked = solve(robot, Arms.LEFT, AHEAD, torso_height=0.25)
+        assert robot.joint_position("torso_lift_joint") == 0
+        assert asked != solve(robot, Arms.LEFT, AHEAD)
+        robot.set_joint_position("torso_lift_joint", 0.25)
+        assert asked == solve(robot, Arms.LEFT, AHEAD)
+        assert asked != solve(robot, Arms.LEFT, AHEAD, torso_height=0.0)
