@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.store.rows import EpisodeRow, StoredEvent
 
-__all__ = ["Dialect", "Birth", "Found", "Migrations", "Progress"]
+__all__ = ["Dialect", "Birth", "Found", "Migrations", "Progress", "RowRefused"]
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; format N is what the first N of them make."""
@@ -31,6 +31,10 @@ class Found(NamedTuple):
 
     log_id: str
     format: int
+
+
+class RowRefused(ValueError):
+    """A row that the database cannot hold: a key that is taken, a value that does not fit its column."""
 
 
 class Dialect(Protocol):
@@ -105,6 +109,34 @@ class Dialect(Protocol):
         ...
 
     async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None: ...
+
+    # --- tables and views made from the log ---------------------------------------------------------------------
+
+    async def make_place(self, connection: AsyncConnection) -> None:
+        """Where tables and views go is there afterwards."""
+        ...
+
+    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
+        """Whether there is a table of that name among them."""
+        ...
+
+    async def replace_views(
+        self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
+    ) -> None:
+        """Name and SQL of each. A view may stand on those before it in `after`."""
+        ...
+
+    async def insert_rows(
+        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        """Raises `RowRefused`."""
+        ...
+
+    async def update_rows(
+        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        """`columns` maps names to SQL types; the first is the id. Raises `RowRefused`."""
+        ...
 
     # --- faults -------------------------------------------------------------------------------------------------
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress
+from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress, RowRefused
 from pycrorm_async.store.postgresql import faults, tables
 from pycrorm_async.store.postgresql import statements as sql
-from pycrorm_async.store.postgresql.engine import LOG_SCHEMA
+from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA
 from pycrorm_async.store.rows import EpisodeRow, StoredEvent
 
 __all__ = ["PostgreSQL"]
@@ -62,14 +64,8 @@ class PostgreSQL:
         return list((await connection.exec_driver_sql(sql.NEW_NUMBERS, (count,))).scalars())
 
     async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None:
-        driver = (await connection.get_raw_connection()).driver_connection
-        assert driver is not None
-        await driver.copy_records_to_table(
-            "event",
-            schema_name=LOG_SCHEMA,
-            columns=sql.EVENT_COLUMNS,
-            records=[(*each[:6], each.payload.decode()) for each in events],
-        )
+        rows = [(*each[:6], each.payload.decode()) for each in events]
+        await _copy(connection, LOG_SCHEMA, "event", sql.EVENT_COLUMNS, rows)
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         rows = [
@@ -112,10 +108,69 @@ class PostgreSQL:
     async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None:
         await connection.exec_driver_sql(sql.PARK, (reason, number))
 
+    # --- tables and views ---------------------------------------------------------------------------------------
+
+    async def make_place(self, connection: AsyncConnection) -> None:
+        await connection.exec_driver_sql(f"CREATE SCHEMA IF NOT EXISTS {TABLES_SCHEMA}")
+
+    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
+        return bool((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).scalar_one())
+
+    async def replace_views(
+        self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
+    ) -> None:
+        """All of them, because views stand on views; readers wait for the few ms, and see all old or all new."""
+        if before == after:
+            return
+        quote = connection.dialect.identifier_preparer.quote
+        if before:
+            await connection.exec_driver_sql(f"DROP VIEW {', '.join(map(quote, before))} CASCADE")
+        for name, text in after.items():
+            await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
+
+    async def insert_rows(
+        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        await _copy(connection, TABLES_SCHEMA, table, columns, rows)
+
+    async def update_rows(
+        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        arrays = ", ".join(f"${place}::{kind}[]" for place, kind in enumerate(columns.values(), 1))
+        changes = ", ".join(f"{column} = change.{column}" for column in list(columns)[1:])
+        with _rows_refused():
+            await connection.exec_driver_sql(
+                f"UPDATE {table} SET {changes}"  # noqa: S608
+                f" FROM unnest({arrays}) AS change ({', '.join(columns)}) WHERE {table}.id = change.id",
+                _arrays(rows, len(columns)),
+            )
+
     # --- faults -------------------------------------------------------------------------------------------------
 
     def ours(self, error: Exception, name: str) -> PycrormError:
         return faults.ours(error, name)
+
+
+async def _copy(
+    connection: AsyncConnection, schema: str, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+) -> None:
+    """COPY, within the transaction that a statement through SQLAlchemy has begun before."""
+    driver = (await connection.get_raw_connection()).driver_connection
+    assert driver is not None
+    with _rows_refused():
+        await driver.copy_records_to_table(table, schema_name=schema, columns=columns, records=rows)
+
+
+@contextmanager
+def _rows_refused() -> Iterator[None]:
+    try:
+        yield
+    except DBAPIError as error:
+        if isinstance(error, DataError | IntegrityError):
+            raise RowRefused(str(error.orig)) from error
+        raise
+    except faults.ROW_FAULTS as error:
+        raise RowRefused(" ".join(str(error).split())) from error
 
 
 async def _rows(kind: Any, connection: AsyncConnection, statement: str, *parameters: Any) -> list[Any]:

@@ -32,7 +32,13 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
     }
     return create_async_engine(
         url.set(drivername="postgresql+asyncpg"),
-        connect_args={"timeout": busy_timeout_s, "command_timeout": ANSWER_S_MAX, "server_settings": settings},
+        connect_args={
+            "timeout": busy_timeout_s,
+            "command_timeout": ANSWER_S_MAX,
+            "server_settings": settings,
+            # A plan that is kept fails once when a view it reads has got a column, which happens with every new type.
+            "prepared_statement_cache_size": 0,
+        },
         pool_size=2,
         pool_pre_ping=True,
         hide_parameters=True,

@@ -7,7 +7,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError
 
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
 
-__all__ = ["FAULTS", "ours"]
+__all__ = ["FAULTS", "ROW_FAULTS", "ours"]
 
 FAULTS: tuple[type[Exception], ...] = (
     DBAPIError,
@@ -17,6 +17,14 @@ FAULTS: tuple[type[Exception], ...] = (
     OSError,
     TimeoutError,
 )
+
+ROW_FAULTS: tuple[type[Exception], ...] = (
+    asyncpg.DataError,
+    asyncpg.IntegrityConstraintViolationError,
+    asyncpg.exceptions._base.DataError,  # noqa: SLF001  what the driver raises before it sends; the name hides another
+    OverflowError,
+)
+"""What says that a row cannot be held."""
 
 _AWAY = (
     "08",  # connection

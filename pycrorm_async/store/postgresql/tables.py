@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 from pycrorm_async.store.postgresql.engine import LOG_SCHEMA as LOG
+from pycrorm_async.store.postgresql.engine import TABLES_SCHEMA as TABLES
 
-__all__ = ["MIGRATIONS", "TABLE_NAMES", "READ_LOG", "INSERT_LOG", "SET_FORMAT", "SERVER_VERSION", "ALONE"]
+__all__ = ["MIGRATIONS", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT", "SERVER_VERSION", "ALONE"]
 
 SERVER_VERSION = "SELECT current_setting('server_version_num')::int"
 
@@ -94,6 +95,7 @@ _FIRST = (
 MIGRATIONS: tuple[tuple[str, ...], ...] = (_FIRST,)
 
 TABLE_NAMES = f"SELECT relname FROM pg_class WHERE relnamespace = to_regnamespace('{LOG}')"  # noqa: S608
+HAS_TABLE = f"SELECT to_regclass(format('{TABLES}.%I', $1::text)) IS NOT NULL"
 READ_LOG = f"SELECT id, format FROM {LOG}.pycrorm_log"  # noqa: S608
 INSERT_LOG = f"INSERT INTO {LOG}.pycrorm_log (one, id, format, created_wall_ns) VALUES (1, $1, $2, $3)"  # noqa: S608
 SET_FORMAT = f"UPDATE {LOG}.pycrorm_log SET format = $1"  # noqa: S608

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import accumulate
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import accumulate, chain
 from typing import Any
 
 import msgspec
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress
+from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress, RowRefused
 from pycrorm_async.store.rows import EpisodeRow, StoredEvent
 from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
@@ -110,11 +111,78 @@ class SQLite:
     async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None:
         await connection.exec_driver_sql(sql.PARK, (reason, number))
 
+    # --- tables and views ---------------------------------------------------------------------------------------
+
+    async def make_place(self, connection: AsyncConnection) -> None:
+        """They are in the same file."""
+
+    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
+        return (await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).first() is not None
+
+    async def replace_views(
+        self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
+    ) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        for name, text in before.items():
+            if after.get(name) != text:
+                await connection.exec_driver_sql(f"DROP VIEW {quote(name)}")
+        for name, text in after.items():
+            if before.get(name) != text:
+                await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
+
+    async def insert_rows(
+        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        into = f"INSERT INTO {quote(table)} ({', '.join(map(quote, columns))}) VALUES "  # noqa: S608
+        with _rows_refused():
+            for part in _parts(rows, len(columns)):
+                await connection.exec_driver_sql(f"{into}{_placeholders(part)}", tuple(chain.from_iterable(part)))
+
+    async def update_rows(
+        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        names = list(columns)[1:]
+        changes = ", ".join(f"{column} = change.column{place}" for place, column in enumerate(names, 2))
+        with _rows_refused():
+            for part in _parts(rows, len(columns)):
+                await connection.exec_driver_sql(
+                    f"UPDATE {table} SET {changes}"  # noqa: S608
+                    f" FROM (VALUES {_placeholders(part)}) AS change WHERE {table}.id = change.column1",
+                    tuple(chain.from_iterable(part)),
+                )
+
     # --- faults -------------------------------------------------------------------------------------------------
 
     def ours(self, error: Exception, name: str) -> PycrormError:
         assert isinstance(error, DBAPIError)
         return faults.ours(error, name)
+
+
+_PARAMETERS_MAX = 8_000
+"""In one statement. SQLite takes 32,766, but is a third slower with so many; with fewer, a busy plan is waited for more
+often."""
+
+
+def _parts(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[Sequence[tuple[Any, ...]]]:
+    size = _PARAMETERS_MAX // columns
+    for start in range(0, len(rows), size):
+        yield rows[start : start + size]
+
+
+def _placeholders(rows: Sequence[tuple[Any, ...]]) -> str:
+    one = f"({', '.join('?' * len(rows[0]))})"
+    return ", ".join([one] * len(rows))
+
+
+@contextmanager
+def _rows_refused() -> Iterator[None]:
+    try:
+        yield
+    except (DataError, IntegrityError) as error:
+        raise RowRefused(str(error.orig)) from error
+    except OverflowError as error:
+        raise RowRefused(str(error)) from error
 
 
 async def _rows(kind: Any, connection: AsyncConnection, statement: str, *parameters: Any) -> list[Any]:
