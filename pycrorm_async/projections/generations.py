@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import msgspec
+from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, Index
 
@@ -25,6 +26,7 @@ from pycrorm_async.projections.tables import (
     physical_name,
 )
 from pycrorm_async.projections.views import view_text
+from pycrorm_async.store.dialects import dialect_of
 
 __all__ = ["Generation", "PROJECTION", "PROJECTION_VERSION", "current_generation", "make_generation", "grow"]
 
@@ -32,20 +34,23 @@ PROJECTION = "tables"
 PROJECTION_VERSION = 2
 """Counts what the fold means: tables of an older version must be rebuilt."""
 
-_CREATE = """
-CREATE TABLE IF NOT EXISTS pycrorm_generation (
+_NOTES = "pycrorm_generation"
+_CREATE = f"""
+CREATE TABLE IF NOT EXISTS {_NOTES} (
  projection TEXT PRIMARY KEY,
  version INTEGER NOT NULL,
  generation INTEGER NOT NULL,
  revision INTEGER NOT NULL,
  layout TEXT NOT NULL,
  views TEXT NOT NULL)"""
-_EXISTS = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = 'pycrorm_generation'"
-_SELECT = "SELECT version, generation, revision, layout, views FROM pycrorm_generation WHERE projection = ?"
-_UPSERT = """
-INSERT INTO pycrorm_generation (projection, version, generation, revision, layout, views) VALUES (?, ?, ?, ?, ?, ?)
+_SELECT = text(
+    f"SELECT version, generation, revision, layout, views FROM {_NOTES} WHERE projection = :projection"  # noqa: S608
+)
+_UPSERT = text(f"""
+INSERT INTO {_NOTES} (projection, version, generation, revision, layout, views)
+VALUES (:projection, :version, :generation, :revision, :layout, :views)
 ON CONFLICT (projection) DO UPDATE SET version = excluded.version, generation = excluded.generation,
- revision = excluded.revision, layout = excluded.layout, views = excluded.views"""
+ revision = excluded.revision, layout = excluded.layout, views = excluded.views""")  # noqa: S608
 
 
 @dataclass(frozen=True)
@@ -60,9 +65,9 @@ class Generation:
 
 async def current_generation(connection: AsyncConnection) -> Generation | None:
     """What people see now; None in a memory without tables. Raises `DatabaseForeign` for another version's."""
-    if (await connection.exec_driver_sql(_EXISTS)).first() is None:
+    if not await dialect_of(connection).has_table(connection, _NOTES):
         return None
-    found = (await connection.exec_driver_sql(_SELECT, (PROJECTION,))).first()
+    found = (await connection.execute(_SELECT, {"projection": PROJECTION})).first()
     if found is None:
         return None
     if found.version != PROJECTION_VERSION:
@@ -80,6 +85,7 @@ async def current_generation(connection: AsyncConnection) -> Generation | None:
 
 async def make_generation(connection: AsyncConnection, number: int) -> Generation:
     """Makes the tables every memory has, in a generation of this number. Nobody sees them before `grow`."""
+    await dialect_of(connection).make_place(connection)
     await connection.exec_driver_sql(_CREATE)
     for name, columns in CORE.items():
         await _make_table(connection, name, columns, number)
@@ -98,7 +104,7 @@ async def grow(connection: AsyncConnection, generation: Generation, layout: Layo
         name: view_text(meaning, connection.dialect)
         for name, meaning in public_views(layout, generation.number).items()
     } | layout.user_views
-    await _replace_views(connection, generation.views, views)
+    await dialect_of(connection).replace_views(connection, generation.views, views)
     grown = replace(generation, revision=generation.revision + 1, layout=layout, views=views)
     await _note(connection, grown)
     return grown
@@ -132,19 +138,13 @@ def _index_named(indexes: set[Index], name: str) -> Index:
     return next(each for each in indexes if each.name == name)
 
 
-async def _replace_views(connection: AsyncConnection, before: dict[str, str], after: dict[str, str]) -> None:
-    quote = connection.dialect.identifier_preparer.quote
-    for name, text in before.items():
-        if after.get(name) != text:
-            await connection.exec_driver_sql(f"DROP VIEW {quote(name)}")
-    for name, text in after.items():
-        if before.get(name) != text:
-            await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
-
-
 async def _note(connection: AsyncConnection, generation: Generation) -> None:
-    layout = msgspec.json.encode(generation.layout).decode()
-    views = msgspec.json.encode(generation.views).decode()
-    await connection.exec_driver_sql(
-        _UPSERT, (PROJECTION, PROJECTION_VERSION, generation.number, generation.revision, layout, views)
-    )
+    noted = {
+        "projection": PROJECTION,
+        "version": PROJECTION_VERSION,
+        "generation": generation.number,
+        "revision": generation.revision,
+        "layout": msgspec.json.encode(generation.layout).decode(),
+        "views": msgspec.json.encode(generation.views).decode(),
+    }
+    await connection.execute(_UPSERT, noted)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
 
-from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, OperationalError
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseError, InternalError
@@ -34,6 +34,8 @@ from pycrorm_async.projections.rows import Rows
 from pycrorm_async.projections.union import unite
 from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
 from pycrorm_async.projections.write import write_rows
+from pycrorm_async.store.dialect import RowRefused
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import advance_folded, park
 from pycrorm_async.store.rows import StoredEvent
@@ -83,6 +85,7 @@ class Projector:
         """
         with self._log.translated():
             async with self._log.engine.begin() as connection:
+                await dialect_of(connection).alone(connection)
                 found = await current_generation(connection)
                 generation = found or await make_generation(connection, 1)
                 layout = generation.layout.with_leaves(mapped_leaves())
@@ -113,12 +116,14 @@ class Projector:
                     await connection.rollback()
                     return 0
             self._generation = written
-        except (DataError, IntegrityError, OverflowError) as error:
-            return await self._fold_apart(events, error)
+        except RowRefused as refusal:
+            return await self._fold_apart(events, refusal)
         return sum(now - before for _, before, now in folded.steps)
 
     async def _write(self, connection: AsyncConnection, folded: _Folded, types: _Types) -> Generation | None:
         """The generation written to; None if the tables or the progress are not what the fold took them to be."""
+        if self._generation is None or types.layout != self._generation.layout:
+            await dialect_of(connection).alone(connection)
         generation = await current_generation(connection)
         if generation is None:
             raise InternalError("the tables are gone: open the memory again")
@@ -128,7 +133,7 @@ class Projector:
         if types.layout != generation.layout:
             try:
                 generation = await grow(connection, generation, types.layout)
-            except OperationalError as error:
+            except DBAPIError as error:
                 if "already exists" not in str(error.orig):
                     raise
                 raise DatabaseError(
@@ -152,7 +157,7 @@ class Projector:
             self._types = types
         return types
 
-    async def _fold_apart(self, events: Sequence[StoredEvent], error: Exception) -> int:
+    async def _fold_apart(self, events: Sequence[StoredEvent], refusal: RowRefused) -> int:
         """The database refused a row of this batch: find the episode it belongs to, and park that one."""
         episodes = [list(each) for _, each in groupby(events, key=attrgetter("number"))]
         if len(episodes) > 1:
@@ -163,8 +168,7 @@ class Projector:
             count = await self._fold_batch(events[:middle])
             return count + (await self._fold_batch(events[middle:]) if count == middle else 0)
         async with self._log.engine.begin() as connection:
-            fault = error.orig if isinstance(error, DBAPIError) else error
-            await park(connection, events[0].number, f"event {events[0].sequence}: the database refuses it: {fault}")
+            await park(connection, events[0].number, f"event {events[0].sequence}: the database refuses it: {refusal}")
         return 0
 
 

@@ -9,7 +9,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from sqlalchemy import ColumnElement, Select, Table, case, cast, column, func, null, select, table, union_all
+from sqlalchemy import (
+    ColumnElement,
+    Select,
+    Table,
+    Text,
+    case,
+    cast,
+    column,
+    func,
+    literal_column,
+    null,
+    select,
+    table,
+    union_all,
+)
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.sql.selectable import CompoundSelect
 
 from pycrorm_async.events.fields import table_name
@@ -24,6 +40,30 @@ View: TypeAlias = Select[Any] | CompoundSelect[Any]
 _event = table("event", column("episode"), column("sequence"), column("payload"))
 _episode = table("episode", column("number"), column("id"))
 _declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
+
+
+class _Member(FunctionElement[str]):
+    """A member of a JSON object that is kept as text, as text itself; an object or a list as JSON."""
+
+    name = "json_member"
+    type = Text()
+    inherit_cache = True
+
+
+@compiles(_Member)
+def _of_text(element: _Member, compiler: Any, **options: Any) -> str:
+    document, name = (compiler.process(each, **options) for each in element.clauses)
+    return f"json_extract({document}, {name})"
+
+
+@compiles(_Member, "postgresql")
+def _of_json(element: _Member, compiler: Any, **options: Any) -> str:
+    document, path = (compiler.process(each, **options) for each in element.clauses)
+    return f"({document}::json ->> {path.replace('$.', '')})"
+
+
+def _member(document: ColumnElement[Any], name: str) -> ColumnElement[str]:
+    return _Member(document, literal_column(f"'$.{name}'"))
 
 
 def public_views(layout: Layout, generation: int) -> dict[str, View]:
@@ -45,7 +85,7 @@ def _process_metadata(core: dict[str, Table], _layout: Layout) -> View:
 
 def _designator_type(_core: dict[str, Table], _layout: Layout) -> View:
     def said(name: str) -> ColumnElement[Any]:
-        return func.json_extract(_declaration.c.payload, f"$.{name}")
+        return _member(_declaration.c.payload, name)
 
     return select(
         _declaration.c.fingerprint,
@@ -66,7 +106,7 @@ def _task_tree_node(core: dict[str, Table], _layout: Layout) -> View:
 def _designator(core: dict[str, Table], layout: Layout) -> View:
     nodes = core["task_tree_node"]
     started = (
-        select(func.json_extract(_event.c.payload, "$.parameters"))
+        select(_member(_event.c.payload, "parameters"))
         .where(_event.c.episode == nodes.c.process_metadata_id)
         .where(_event.c.sequence == nodes.c.id.bitwise_rshift(5).bitwise_and(SEQUENCE_MAX))
         .scalar_subquery()

@@ -19,9 +19,10 @@ from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
 from sqlalchemy.ext.asyncio import AsyncEngine
 
-from pycrorm_async.errors import DatabaseUnavailable, UnknownUrl
+from pycrorm_async.errors import UnknownUrl
+from pycrorm_async.store.postgresql import engine as postgresql
 from pycrorm_async.store.private import private_folder, usual_place
-from pycrorm_async.store.sqlite.engine import make_engine
+from pycrorm_async.store.sqlite import engine as sqlite
 
 __all__ = ["DatabaseAddress", "BUSY_TIMEOUT_S"]
 
@@ -105,8 +106,8 @@ class DatabaseAddress:
         it is a snapshot. Raises `DatabaseUnavailable` for what this version cannot open.
         """
         if not self.is_sqlite:
-            raise DatabaseUnavailable(f"{self}: PostgreSQL is not supported yet by this version")
-        return make_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)
+            return postgresql.make_engine(self._url, read_only=read_only, busy_timeout_s=busy_timeout_s)
+        return sqlite.make_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)
 
     def __str__(self) -> str:
         # Without the query as well: drivers take passwords there.

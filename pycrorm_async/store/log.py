@@ -10,25 +10,23 @@ from __future__ import annotations
 
 import os
 import uuid
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
-from typing import Any
 
-from sqlalchemy.exc import DBAPIError
-from sqlalchemy.ext.asyncio import AsyncEngine
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.errors import DatabaseUnavailable, PycrormError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import append_batch
+from pycrorm_async.store.dialect import Dialect
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.rows import EpisodeRow, StoredEvent
 from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
-from pycrorm_async.store.sqlite import statements as sql
 from pycrorm_async.store.sqlite.engine import BEGIN
-from pycrorm_async.store.sqlite.faults import ours
 
 __all__ = ["EventLog"]
 
@@ -43,7 +41,8 @@ class EventLog:
         self.log_id = log_id
         self._process = os.getpid()
         self._reads = engine.execution_options(**{BEGIN: "BEGIN"})
-        self._file = _identity(address.path)
+        self._dialect = dialect_of(engine)
+        self._file = _identity(address.path) if address.is_sqlite else None
 
     @classmethod
     async def open(
@@ -63,13 +62,15 @@ class EventLog:
         engine = address.engine(read_only=not create, busy_timeout_s=busy_timeout_s)
         name = str(address)
         try:
-            with _translated(name):
+            with _translated(dialect_of(engine), name):
                 if create:
-                    make_file(address.path, name)
+                    if address.is_sqlite:
+                        make_file(address.path, name)
                     birth = Birth(str(uuid.uuid4()), clock.wall_ns())
                     log_id = await make_or_migrate(engine, name, birth=birth)
                 else:
-                    must_exist(address.path, name)
+                    if address.is_sqlite:
+                        must_exist(address.path, name)
                     async with engine.connect() as connection:
                         log_id = await recognise(connection, name)
             return cls(address=address, engine=engine, log_id=log_id)
@@ -80,7 +81,7 @@ class EventLog:
     @contextmanager
     def translated(self) -> Iterator[None]:
         """Inside, a fault of the database is raised as the error of ours it is: for what others do with `engine`."""
-        with _translated(str(self.address)):
+        with _translated(self._dialect, str(self.address)):
             yield
 
     async def close(self) -> None:
@@ -101,9 +102,9 @@ class EventLog:
             return {}
         with self.translated():
             async with self.engine.begin() as connection:
-                refusals = await append_batch(connection, records)
+                refusals = await append_batch(self._dialect, connection, records)
         # SQLite goes on writing into a file that was removed or replaced, where nobody will find it.
-        if _identity(self.address.path) != self._file:
+        if self.address.is_sqlite and _identity(self.address.path) != self._file:
             raise DatabaseUnavailable(f"{self.address}: the file was removed or replaced while it was open")
         return refusals
 
@@ -111,37 +112,45 @@ class EventLog:
 
     async def episodes(self) -> list[EpisodeRow]:
         """Every episode, by number."""
-        return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_EPISODES)]
+        async with self._reading() as connection:
+            return await self._dialect.episodes(connection)
 
     async def episode_number(self, episode: EpisodeId) -> int | None:
         """The number of an episode here; None if nothing of it is stored."""
-        rows = await self._rows(sql.SELECT_EPISODES_BY_ID, f'["{episode_text(episode)}"]')
-        return int(rows[0].number) if rows else None
+        async with self._reading() as connection:
+            found = await self._dialect.episode(connection, episode_text(episode))
+        return found.number if found is not None else None
 
     async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[StoredEvent]:
         """The events of an episode that follow sequence `after`, at most `limit`."""
-        return [StoredEvent._make(row) for row in await self._rows(sql.SELECT_EVENTS, number, after, limit)]
+        async with self._reading() as connection:
+            return await self._dialect.events(connection, number, after=after, limit=limit)
 
     async def unfolded(self, limit: int = 10_000) -> list[StoredEvent]:
         """What the tables do not show yet, by episode and sequence, at most `limit`; nothing of parked episodes."""
-        return [StoredEvent._make(row) for row in await self._rows(sql.SELECT_UNFOLDED, limit)]
+        async with self._reading() as connection:
+            return await self._dialect.unfolded(connection, limit)
 
     async def behind(self) -> list[EpisodeRow]:
         """The episodes of which the tables do not show all; without the parked ones."""
-        return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_BEHIND)]
+        async with self._reading() as connection:
+            return await self._dialect.behind(connection)
 
     async def stopped(self) -> list[EpisodeRow]:
         """The episodes that the log refused something of, or that are parked; the rows say why."""
-        return [EpisodeRow._make(row) for row in await self._rows(sql.SELECT_STOPPED)]
+        async with self._reading() as connection:
+            return await self._dialect.stopped(connection)
 
     async def declarations(self) -> list[bytes]:
         """The payloads of all DesignatorTypeDeclared, in the order of their first arrival."""
-        return [bytes(row[0]) for row in await self._rows(sql.SELECT_DECLARATIONS)]
+        async with self._reading() as connection:
+            return await self._dialect.declarations(connection)
 
-    async def _rows(self, statement: str, *parameters: Any) -> Sequence[Any]:
+    @asynccontextmanager
+    async def _reading(self) -> AsyncIterator[AsyncConnection]:
         with self.translated():
             async with self._reads.connect() as connection:
-                return (await connection.exec_driver_sql(statement, parameters)).all()
+                yield connection
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
@@ -153,8 +162,10 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 @contextmanager
-def _translated(name: str) -> Iterator[None]:
+def _translated(dialect: Dialect, name: str) -> Iterator[None]:
     try:
         yield
-    except DBAPIError as error:
-        raise ours(error, name) from error
+    except PycrormError:
+        raise
+    except dialect.faults as error:
+        raise dialect.ours(error, name) from error

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import msgspec
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.store.sqlite import statements as sql
+from pycrorm_async.store.dialect import Progress
+from pycrorm_async.store.dialects import dialect_of
 
 __all__ = ["advance_folded", "park"]
 
 
-async def advance_folded(connection: AsyncConnection, steps: Sequence[tuple[int, int, int]]) -> bool:
+async def advance_folded(connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
     """Notes (episode number, folded before, folded now) of each episode.
 
     False if one of them is not where the caller believed: someone else folded it, and the caller must roll back.
     """
-    text = msgspec.json.encode(steps).decode()
-    return (await connection.exec_driver_sql(sql.ADVANCE_FOLDED, (text,))).rowcount == len(steps)
+    return await dialect_of(connection).advance_folded(connection, steps) == len(steps)
 
 
 async def park(connection: AsyncConnection, number: int, reason: str | None) -> None:
     """Stops folding an episode, with the reason; None releases it. The log goes on taking its events."""
-    await connection.exec_driver_sql(sql.PARK, (reason, number))
+    await dialect_of(connection).park(connection, number, reason)

@@ -24,7 +24,22 @@ async def stored_and_folded(log: EventLog, records: Sequence[Record]) -> Project
     return projector
 
 
+_KINDS = {"sqlite": {"table": "'table'", "view": "'view'"}, "postgresql": {"table": "'r'", "view": "'v'"}}
+_NAMED = {
+    "sqlite": "SELECT name FROM sqlite_master WHERE type IN ({}) ORDER BY name",
+    "postgresql": "SELECT relname FROM pg_class JOIN pg_namespace AS place ON place.oid = relnamespace"
+    " WHERE nspname IN ('memory', 'pycrorm') AND relkind IN ({}) ORDER BY relname",
+}
+
+
+async def names(log: EventLog, *kinds: str) -> list[str]:
+    """The tables, or the views, or both, that are in the database."""
+    database = log.engine.dialect.name
+    asked = _NAMED[database].format(", ".join(_KINDS[database][each] for each in kinds))
+    return [name for (name,) in await ask(log, asked)]
+
+
 async def all_rows(log: EventLog) -> dict[str, list[tuple[Any, ...]]]:
     """Every table of the first generation, ordered."""
-    names = await ask(log, "SELECT name FROM sqlite_master WHERE type = 'table' AND name LIKE '%\\_\\_1' ESCAPE '\\'")
-    return {name: sorted(await ask(log, f'SELECT * FROM "{name}"'), key=repr) for (name,) in names}
+    tables = [name for name in await names(log, "table") if name.endswith("__1")]
+    return {name: sorted(await ask(log, f'SELECT * FROM "{name}"'), key=repr) for name in tables}

@@ -88,9 +88,7 @@ def folded(script: Script, *types: DesignatorTypeDeclared, number: int = 1) -> R
 def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:
     script = Script()
     thinker = NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
-    script.put(
-        EpisodeStarted("why", "me", "host", "1.2", "3.11.7", "breakfast", "a kitchen", 42, True, thinker)
-    )
+    script.put(EpisodeStarted("why", "me", "host", "1.2", "3.11.7", "breakfast", "a kitchen", 42, True, thinker))
     script.put(EpisodeEnded("FAILED", FailureValue("plans.IKError", "too far")))
     assert rows_of(script, number=7) == {
         "process_metadata": [

@@ -27,7 +27,7 @@ from pycrorm_async.events.happenings import (
 )
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
-from tests.projections.asking import all_rows, ask, stored_and_folded
+from tests.projections.asking import all_rows, ask, names, stored_and_folded
 from tests.projections.script import (
     NAVIGATE,
     PICK_UP,
@@ -148,7 +148,7 @@ async def test_nothing_behind_is_nothing_to_do(log: EventLog) -> None:
         ),
         (
             "refused by the database",
-            "event 3: the database refuses it: Python int too large to convert to SQLite INTEGER",
+            "event 3: the database refuses it: ",
         ),
     ],
 )
@@ -176,8 +176,11 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_g
     first.put(NodeEnded(2, "SUCCEEDED"))
     second.put(NodeStarted("action", 2, name_of(SAYING), {"text": "hi"}))
     projector = await stored_and_folded(log, [*declarations(SAYING, numeric), *mixed(first, second)])
-    assert [(each.number, each.parked) for each in await log.stopped()] == [(1, reason)]
-    assert await ask(log, "SELECT number, folded, head FROM episode") == [(1, 2, 4), (2, 3, 3)]
+    (stopped,) = await log.stopped()
+    assert stopped.number == 1
+    assert stopped.parked is not None
+    assert stopped.parked == reason or (bad.startswith("refused") and stopped.parked.startswith(reason))
+    assert await ask(log, "SELECT number, folded, head FROM episode ORDER BY number") == [(1, 2, 4), (2, 3, 3)]
     assert await ask(log, "SELECT id, status FROM task_tree_node ORDER BY id") == [
         (row(2), "RUNNING"),
         (row(2, number=2), "RUNNING"),
@@ -250,7 +253,9 @@ async def test_several_projectors_show_every_event_once(log: EventLog) -> None:
     await log.append([*declarations(NAVIGATE, PICK_UP, VIA), *mixed(*episodes)])
     counts = await asyncio.gather(*(each.fold_behind() for each in projectors))
     assert sum(counts) == 8 * 17
-    assert await ask(log, "SELECT count(*), sum(status = 'SUCCEEDED') FROM task_tree_node") == [(32, 24)]
+    assert await ask(
+        log, "SELECT count(*), sum(CASE WHEN status = 'SUCCEEDED' THEN 1 ELSE 0 END) FROM task_tree_node"
+    ) == [(32, 24)]
     assert await ask(log, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
 
 
@@ -292,10 +297,10 @@ async def test_text_of_any_kind_arrives_as_it_was(log: EventLog) -> None:
 async def test_opening_again_changes_nothing(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(SAYING), *rich_episode(1).records[:2]])
     before = await ask(log, "SELECT * FROM pycrorm_generation")
-    schema = await ask(log, "SELECT name, sql FROM sqlite_master ORDER BY name")
+    there = await names(log, "table", "view")
     await Projector(log).open()
     assert await ask(log, "SELECT * FROM pycrorm_generation") == before
-    assert await ask(log, "SELECT name, sql FROM sqlite_master ORDER BY name") == schema
+    assert await names(log, "table", "view") == there
 
 
 async def test_tables_of_another_version_are_refused(log: EventLog) -> None:

@@ -25,7 +25,7 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
-from tests.projections.asking import ask, stored_and_folded
+from tests.projections.asking import ask, names, stored_and_folded
 from tests.projections.script import PICK_UP, Script, declarations, declared, field, name_of, pose, row
 
 
@@ -113,16 +113,16 @@ async def test_a_view_cannot_take_a_name_that_is_taken(log: EventLog, name: str)
 
 async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_views(log: EventLog) -> None:
     await Projector(log).open()
-    names = {name for (name,) in await ask(log, "SELECT name FROM sqlite_master WHERE type IN ('table', 'view')")}
-    assert len(names) > 60
-    assert {"event", "pycrorm_generation", "designator", "pose", "pose__1", "PickUpWithContextView"} <= names
+    there = set(await names(log, "table", "view"))
+    assert len(there) > 60
+    assert {"event", "pycrorm_generation", "designator", "pose", "pose__1", "PickUpWithContextView"} <= there
     async with log.engine.connect() as connection:
         generation = await current_generation(connection)
     assert generation is not None
     layout = generation.layout
     # The table of an author's class waits for the designator that will name it.
     waiting = layout.leaves.keys() - {table for each in layout.types.values() for table in each.tables}
-    for name in names - waiting:
+    for name in there - waiting:
         with pytest.raises(Contradictory):
             layout.with_declaration(declared("NobodysAction", name))
         with pytest.raises(CallerError):

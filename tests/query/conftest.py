@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from pathlib import Path
 
 import pytest
 
@@ -10,7 +9,8 @@ from pycrorm_async.store.log import EventLog
 
 
 @pytest.fixture
-async def log(tmp_path: Path) -> AsyncIterator[EventLog]:
-    opened = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"), create=True)
+async def log(database_url: str) -> AsyncIterator[EventLog]:
+    """On each kind of database."""
+    opened = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     yield opened
     await opened.close()

@@ -1,3 +1,5 @@
+"""Logs: `log` runs a test on both kinds of database, `file_log` on SQLite alone."""
+
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
@@ -10,12 +12,24 @@ from pycrorm_async.store.log import EventLog
 
 
 @pytest.fixture
-def address(tmp_path: Path) -> DatabaseAddress:
-    return DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}")
+def address(database_url: str) -> DatabaseAddress:
+    return DatabaseAddress.parse(database_url)
 
 
 @pytest.fixture
 async def log(address: DatabaseAddress) -> AsyncIterator[EventLog]:
     opened = await EventLog.open(address, create=True)
+    yield opened
+    await opened.close()
+
+
+@pytest.fixture
+def file_address(tmp_path: Path) -> DatabaseAddress:
+    return DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}")
+
+
+@pytest.fixture
+async def file_log(file_address: DatabaseAddress) -> AsyncIterator[EventLog]:
+    opened = await EventLog.open(file_address, create=True)
     yield opened
     await opened.close()

@@ -1,16 +1,11 @@
-"""Records for the tests of the store and the writer, and a second look at the file by the driver alone."""
+"""Records for the tests of the store and the writer."""
 
 from __future__ import annotations
-
-import sqlite3
-from collections.abc import Iterable
-from pathlib import Path
-from typing import Any
 
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = ["episode", "record", "run_of", "declaration", "ask"]
+__all__ = ["episode", "record", "run_of", "declaration"]
 
 
 def episode(number: int) -> EpisodeId:
@@ -49,12 +44,3 @@ def run_of(of: EpisodeId, first: int, last: int, *, position: int | None = None)
 
 def declaration(payload: bytes, *, position: int = 1) -> Record:
     return Record(position, None, 0, "DesignatorTypeDeclared", 1, 7, 8, payload)
-
-
-def ask(path: Path, statement: str, parameters: Iterable[Any] = ()) -> list[Any]:
-    """Rows, by a connection of its own that knows nothing of ours."""
-    connection = sqlite3.connect(path)
-    try:
-        return connection.execute(statement, tuple(parameters)).fetchall()
-    finally:
-        connection.close()

@@ -6,8 +6,14 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import OperationalError
 
-from pycrorm_async.errors import DatabaseUnavailable, UnknownUrl
+from pycrorm_async.errors import UnknownUrl
 from pycrorm_async.store.address import DatabaseAddress
+
+
+@pytest.fixture
+def database_url(tmp_path: Path) -> str:
+    """All of this is about files."""
+    return f"sqlite:///{tmp_path / 'memory.db'}"
 
 
 def test_three_slashes_name_a_file_in_the_working_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,13 +62,6 @@ def test_another_url_is_refused_with_what_works_and_without_its_password(url: st
     message = str(caught.value)
     assert message.startswith(f"{reason}; what works: sqlite:///memory.db")
     assert "s3cret" not in message
-
-
-def test_postgresql_is_understood_and_honestly_refused() -> None:
-    address = DatabaseAddress.parse("postgresql://robot:s3cret@lab/memory")
-    with pytest.raises(DatabaseUnavailable) as caught:
-        address.engine()
-    assert str(caught.value) == ("postgresql://robot:***@lab/memory: PostgreSQL is not supported yet by this version")
 
 
 async def test_an_engine_never_makes_a_file_that_is_missing(tmp_path: Path) -> None:

@@ -9,7 +9,8 @@ from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_text
 from pycrorm_async.store.log import EventLog
-from tests.store.making import ask, declaration, episode, record, run_of
+from tests.databases import ask, ask_to_change
+from tests.store.making import declaration, episode, record, run_of
 
 HEADS = "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode ORDER BY number"
 
@@ -18,7 +19,7 @@ def name(number: int) -> str:
     return f"00000000-0000-0000-0000-{number:012x}"
 
 
-async def test_every_column_is_stored_as_it_was_given(log: EventLog) -> None:
+async def test_every_column_is_stored_as_it_was_given(log: EventLog, database_url: str) -> None:
     given = record(
         episode(1),
         1,
@@ -30,7 +31,7 @@ async def test_every_column_is_stored_as_it_was_given(log: EventLog) -> None:
         payload=b'{"name":"milk"}',
     )
     await log.append([given])
-    assert ask(log.address.path, "SELECT * FROM event") == [
+    assert ask(database_url, "SELECT * FROM event ORDER BY episode, sequence") == [
         (1, 1, "ObjectAdded", 3, 1_785_000_000_123_456_789, 9_007_199_254_740_993, '{"name":"milk"}')
     ]
 
@@ -47,31 +48,31 @@ PAYLOADS = [
 ]
 
 
-async def test_a_payload_is_stored_byte_for_byte(log: EventLog) -> None:
+async def test_a_payload_is_stored_byte_for_byte(log: EventLog, database_url: str) -> None:
     await log.append(
         [record(episode(1), sequence, payload=text.encode()) for sequence, text in enumerate(PAYLOADS, start=1)]
     )
-    assert [row[0] for row in ask(log.address.path, "SELECT payload FROM event ORDER BY sequence")] == PAYLOADS
+    assert [row[0] for row in ask(database_url, "SELECT payload FROM event ORDER BY sequence")] == PAYLOADS
     assert [each.payload for each in await log.events(1)] == [text.encode() for text in PAYLOADS]
 
 
-async def test_times_may_be_as_large_and_as_small_as_64_bits(log: EventLog) -> None:
+async def test_times_may_be_as_large_and_as_small_as_64_bits(log: EventLog, database_url: str) -> None:
     await log.append(
         [
             record(episode(1), 1, wall_ns=2**63 - 1, monotonic_ns=-(2**63)),
             record(episode(1), 2, wall_ns=0, monotonic_ns=2**53 + 1),
         ]
     )
-    assert ask(log.address.path, "SELECT wall_ns, monotonic_ns FROM event ORDER BY sequence") == [
+    assert ask(database_url, "SELECT wall_ns, monotonic_ns FROM event ORDER BY sequence") == [
         (9223372036854775807, -9223372036854775808),
         (0, 9007199254740993),
     ]
 
 
-async def test_episodes_are_numbered_in_the_order_in_which_they_appear(log: EventLog) -> None:
+async def test_episodes_are_numbered_in_the_order_in_which_they_appear(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(9), 1, 2), *run_of(episode(3), 1, 1), *run_of(episode(9), 3, 3)])
     await log.append([*run_of(episode(5), 1, 1), *run_of(episode(3), 2, 2)])
-    assert [row[:3] for row in ask(log.address.path, HEADS)] == [
+    assert [row[:3] for row in ask(database_url, HEADS)] == [
         (1, name(9), 3),
         (2, name(3), 2),
         (3, name(5), 1),
@@ -79,46 +80,46 @@ async def test_episodes_are_numbered_in_the_order_in_which_they_appear(log: Even
     assert episode_text(episode(9)) == name(9)
 
 
-async def test_a_batch_of_interleaved_episodes_is_stored_whole(log: EventLog) -> None:
+async def test_a_batch_of_interleaved_episodes_is_stored_whole(log: EventLog, database_url: str) -> None:
     given = [record(episode(which), sequence) for sequence in range(1, 41) for which in (1, 2, 3)]
     assert await log.append(given) == {}
-    stored = ask(log.address.path, "SELECT episode, sequence FROM event ORDER BY episode, sequence")
+    stored = ask(database_url, "SELECT episode, sequence FROM event ORDER BY episode, sequence")
     assert stored == [(which, sequence) for which in (1, 2, 3) for sequence in range(1, 41)]
 
 
-async def test_an_episode_knows_when_it_started_and_ended(log: EventLog) -> None:
+async def test_an_episode_knows_when_it_started_and_ended(log: EventLog, database_url: str) -> None:
     await log.append([record(episode(1), 1, wall_ns=100), record(episode(1), 2, wall_ns=200)])
-    assert ask(log.address.path, HEADS) == [(1, name(1), 2, 0, 100, None, None, None)]
+    assert ask(database_url, HEADS) == [(1, name(1), 2, 0, 100, None, None, None)]
     await log.append([record(episode(1), 3, wall_ns=300, kind="EpisodeEnded")])
-    assert ask(log.address.path, HEADS) == [(1, name(1), 3, 0, 100, 300, None, None)]
+    assert ask(database_url, HEADS) == [(1, name(1), 3, 0, 100, 300, None, None)]
     await log.append([record(episode(1), 4, wall_ns=400, kind="NodeEnded")])
-    assert ask(log.address.path, HEADS) == [(1, name(1), 4, 0, 100, 300, None, None)]
+    assert ask(database_url, HEADS) == [(1, name(1), 4, 0, 100, 300, None, None)]
 
 
-async def test_an_empty_batch_is_no_transaction(log: EventLog) -> None:
-    holder = sqlite3.connect(log.address.path, isolation_level=None)
+async def test_an_empty_batch_is_no_transaction(file_log: EventLog) -> None:
+    holder = sqlite3.connect(file_log.address.path, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
-    assert await log.append([]) == {}
+    assert await file_log.append([]) == {}
     holder.close()
 
 
 # --- twice ----------------------------------------------------------------------------------------------------
 
 
-async def test_a_batch_appended_twice_is_stored_once(log: EventLog) -> None:
+async def test_a_batch_appended_twice_is_stored_once(log: EventLog, database_url: str) -> None:
     given = [declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 5), *run_of(episode(2), 1, 3)]
     await log.append(given)
-    before = ask(log.address.path, "SELECT * FROM event"), ask(log.address.path, HEADS)
+    before = ask(database_url, "SELECT * FROM event ORDER BY episode, sequence"), ask(database_url, HEADS)
     assert await log.append(given) == {}
-    assert (ask(log.address.path, "SELECT * FROM event"), ask(log.address.path, HEADS)) == before
-    assert ask(log.address.path, "SELECT count(*) FROM pycrorm_declaration") == [(1,)]
+    assert (ask(database_url, "SELECT * FROM event ORDER BY episode, sequence"), ask(database_url, HEADS)) == before
+    assert ask(database_url, "SELECT count(*) FROM pycrorm_declaration") == [(1,)]
 
 
-async def test_a_batch_that_overlaps_what_is_stored_adds_what_is_new(log: EventLog) -> None:
+async def test_a_batch_that_overlaps_what_is_stored_adds_what_is_new(log: EventLog, database_url: str) -> None:
     await log.append(run_of(episode(1), 1, 5))
     assert await log.append([*run_of(episode(1), 3, 8), *run_of(episode(1), 7, 9)]) == {}
-    assert ask(log.address.path, "SELECT sequence FROM event ORDER BY sequence") == [(n,) for n in range(1, 10)]
-    assert ask(log.address.path, "SELECT head FROM episode") == [(9,)]
+    assert ask(database_url, "SELECT sequence FROM event ORDER BY sequence") == [(n,) for n in range(1, 10)]
+    assert ask(database_url, "SELECT head FROM episode") == [(9,)]
 
 
 @pytest.mark.parametrize(
@@ -133,10 +134,10 @@ async def test_a_batch_that_overlaps_what_is_stored_adds_what_is_new(log: EventL
     ],
 )
 async def test_another_event_under_a_stored_number_is_damage_and_stores_nothing(
-    log: EventLog, change: dict[str, bytes]
+    log: EventLog, database_url: str, change: dict[str, bytes]
 ) -> None:
     await log.append(run_of(episode(1), 1, 3))
-    before = ask(log.address.path, "SELECT * FROM event")
+    before = ask(database_url, "SELECT * FROM event ORDER BY episode, sequence")
     with pytest.raises(LogDamaged) as caught:
         await log.append(
             [
@@ -146,15 +147,15 @@ async def test_another_event_under_a_stored_number_is_damage_and_stores_nothing(
             ]
         )
     assert (caught.value.episode, caught.value.sequence) == (name(1), 2)
-    assert ask(log.address.path, "SELECT * FROM event") == before
-    assert [row[:3] for row in ask(log.address.path, HEADS)] == [(1, name(1), 3)]
+    assert ask(database_url, "SELECT * FROM event ORDER BY episode, sequence") == before
+    assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(1), 3)]
 
 
-async def test_another_event_under_a_number_of_the_same_batch_is_damage(log: EventLog) -> None:
+async def test_another_event_under_a_number_of_the_same_batch_is_damage(log: EventLog, database_url: str) -> None:
     with pytest.raises(LogDamaged) as caught:
         await log.append([*run_of(episode(1), 1, 3), record(episode(1), 3, payload=b"{}")])
     assert (caught.value.episode, caught.value.sequence) == (name(1), 3)
-    assert ask(log.address.path, "SELECT count(*) FROM event") == [(0,)]
+    assert ask(database_url, "SELECT count(*) FROM event") == [(0,)]
 
 
 async def test_an_event_numbered_zero_is_damage(log: EventLog) -> None:
@@ -165,46 +166,50 @@ async def test_an_event_numbered_zero_is_damage(log: EventLog) -> None:
 # --- refused --------------------------------------------------------------------------------------------------
 
 
-async def test_a_gap_stops_its_episode_before_the_gap_and_no_other(log: EventLog) -> None:
+async def test_a_gap_stops_its_episode_before_the_gap_and_no_other(log: EventLog, database_url: str) -> None:
     refused = await log.append(
         [*run_of(episode(1), 1, 2), *run_of(episode(2), 1, 3), *run_of(episode(1), 5, 6), *run_of(episode(2), 4, 4)]
     )
     reason = "events 3 to 4 did not arrive before event 5"
     assert refused == {episode(1): reason}
-    assert [(row[1], row[2], row[6]) for row in ask(log.address.path, HEADS)] == [
+    assert [(row[1], row[2], row[6]) for row in ask(database_url, HEADS)] == [
         (name(1), 2, reason),
         (name(2), 4, None),
     ]
     assert [(row.id, row.refused) for row in await log.stopped()] == [(name(1), reason)]
 
 
-async def test_an_episode_with_a_gap_goes_on_being_refused_with_its_first_reason_shown(log: EventLog) -> None:
+async def test_an_episode_with_a_gap_goes_on_being_refused_with_its_first_reason_shown(
+    log: EventLog, database_url: str
+) -> None:
     await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 4)])
     refused = await log.append([*run_of(episode(1), 5, 9), *run_of(episode(2), 1, 1)])
     assert refused == {episode(1): "event 3 did not arrive before event 4"}
-    assert ask(log.address.path, "SELECT head FROM episode ORDER BY number") == [(2,), (1,)]
+    assert ask(database_url, "SELECT head FROM episode ORDER BY number") == [(2,), (1,)]
 
 
-async def test_an_episode_that_begins_with_a_gap_is_known_and_refused(log: EventLog) -> None:
+async def test_an_episode_that_begins_with_a_gap_is_known_and_refused(log: EventLog, database_url: str) -> None:
     assert await log.append(run_of(episode(1), 2, 4)) == {episode(1): "event 1 did not arrive before event 2"}
-    assert [row[:3] for row in ask(log.address.path, HEADS)] == [(1, name(1), 0)]
+    assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(1), 0)]
 
 
-async def test_a_refusal_ends_when_the_missing_events_arrive(log: EventLog) -> None:
+async def test_a_refusal_ends_when_the_missing_events_arrive(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 6)])
     assert await log.append(run_of(episode(1), 3, 6)) == {}
-    assert ask(log.address.path, "SELECT head, refused FROM episode") == [(6, None)]
+    assert ask(database_url, "SELECT head, refused FROM episode") == [(6, None)]
     assert await log.stopped() == []
 
 
-async def test_repeating_what_is_stored_says_nothing_about_a_refusal(log: EventLog) -> None:
+async def test_repeating_what_is_stored_says_nothing_about_a_refusal(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 6)])
     assert await log.append(run_of(episode(1), 1, 2)) == {}
-    assert ask(log.address.path, "SELECT head, refused FROM episode") == [(2, "event 3 did not arrive before event 4")]
+    assert ask(database_url, "SELECT head, refused FROM episode") == [(2, "event 3 did not arrive before event 4")]
 
 
 @pytest.mark.parametrize("payload", [b'{"name":"a\x00b"}', b'{"name":"\xff"}', b'{"name":"\xc3', b'"\xed\xa0\x80"'])
-async def test_what_no_database_holds_as_text_stops_its_episode(log: EventLog, payload: bytes) -> None:
+async def test_what_no_database_holds_as_text_stops_its_episode(
+    log: EventLog, database_url: str, payload: bytes
+) -> None:
     refused = await log.append(
         [
             *run_of(episode(2), 1, 2),
@@ -214,64 +219,59 @@ async def test_what_no_database_holds_as_text_stops_its_episode(log: EventLog, p
         ]
     )
     assert refused == {episode(1): "event 2: its payload is not text that a database can hold"}
-    assert [(row[1], row[2]) for row in ask(log.address.path, HEADS)] == [(name(2), 2), (name(1), 1)]
+    assert [(row[1], row[2]) for row in ask(database_url, HEADS)] == [(name(2), 2), (name(1), 1)]
 
 
-async def test_an_episode_number_beyond_the_last_is_refused_and_nothing_else_is(log: EventLog) -> None:
+async def test_an_episode_number_beyond_the_last_is_refused_and_nothing_else_is(
+    log: EventLog, database_url: str
+) -> None:
     await log.append(run_of(episode(1), 1, 1))
-    ask_to_change(log, "INSERT INTO episode (number, id, head, started_wall_ns) VALUES (?, 'x', 0, 0)")
+    taken = f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({EPISODE_NUMBER_MAX}, 'x', 0, 0)"
+    ask_to_change(database_url, taken)
+    if database_url.startswith("postgresql"):  # there, numbers come from a sequence
+        ask_to_change(database_url, f"SELECT setval('pycrorm.episode_number', {EPISODE_NUMBER_MAX})")
     refused = await log.append([*run_of(episode(2), 1, 2), *run_of(episode(1), 2, 3)])
     assert refused == {episode(2): "this memory holds 4,194,303 episodes, the most it can"}
-    assert ask(log.address.path, "SELECT head FROM episode WHERE number = 1") == [(3,)]
-    assert ask(log.address.path, "SELECT count(*) FROM episode") == [(2,)]
+    assert ask(database_url, "SELECT head FROM episode WHERE number = 1") == [(3,)]
+    assert ask(database_url, "SELECT count(*) FROM episode") == [(2,)]
 
 
-def ask_to_change(log: EventLog, statement: str) -> None:
-    connection = sqlite3.connect(log.address.path)
-    connection.execute(statement, (EPISODE_NUMBER_MAX,))
-    connection.commit()
-    connection.close()
-
-
-async def test_an_event_number_beyond_the_last_is_refused(log: EventLog) -> None:
+async def test_an_event_number_beyond_the_last_is_refused(log: EventLog, database_url: str) -> None:
     await log.append(run_of(episode(1), 1, 1))
-    connection = sqlite3.connect(log.address.path)
-    connection.execute("UPDATE episode SET head = ?", (SEQUENCE_MAX - 1,))
-    connection.commit()
-    connection.close()
+    ask_to_change(database_url, f"UPDATE episode SET head = {SEQUENCE_MAX - 1}")
     refused = await log.append(run_of(episode(1), SEQUENCE_MAX, SEQUENCE_MAX + 2))
     assert refused == {episode(1): "event 67108864: an episode holds at most 67,108,863 events"}
-    assert ask(log.address.path, "SELECT head FROM episode") == [(67_108_863,)]
+    assert ask(database_url, "SELECT head FROM episode") == [(67_108_863,)]
 
 
 # --- declarations ---------------------------------------------------------------------------------------------
 
 
-async def test_declarations_are_kept_once_in_the_order_of_their_first_arrival(log: EventLog) -> None:
+async def test_declarations_are_kept_once_in_the_order_of_their_first_arrival(log: EventLog, database_url: str) -> None:
     one, two, three = (json.dumps({"dtype": letter, "ü": "\u2028"}, ensure_ascii=False).encode() for letter in "CAB")
     await log.append([declaration(one), *run_of(episode(1), 1, 2), declaration(two), declaration(one)])
     await log.append([declaration(two), declaration(three)])
     assert await log.declarations() == [one, two, three]
-    assert ask(log.address.path, "SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal") == [
+    assert ask(database_url, "SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal") == [
         (fingerprint(one),),
         (fingerprint(two),),
         (fingerprint(three),),
     ]
 
 
-async def test_a_record_of_the_recorder_that_is_no_declaration_is_damage(log: EventLog) -> None:
+async def test_a_record_of_the_recorder_that_is_no_declaration_is_damage(log: EventLog, database_url: str) -> None:
     odd = declaration(b"{}", position=12)._replace(type="Other")
     with pytest.raises(DamageError, match="record 12 belongs to no episode and is a Other"):
         await log.append([*run_of(episode(1), 1, 2), odd])
-    assert ask(log.address.path, "SELECT count(*) FROM event") == [(0,)]
+    assert ask(database_url, "SELECT count(*) FROM event") == [(0,)]
 
 
 # --- the database is away -------------------------------------------------------------------------------------
 
 
-async def test_a_database_locked_by_another_writer_is_away_and_takes_the_batch_afterwards(log: EventLog) -> None:
-    impatient = await EventLog.open(log.address, create=True, busy_timeout_s=0.05)
-    holder = sqlite3.connect(log.address.path, isolation_level=None)
+async def test_a_database_locked_by_another_writer_is_away_and_takes_the_batch_afterwards(file_log: EventLog) -> None:
+    impatient = await EventLog.open(file_log.address, create=True, busy_timeout_s=0.05)
+    holder = sqlite3.connect(file_log.address.path, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
     with pytest.raises(DatabaseUnavailable, match="database is locked"):
         await impatient.append(run_of(episode(1), 1, 3))
@@ -279,31 +279,31 @@ async def test_a_database_locked_by_another_writer_is_away_and_takes_the_batch_a
     holder.close()
     await impatient.append(run_of(episode(1), 1, 3))
     await impatient.close()
-    assert ask(log.address.path, "SELECT count(*) FROM event") == [(3,)]
+    assert ask(file_log.address.path, "SELECT count(*) FROM event") == [(3,)]
 
 
-async def test_a_file_removed_below_the_log_is_an_unavailable_database_not_a_success(log: EventLog) -> None:
-    await log.append(run_of(episode(1), 1, 3))
-    log.address.path.unlink()
+async def test_a_file_removed_below_the_log_is_an_unavailable_database_not_a_success(file_log: EventLog) -> None:
+    await file_log.append(run_of(episode(1), 1, 3))
+    file_log.address.path.unlink()
     with pytest.raises(DatabaseUnavailable, match="the file was removed or replaced while it was open"):
-        await log.append(run_of(episode(1), 4, 5))
+        await file_log.append(run_of(episode(1), 4, 5))
 
 
 async def test_a_file_replaced_below_the_log_is_an_unavailable_database_not_a_success(
-    log: EventLog,
+    file_log: EventLog,
 ) -> None:
-    await log.append(run_of(episode(1), 1, 3))
-    log.address.path.rename(log.address.path.with_suffix(".old"))
-    log.address.path.touch()
+    await file_log.append(run_of(episode(1), 1, 3))
+    file_log.address.path.rename(file_log.address.path.with_suffix(".old"))
+    file_log.address.path.touch()
     with pytest.raises(DatabaseUnavailable, match="the file was removed or replaced while it was open"):
-        await log.append(run_of(episode(1), 4, 5))
+        await file_log.append(run_of(episode(1), 4, 5))
 
 
-async def test_a_log_replaced_by_garbage_is_reported_as_ours_to_mend(log: EventLog) -> None:
-    await log.append(run_of(episode(1), 1, 3))
-    await log.close()
-    content = bytearray(log.address.path.read_bytes())
+async def test_a_log_replaced_by_garbage_is_reported_as_ours_to_mend(file_log: EventLog) -> None:
+    await file_log.append(run_of(episode(1), 1, 3))
+    await file_log.close()
+    content = bytearray(file_log.address.path.read_bytes())
     content[4096:] = b"\xff" * (len(content) - 4096)
-    log.address.path.write_bytes(content)
+    file_log.address.path.write_bytes(content)
     with pytest.raises(DamageError, match="is damaged: database disk image is malformed"):
-        await log.events(1)
+        await file_log.events(1)

@@ -11,12 +11,22 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
+import pytest
+
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.store.making import ask, episode, run_of
+from tests.databases import ask
+from tests.store.making import episode, run_of
 
 PER_BATCH = 300
+
+
+@pytest.fixture
+def database_url(tmp_path: Path) -> str:
+    """All of this is about files."""
+    return f"sqlite:///{tmp_path / 'memory.db'}"
+
 
 # Imports once, then forks a process for every line it reads: the child appends batches from that number on, for ever.
 APPENDER = """

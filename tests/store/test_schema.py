@@ -11,10 +11,18 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.schema import MIGRATIONS, Birth, make_or_migrate, recognise
-from tests.store.making import ask, declaration, episode, run_of
+from pycrorm_async.store.schema import Birth, make_or_migrate, recognise
+from pycrorm_async.store.sqlite.tables import MIGRATIONS
+from tests.databases import ask
+from tests.store.making import declaration, episode, run_of
 
 ALL_OF_IT = "SELECT type, name, sql FROM sqlite_master ORDER BY type, name"
+
+
+@pytest.fixture
+def database_url(tmp_path: Path) -> str:
+    """All of this is about files."""
+    return f"sqlite:///{tmp_path / 'memory.db'}"
 
 
 async def test_a_new_log_has_an_id_that_stays(address: DatabaseAddress) -> None:

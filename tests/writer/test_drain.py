@@ -15,7 +15,8 @@ from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.drain import Drain
-from tests.store.making import ask, episode, record, run_of
+from tests.databases import ask
+from tests.store.making import episode, record, run_of
 from tests.writer.ends import CountingFold, KeptSource, LosesReplies, Passing
 
 TENS = Settings(batch_events_max=10)

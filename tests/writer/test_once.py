@@ -11,7 +11,8 @@ from pycrorm_async.errors import DatabaseUnavailable, SpoolDamaged
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.once import drain_once
-from tests.store.making import ask, episode, run_of
+from tests.databases import ask
+from tests.store.making import episode, run_of
 from tests.writer.ends import CountingFold, KeptSource, Passing
 
 SETTINGS = Settings(batch_events_max=10)

@@ -25,7 +25,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import park
 from pycrorm_async.writer.ports import Destination, Source
 from pycrorm_async.writer.thread import WriterThread
-from tests.store.making import ask, declaration, episode, record, run_of
+from tests.databases import ask
+from tests.store.making import declaration, episode, record, run_of
 from tests.writer.ends import KeptSource, LosesReplies, Passing, opener
 
 HEADS = "SELECT id, head, folded FROM episode ORDER BY number"

@@ -21,7 +21,8 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.once import drain_once
 from pycrorm_async.writer.thread import WriterThread
-from tests.store.making import ask, episode
+from tests.databases import ask
+from tests.store.making import episode
 from tests.writer.ends import CountingFold, opener
 
 SETTINGS = Settings(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 
-__all__ = ["MIGRATIONS", "USE_WAL", "TABLE_NAMES", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
+__all__ = ["MIGRATIONS", "USE_WAL", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
 
 
 def _refuse(name: str, change: str, table: str) -> str:
@@ -83,6 +83,7 @@ USE_WAL = "PRAGMA journal_mode = WAL"
 TABLE_NAMES = (
     "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
 )
+HAS_TABLE = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?"
 READ_LOG = "SELECT id, format FROM pycrorm_log"
 INSERT_LOG = "INSERT INTO pycrorm_log (one, id, format, created_wall_ns) VALUES (1, ?, ?, ?)"
 SET_FORMAT = "UPDATE pycrorm_log SET format = ?"

@@ -1,0 +1,148 @@
+"""What the log asks of a kind of database: `store.sqlite` and `store.postgresql` answer, nothing else of it differs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, TypeAlias
+
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+
+from pycrorm_async.errors import PycrormError
+from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+
+__all__ = ["Dialect", "Birth", "Found", "Migrations", "Progress", "RowRefused"]
+
+Migrations: TypeAlias = Sequence[Sequence[str]]
+"""Numbered steps; format N is what the first N of them make."""
+
+Progress: TypeAlias = tuple[int, int, int]
+"""An episode's number, how far it was folded, how far it is now."""
+
+
+class Birth(NamedTuple):
+    """What a log gets when it is made: its id, a UUID as text, and the time."""
+
+    log_id: str
+    created_wall_ns: int
+
+
+class Found(NamedTuple):
+    """The log that is in a database already."""
+
+    log_id: str
+    format: int
+
+
+class RowRefused(ValueError):
+    """A row that the database cannot hold: a key that is taken, a value that does not fit its column."""
+
+
+class Dialect(Protocol):
+    """Everything that is given a connection happens within the caller's transaction, in one statement a table."""
+
+    # --- is there a log, and making one -------------------------------------------------------------------------
+
+    migrations: Migrations
+
+    async def prepare(self, engine: AsyncEngine, name: str) -> None:
+        """What must be done outside a transaction before a log is made or grown in a database that is ours or empty."""
+        ...
+
+    async def alone(self, connection: AsyncConnection) -> None:
+        """Until the transaction ends nobody else makes or grows a log here."""
+        ...
+
+    async def look(self, connection: AsyncConnection, name: str) -> Found | None:
+        """The log in this database, None if it is empty. Raises `DatabaseForeign`, `DatabaseUnavailable`."""
+        ...
+
+    async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None: ...
+
+    async def note_format(self, connection: AsyncConnection, format_now: int) -> None: ...
+
+    # --- appending ----------------------------------------------------------------------------------------------
+
+    async def insert_declarations(self, connection: AsyncConnection, named: Sequence[tuple[str, str]]) -> None:
+        """(fingerprint, payload) of each; those that are there already stay as they are."""
+        ...
+
+    async def episodes_by_id(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
+        """Those of them that are there; nobody else changes them before the transaction ends."""
+        ...
+
+    async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
+        """Numbers that no episode has or will have had."""
+        ...
+
+    async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None: ...
+
+    async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
+        """`folded` and `parked` stay as they are."""
+        ...
+
+    async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
+        """The events under these (episode number, sequence), as far as they are there."""
+        ...
+
+    # --- reading ------------------------------------------------------------------------------------------------
+
+    async def episode(self, connection: AsyncConnection, identity: str) -> EpisodeRow | None: ...
+
+    async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
+
+    async def behind(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
+
+    async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
+
+    async def events(
+        self, connection: AsyncConnection, number: int, *, after: int, limit: int
+    ) -> list[StoredEvent]: ...
+
+    async def unfolded(self, connection: AsyncConnection, limit: int) -> list[StoredEvent]: ...
+
+    async def declarations(self, connection: AsyncConnection) -> list[bytes]: ...
+
+    # --- what a projector adds ----------------------------------------------------------------------------------
+
+    async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:
+        """How many of the episodes were where they are said to have been."""
+        ...
+
+    async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None: ...
+
+    # --- tables and views made from the log ---------------------------------------------------------------------
+
+    async def make_place(self, connection: AsyncConnection) -> None:
+        """Where tables and views go is there afterwards."""
+        ...
+
+    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
+        """Whether there is a table of that name among them."""
+        ...
+
+    async def replace_views(
+        self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
+    ) -> None:
+        """Name and SQL of each. A view may stand on those before it in `after`."""
+        ...
+
+    async def insert_rows(
+        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        """Raises `RowRefused`."""
+        ...
+
+    async def update_rows(
+        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        """`columns` maps names to SQL types; the first is the id. Raises `RowRefused`."""
+        ...
+
+    # --- faults -------------------------------------------------------------------------------------------------
+
+    faults: tuple[type[Exception], ...]
+    """What its driver raises, and SQLAlchemy in its name."""
+
+    def ours(self, error: Exception, name: str) -> PycrormError:
+        """The error of ours to raise in its place."""
+        ...

@@ -1,0 +1,182 @@
+"""PostgreSQL's answers to what the log asks; the texts are in `statements` and `tables`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress, RowRefused
+from pycrorm_async.store.postgresql import faults, tables
+from pycrorm_async.store.postgresql import statements as sql
+from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA
+from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+
+__all__ = ["PostgreSQL"]
+
+_SERVER_MIN = 140_000
+
+
+class PostgreSQL:
+    """Implements `Dialect`. Events go by COPY; whoever appends to an episode holds its row until COMMIT."""
+
+    migrations: Migrations = tables.MIGRATIONS
+    faults: tuple[type[Exception], ...] = faults.FAULTS
+
+    # --- making -------------------------------------------------------------------------------------------------
+
+    async def prepare(self, engine: AsyncEngine, name: str) -> None:
+        """Nothing has to be done outside a transaction."""
+
+    async def alone(self, connection: AsyncConnection) -> None:
+        await connection.exec_driver_sql(tables.ALONE)
+
+    async def look(self, connection: AsyncConnection, name: str) -> Found | None:
+        version = (await connection.exec_driver_sql(tables.SERVER_VERSION)).scalar_one()
+        if version < _SERVER_MIN:
+            raise DatabaseUnavailable(f"{name}: PostgreSQL 14 or newer is needed, this is {version // 10_000}")
+        names = set((await connection.exec_driver_sql(tables.TABLE_NAMES)).scalars())
+        if not names:
+            return None
+        if "pycrorm_log" not in names:
+            raise DatabaseForeign(f"{name} has a schema {LOG_SCHEMA!r} of another program: it has no pycrorm_log")
+        return Found._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
+
+    async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
+        await connection.exec_driver_sql(tables.INSERT_LOG, (birth.log_id, format_now, birth.created_wall_ns))
+
+    async def note_format(self, connection: AsyncConnection, format_now: int) -> None:
+        await connection.exec_driver_sql(tables.SET_FORMAT, (format_now,))
+
+    # --- appending ----------------------------------------------------------------------------------------------
+
+    async def insert_declarations(self, connection: AsyncConnection, named: Sequence[tuple[str, str]]) -> None:
+        await connection.exec_driver_sql(sql.INSERT_DECLARATIONS, _arrays(named, 2))
+
+    async def episodes_by_id(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES_BY_ID, list(ids))
+
+    async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
+        return list((await connection.exec_driver_sql(sql.NEW_NUMBERS, (count,))).scalars())
+
+    async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None:
+        rows = [(*each[:6], each.payload.decode()) for each in events]
+        await _copy(connection, LOG_SCHEMA, "event", sql.EVENT_COLUMNS, rows)
+
+    async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
+        rows = [
+            (each.number, each.id, each.head, each.started_wall_ns, each.ended_wall_ns, each.refused)
+            for each in sorted(episodes)
+        ]
+        await connection.exec_driver_sql(sql.UPSERT_EPISODES, _arrays(rows, 6))
+
+    async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_STORED_AGAIN, *_arrays(keys, 2))
+
+    # --- reading ------------------------------------------------------------------------------------------------
+
+    async def episode(self, connection: AsyncConnection, identity: str) -> EpisodeRow | None:
+        return next(iter(await _rows(EpisodeRow, connection, sql.SELECT_EPISODE_BY_ID, identity)), None)
+
+    async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES)
+
+    async def behind(self, connection: AsyncConnection) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_BEHIND)
+
+    async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_STOPPED)
+
+    async def events(self, connection: AsyncConnection, number: int, *, after: int, limit: int) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
+
+    async def unfolded(self, connection: AsyncConnection, limit: int) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_UNFOLDED, limit)
+
+    async def declarations(self, connection: AsyncConnection) -> list[bytes]:
+        return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
+
+    # --- folding ------------------------------------------------------------------------------------------------
+
+    async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:
+        return (await connection.exec_driver_sql(sql.ADVANCE_FOLDED, _arrays(steps, 3))).rowcount
+
+    async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None:
+        await connection.exec_driver_sql(sql.PARK, (reason, number))
+
+    # --- tables and views ---------------------------------------------------------------------------------------
+
+    async def make_place(self, connection: AsyncConnection) -> None:
+        await connection.exec_driver_sql(f"CREATE SCHEMA IF NOT EXISTS {TABLES_SCHEMA}")
+
+    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
+        return bool((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).scalar_one())
+
+    async def replace_views(
+        self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
+    ) -> None:
+        """All of them, because views stand on views; readers wait for the few ms, and see all old or all new."""
+        if before == after:
+            return
+        quote = connection.dialect.identifier_preparer.quote
+        if before:
+            await connection.exec_driver_sql(f"DROP VIEW {', '.join(map(quote, before))} CASCADE")
+        for name, text in after.items():
+            await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
+
+    async def insert_rows(
+        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        await _copy(connection, TABLES_SCHEMA, table, columns, rows)
+
+    async def update_rows(
+        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        arrays = ", ".join(f"${place}::{kind}[]" for place, kind in enumerate(columns.values(), 1))
+        changes = ", ".join(f"{column} = change.{column}" for column in list(columns)[1:])
+        with _rows_refused():
+            await connection.exec_driver_sql(
+                f"UPDATE {table} SET {changes}"  # noqa: S608
+                f" FROM unnest({arrays}) AS change ({', '.join(columns)}) WHERE {table}.id = change.id",
+                _arrays(rows, len(columns)),
+            )
+
+    # --- faults -------------------------------------------------------------------------------------------------
+
+    def ours(self, error: Exception, name: str) -> PycrormError:
+        return faults.ours(error, name)
+
+
+async def _copy(
+    connection: AsyncConnection, schema: str, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+) -> None:
+    """COPY, within the transaction that a statement through SQLAlchemy has begun before."""
+    driver = (await connection.get_raw_connection()).driver_connection
+    assert driver is not None
+    with _rows_refused():
+        await driver.copy_records_to_table(table, schema_name=schema, columns=columns, records=rows)
+
+
+@contextmanager
+def _rows_refused() -> Iterator[None]:
+    try:
+        yield
+    except DBAPIError as error:
+        if isinstance(error, DataError | IntegrityError):
+            raise RowRefused(str(error.orig)) from error
+        raise
+    except faults.ROW_FAULTS as error:
+        raise RowRefused(" ".join(str(error).split())) from error
+
+
+async def _rows(kind: Any, connection: AsyncConnection, statement: str, *parameters: Any) -> list[Any]:
+    return [kind._make(row) for row in await connection.exec_driver_sql(statement, parameters)]
+
+
+def _arrays(rows: Sequence[tuple[Any, ...]], columns: int) -> tuple[list[Any], ...]:
+    """Rows as one array a column, which is how a statement takes many."""
+    return tuple([row[column] for row in rows] for column in range(columns))

