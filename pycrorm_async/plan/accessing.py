@@ -1,4 +1,4 @@
-"""Which joint a handle moves, how far it opens, and where the handle and the hand on it pass on the way.
+"""Which joint a handle moves, how far it opens, how a hand takes it, and where handle and hand pass on the way.
 
 The same functions serve the motions that open and close and the search for a place to stand, so that what is
 offered is what will be done. Pure geometry in the map, metres and rad; nothing is moved.
@@ -7,13 +7,14 @@ offered is what will be done. Pure geometry in the map, metres and rad; nothing 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from pycrorm_async.plan.failures import EnvironmentManipulationImpossible
 from pycrorm_async.plan.objects import ObjectLike, ObjectPart, in_world
 from pycrorm_async.world.enums import JointType
 from pycrorm_async.world.objects import Object
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.pose import Pose, rotated
 
 __all__ = [
     "OPENING_MARGIN",
@@ -21,8 +22,11 @@ __all__ = [
     "STEP_RAD_MAX",
     "Handle",
     "closed_position",
+    "grasp_pose",
+    "hand_poses",
     "handle_of",
     "handle_poses",
+    "hold",
     "moved_position",
     "opened_position",
 ]
@@ -114,9 +118,55 @@ def handle_poses(handle: Handle, goal: float, start: float | None = None) -> lis
     ]
 
 
+def hold(handle: Handle) -> Pose:
+    """How a hand takes the handle: the tool frame as seen from the handle's.
+
+    What slides is taken from the front: the hand is turned as the handle is. What swings is taken from the side
+    of the hinge: the hand is turned by a right angle about the hinge's axis, and points away from the hinge. For
+    on its way a door turns the hand, and one that began straight could not follow it from any place before it.
+    """
+    if handle.whole.joint_type(handle.joint) is JointType.PRISMATIC:
+        return Pose()
+    # seen from the handle, half a turn of the joint brings it to the other side of the hinge
+    now = handle.whole.link_pose(handle.link)
+    opposite = handle.whole.link_pose_at(handle.link, {handle.joint: handle.position + math.pi}).relative_to(now)
+    x, y, z, _ = opposite.orientation
+    from_hinge = [-across / 2 for across in opposite.position]
+    for side in (1.0, -1.0):
+        turn = Pose(orientation=(side * x, side * y, side * z, 1.0))
+        if _dot(rotated(turn.orientation, (1.0, 0.0, 0.0)), from_hinge) > 0.0:
+            break
+    return turn
+
+
+def hand_poses(handle: Handle, goal: float, start: float | None = None) -> list[Pose]:
+    """As `handle_poses`, of the tool frame of a hand that took the handle as `hold` says."""
+    taken = hold(handle)
+    return [each @ taken for each in handle_poses(handle, goal, start)]
+
+
+def grasp_pose(wanted: ObjectLike) -> Pose:
+    """Where the tool frame has to be to grasp it: in the frame of an object; of a handle as `hold` says.
+
+    Raises:
+        PerceptionObjectNotInWorld: it is not in the world, or what it is part of is not.
+        UnknownLink: there is no such part.
+    """
+    if not isinstance(wanted, ObjectPart):
+        return in_world(wanted).pose
+    whole = in_world(wanted.part_of)
+    if not whole.joints_above(wanted.name):
+        return whole.link_pose(wanted.name)
+    return whole.link_pose(wanted.name) @ hold(handle_of(wanted))
+
+
 def _limits(handle: Handle) -> tuple[float, float]:
     lower, upper = handle.whole.joint_limits(handle.joint)
     if not math.isfinite(upper - lower):
         message = f"{handle.joint} turns without end: there is no open and no closed"
         raise EnvironmentManipulationImpossible(message, handle.link, handle.joint)
     return lower, upper
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return sum(x * y for x, y in zip(a, b, strict=True))

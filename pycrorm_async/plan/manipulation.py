@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pycrorm_async.plan.accessing import handle_of
+from pycrorm_async.plan.accessing import grasp_pose, handle_of
 from pycrorm_async.plan.actions import CheckedAction
 from pycrorm_async.plan.failures import (
     EndEffectorFailure,
@@ -21,6 +21,7 @@ from pycrorm_async.plan.grasping import HOLD_DISTANCE_M_MAX, approached, between
 from pycrorm_async.plan.here import RobotHere, robot_here
 from pycrorm_async.plan.motions import ClosingMotion, MoveGripperMotion, MoveTCPMotion, OpeningMotion
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart, in_world
+from pycrorm_async.plan.resources import Resource, reaching
 from pycrorm_async.world.enums import Arms, GripperState
 from pycrorm_async.world.objects import Object
 
@@ -52,6 +53,9 @@ class GripActionPerformable(CheckedAction):
     gripper: Arms
     object_designator: ObjectDesignator | Object
     effort: float
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.gripper)
 
     async def perform(self) -> None:
         robot = robot_here()
@@ -87,6 +91,9 @@ class ReleaseActionPerformable(CheckedAction):
     gripper: Arms
     object_designator: ObjectDesignator | Object
 
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.gripper)
+
     async def perform(self) -> None:
         robot = robot_here()
         tool_frame = robot.one_arm(self.gripper).tool_frame
@@ -101,7 +108,8 @@ class ReleaseActionPerformable(CheckedAction):
 class GraspingActionPerformable(CheckedAction):
     """Close the gripper around an object or a handle, coming straight along the way it will point; nothing is attached.
 
-    The tool frame ends in the frame of the object, or of the handle, turned like it.
+    The tool frame ends in the frame of the object or the handle, turned like it; on the handle of a door it comes
+    from the side of the hinge.
 
     Raises:
         IKError: it is out of reach, or the place 0.1 m before it is.
@@ -115,13 +123,13 @@ class GraspingActionPerformable(CheckedAction):
     arm: Arms
     object_desig: ObjectDesignator | Object
 
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
     async def perform(self) -> None:
         robot = robot_here()
-        robot.one_arm(self.arm)
-        wanted = self.object_desig
-        in_world(wanted.part_of if isinstance(wanted, ObjectPart) else wanted)
+        goal = grasp_pose(self.object_desig)
         _check_free(robot, self.arm)
-        goal = wanted.pose
         await MoveTCPMotion(approached(goal), self.arm).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(goal, self.arm, allow_gripper_collision=True).perform()
@@ -132,7 +140,7 @@ class GraspingActionPerformable(CheckedAction):
 class OpenActionPerformable(CheckedAction):
     """Open a drawer or a door by its handle, up to 0.05 m or rad before its end; the open hand stays at the handle.
 
-    For the built-in kitchen's fridge see `OpeningMotion`.
+    Where to stand for that, `AccessingLocation` knows.
 
     Raises:
         EnvironmentManipulationImpossible: no joint moves the handle.
@@ -144,6 +152,9 @@ class OpenActionPerformable(CheckedAction):
 
     object_designator: ObjectPart
     arm: Arms
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
 
     async def perform(self) -> None:
         handle_of(self.object_designator)
@@ -160,6 +171,9 @@ class CloseActionPerformable(CheckedAction):
 
     object_designator: ObjectPart
     arm: Arms
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
 
     async def perform(self) -> None:
         handle_of(self.object_designator)

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from pycrorm_async.plan import ObjectDesignator, ObjectPart
-from pycrorm_async.plan.accessing import Handle, closed_position, handle_of, handle_poses, opened_position
+from pycrorm_async.plan.accessing import (
+    Handle,
+    closed_position,
+    grasp_pose,
+    hand_poses,
+    handle_of,
+    handle_poses,
+    opened_position,
+)
 from pycrorm_async.plan.failures import EnvironmentManipulationImpossible, PerceptionObjectNotInWorld
 from pycrorm_async.world import Object, ObjectType, Pose
 from pycrorm_async.world.errors import UnknownLink
@@ -59,6 +67,41 @@ def test_a_doors_handle_goes_round_the_hinge_and_turns_with_the_door(
         expected = matrix(scene.kitchen.pose) @ shifted(1.05, -1.25, 0) @ turned(Z, angle) @ shifted(-0.10, 0.59, 0.95)
         np.testing.assert_allclose(matrix(pose), expected, atol=1e-9)
     assert scene.kitchen.joint_position(door.joint) == 0.0
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, 1.85])
+def test_a_hand_takes_a_drawer_from_the_front_and_a_door_from_the_side_of_its_hinge(scene: Scene, angle: float) -> None:
+    scene.kitchen.set_pose(Pose([0.1, -0.2, 0.0], [0, 0, 0.6, 0.8]))
+    scene.kitchen.set_joint_position("fridge_door_joint", angle)
+    drawer = ObjectPart(DRAWER, scene.kitchen)
+    assert grasp_pose(drawer) == drawer.pose
+    hinge = matrix(scene.kitchen.pose) @ shifted(1.05, -1.25, 0)
+    # in the closed door's axes x points into the fridge, y from the hinge to the handle
+    taken = shifted(-0.10, 0.59, 0.95) @ turned(Z, math.pi / 2)
+    np.testing.assert_allclose(
+        matrix(grasp_pose(ObjectPart(FRIDGE, scene.kitchen))), hinge @ turned(Z, angle) @ taken, atol=1e-9
+    )
+    way = hand_poses(handle_of(ObjectPart(FRIDGE, scene.kitchen)), 1.0, 0.5)
+    for number, pose in enumerate(way):
+        np.testing.assert_allclose(matrix(pose), hinge @ turned(Z, 0.5 + 0.1 * number) @ taken, atol=1e-9)
+    assert len(way) == 6
+
+
+def test_a_door_that_is_hinged_on_the_other_side_is_taken_from_there(scene: Scene) -> None:
+    mirrored = scene.kitchen.description_text.replace('xyz="-0.1 0.59 0.95"', 'xyz="-0.1 -0.59 0.95"')
+    cupboard = Object("cupboard", ObjectType.ENVIRONMENT, mirrored)
+    expected = shifted(1.05, -1.25, 0) @ shifted(-0.10, -0.59, 0.95) @ turned(Z, -math.pi / 2)
+    np.testing.assert_allclose(matrix(grasp_pose(ObjectPart(FRIDGE, cupboard))), expected, atol=1e-9)
+
+
+def test_things_and_parts_that_nothing_moves_are_taken_as_they_are(scene: Scene) -> None:
+    scene.milk.set_pose(Pose([1.3, 1, 0.9], [0.1, 0.2, 0.3, 0.9]))
+    assert grasp_pose(scene.milk) == scene.milk.pose
+    tap = ObjectPart("sink_area_tap", scene.kitchen)
+    assert grasp_pose(tap) == tap.pose
+    scene.world.remove(scene.milk)
+    with pytest.raises(PerceptionObjectNotInWorld, match="milk"):
+        grasp_pose(scene.milk)
 
 
 def test_what_cannot_be_opened_is_said_in_one_line(scene: Scene) -> None:
