@@ -1,0 +1,107 @@
+"""What the tests of promises begin with: a scene in a real Bullet world, a memory in a file, and its answers."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from sqlalchemy import Select, select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.orm import Pose as PoseRow
+from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.plan import ActionAbstract, simulated_robot
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+
+MILK_AT = (1.3, 1.0, 0.9)
+CEREAL_AT = (1.3, 0.7, 0.95)
+WITHIN_REACH = Pose([0.6, 0.9, 0])
+"""Where the left arm reaches the milk from the front."""
+
+
+class Lab(NamedTuple):
+    world: BulletWorld
+    robot: Object
+    milk: Object
+    cereal: Object
+
+
+@contextmanager
+def lab() -> Iterator[Lab]:
+    """Robot at the origin, milk and cereal where the thesis has them, nothing below them; motions are simulated."""
+    with BulletWorld() as world, simulated_robot:
+        yield Lab(
+            world,
+            Object("pr2", ObjectType.ROBOT),
+            Object("milk", ObjectType.MILK, pose=Pose(MILK_AT)),
+            Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose(CEREAL_AT)),
+        )
+
+
+@dataclass
+class FailingActionPerformable(ActionAbstract):
+    """Fails with what it is given."""
+
+    _failure: BaseException
+
+    async def perform(self) -> None:
+        raise self._failure
+
+
+def url_of(folder: Path) -> str:
+    return f"sqlite:///{folder}/memory.db"
+
+
+@asynccontextmanager
+async def remembered(folder: Path) -> AsyncIterator[Memory]:
+    """A memory with an episode open; when left, all is in the tables, nothing failed to be recorded."""
+    async with Memory.open(url_of(folder)) as memory:
+        async with memory.episode(description="a test"):
+            yield memory
+        await memory.flush()
+        assert memory.status.faults.total == 0, memory.status.faults.last
+
+
+async def every(memory: Memory | Reading, statement: Select[Any]) -> list[Any]:
+    """All that the question gives, of one column or class."""
+    async with memory.session() as session:
+        return list((await session.scalars(statement)).unique().all())
+
+
+async def asked(folder: Path, statement: Select[Any]) -> list[Any]:
+    """The same of a memory that is closed."""
+    async with Reading.open(url_of(folder)) as reading:
+        return await every(reading, statement)
+
+
+async def nodes_of(folder: Path) -> list[TaskTreeNode]:
+    """Every node of the memory, roots included, in the order they started."""
+    return await asked(folder, select(TaskTreeNode).order_by(TaskTreeNode.id))
+
+
+def statuses(nodes: list[TaskTreeNode]) -> list[tuple[str | None, str]]:
+    return [(node.dtype, node.status.name) for node in nodes]
+
+
+def at(row: PoseRow | None) -> tuple[float, float, float]:
+    """The position of a recorded pose."""
+    assert row is not None
+    return (row.x, row.y, row.z)
+
+
+def turned(row: PoseRow) -> tuple[float, float, float, float]:
+    """The orientation of a recorded pose."""
+    return (row.qx, row.qy, row.qz, row.qw)
+
+
+def written(pose: Pose) -> Mapping[str, Any]:
+    """A pose as it stands among the arguments of a failure, reckoned by hand."""
+    return {
+        "position": list(pose.position),
+        "orientation": list(pose.orientation),
+        "frame": pose.frame,
+        "time_ns": pose.time_ns,
+    }
