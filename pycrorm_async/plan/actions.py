@@ -27,6 +27,7 @@ from pycrorm_async.plan.motions import (
 )
 from pycrorm_async.plan.objects import ObjectDesignator, in_world
 from pycrorm_async.plan.properties import check_properties
+from pycrorm_async.plan.resources import Resource, arms, reaching
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, yaw_quaternion
@@ -59,6 +60,9 @@ class MoveTorsoActionPerformable(CheckedAction):
 
     position: float
 
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.TORSO})
+
     async def perform(self) -> None:
         await MoveJointsMotion([robot_here().description.torso_joint], [self.position]).perform()
 
@@ -72,6 +76,9 @@ class SetGripperActionPerformable(CheckedAction):
     gripper: Arms
     motion: GripperState
 
+    def resources(self) -> frozenset[Resource]:
+        return arms(self.gripper)
+
     async def perform(self) -> None:
         await MoveGripperMotion(self.motion, self.gripper).perform()
 
@@ -83,6 +90,9 @@ class ParkArmsActionPerformable(CheckedAction):
     concept: ClassVar[str | None] = "ParkingArms"
 
     arm: Arms
+
+    def resources(self) -> frozenset[Resource]:
+        return arms(self.arm)
 
     async def perform(self) -> None:
         parked = {arm: dict(each.park) for arm, each in robot_here().each_arm(self.arm).items()}
@@ -97,6 +107,9 @@ class NavigateActionPerformable(CheckedAction):
 
     target_location: Pose
 
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.BASE})
+
     async def perform(self) -> None:
         await MoveMotion(self.target_location).perform()
 
@@ -108,6 +121,9 @@ class LookAtActionPerformable(CheckedAction):
     concept: ClassVar[str | None] = "LookingAt"
 
     target: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.HEAD})
 
     async def perform(self) -> None:
         await LookingMotion(self.target).perform()
@@ -130,6 +146,9 @@ class PickUpActionPerformable(CheckedAction):
     object_designator: ObjectDesignator | Object
     arm: Arms
     grasp: Grasp
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
 
     async def perform(self) -> None:
         robot = robot_here()
@@ -162,6 +181,9 @@ class PlaceActionPerformable(CheckedAction):
     arm: Arms
     target_location: Pose
 
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
     async def perform(self) -> None:
         robot = robot_here()
         body, held = robot.body, in_world(self.object_designator)
@@ -183,6 +205,9 @@ class FaceAtPerformable(CheckedAction):
 
     pose: Pose
 
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.BASE, Resource.HEAD})
+
     async def perform(self) -> None:
         here = robot_here().body.pose
         dx, dy = self.pose.position.x - here.position.x, self.pose.position.y - here.position.y
@@ -201,6 +226,9 @@ class MoveAndPickUpPerformable(CheckedAction):
     object_designator: ObjectDesignator | Object
     arm: Arms
     grasp: Grasp
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm) | {Resource.HEAD}
 
     async def perform(self) -> None:
         await NavigateActionPerformable(self.standing_position).perform()

@@ -17,9 +17,10 @@ import inspect
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
-from pycrorm_async.plan.errors import PerformNotAsync
+from pycrorm_async.plan.errors import PerformNotAsync, ResourcesNotAMethod
 from pycrorm_async.plan.performing import as_node, is_node
 from pycrorm_async.plan.properties import check_properties
+from pycrorm_async.plan.resources import NOTHING, Resource
 from pycrorm_async.plan.task_tree import NodeKind
 
 __all__ = ["Designator", "ActionAbstract", "BaseMotion"]
@@ -37,6 +38,7 @@ class Designator(ABC):
 
     Raises:
         PerformNotAsync: at the definition of a class whose `perform` is not a coroutine function.
+        ResourcesNotAMethod: at the definition of a class that has a field of that name.
     """
 
     kind: ClassVar[NodeKind]
@@ -49,6 +51,8 @@ class Designator(ABC):
         own = vars(cls)
         if not isinstance(own.get("dtype"), str):
             cls.dtype = cls._name_in_memory()
+        if "resources" in own.get("__annotations__", ()) or not callable(own.get("resources", len)):
+            raise ResourcesNotAMethod(cls.__qualname__)
         perform = own.get("perform")
         if perform is None or is_node(perform):  # dataclass(slots=True) makes the class anew, hook and all
             return
@@ -63,6 +67,10 @@ class Designator(ABC):
     @abstractmethod
     async def perform(self) -> Any:
         """Do it; return when it is done. Raises a `PlanFailure` when it cannot be done."""
+
+    def resources(self) -> frozenset[Resource]:
+        """The parts of the robot it needs for itself from its start to its end; those of its parts are their affair."""
+        return NOTHING
 
 
 class ActionAbstract(Designator):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["PerformNotAsync", "ResolutionError", "NoRobotChosen", "NoRobotHere"]
+__all__ = ["PerformNotAsync", "ResourcesNotAMethod", "ResolutionError", "NoRobotChosen", "NoRobotHere"]
 
 
 class PerformNotAsync(CallerError, TypeError):
@@ -14,6 +14,16 @@ class PerformNotAsync(CallerError, TypeError):
 
     def __init__(self, designator: str) -> None:
         super().__init__(f"{designator}.perform must be declared as `async def perform(self)`")
+        self.designator = designator
+
+
+class ResourcesNotAMethod(CallerError, TypeError):
+    """A designator class has `resources` that cannot be asked: a field, or a value."""
+
+    def __init__(self, designator: str) -> None:
+        super().__init__(
+            f"{designator}.resources must be a method that returns a frozenset of Resource: rename the field"
+        )
         self.designator = designator
 
 

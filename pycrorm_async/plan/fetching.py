@@ -21,6 +21,7 @@ from pycrorm_async.plan.here import robot_here
 from pycrorm_async.plan.locations import CostmapLocation
 from pycrorm_async.plan.motions import DetectingMotion
 from pycrorm_async.plan.objects import ObjectDesignator, in_world
+from pycrorm_async.plan.resources import Resource, reaching
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
@@ -38,6 +39,9 @@ class DetectActionPerformable(CheckedAction):
     concept: ClassVar[str | None] = "LookingFor"
 
     object_designator: ObjectDesignator | Object
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.HEAD})
 
     async def perform(self) -> ObjectDesignator:
         return await DetectingMotion(self.object_designator.object_type).perform()
@@ -62,6 +66,9 @@ class TransportActionPerformable(CheckedAction):
     object_designator: ObjectDesignator | Object
     arm: Arms
     target_location: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(Arms.BOTH)
 
     async def perform(self) -> None:
         robot = robot_here()

@@ -15,9 +15,11 @@ from pycrorm_async.plan.errors import ResolutionError
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
 from pycrorm_async.plan.perceiving import perceived
 from pycrorm_async.plan.process_modules import chosen_robot
+from pycrorm_async.plan.resources import NOTHING, Resource, arms, moving, reaching
 from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.watch import current_world
 
 __all__ = [
     "MoveMotion",
@@ -42,6 +44,9 @@ class MoveMotion(BaseMotion):
 
     target: Pose
 
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.BASE})
+
     async def perform(self) -> None:
         await chosen_robot(self, "navigate").navigate(self)
 
@@ -61,6 +66,9 @@ class MoveTCPMotion(BaseMotion):
     arm: Arms
     allow_gripper_collision: bool | None = None
 
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
     async def perform(self) -> None:
         await chosen_robot(self, "move_tcp").move_tcp(self)
 
@@ -72,6 +80,9 @@ class LookingMotion(BaseMotion):
     concept: ClassVar[str | None] = "LookingAt"
 
     target: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.HEAD})
 
     async def perform(self) -> None:
         await chosen_robot(self, "looking").looking(self)
@@ -87,6 +98,9 @@ class MoveGripperMotion(BaseMotion):
     gripper: Arms
     allow_gripper_collision: bool | None = None
 
+    def resources(self) -> frozenset[Resource]:
+        return arms(self.gripper)
+
     async def perform(self) -> None:
         await chosen_robot(self, "move_gripper").move_gripper(self)
 
@@ -99,6 +113,10 @@ class MoveArmJointsMotion(BaseMotion):
 
     left_arm_poses: dict[str, float] | None = None
     right_arm_poses: dict[str, float] | None = None
+
+    def resources(self) -> frozenset[Resource]:
+        left = arms(Arms.LEFT) if self.left_arm_poses else NOTHING
+        return left | arms(Arms.RIGHT) if self.right_arm_poses else left
 
     async def perform(self) -> None:
         await chosen_robot(self, "move_arm_joints").move_arm_joints(self)
@@ -125,6 +143,12 @@ class MoveJointsMotion(BaseMotion):
             counts = f"expected {len(self.names)} values, one for each name, got {len(self.positions)}"
             raise ResolutionError(type(self).__name__, wrong=[f"positions: {counts}"])
 
+    def resources(self) -> frozenset[Resource]:
+        world = current_world.get()
+        robot = world.robot if world is not None else None
+        known = robot.robot_description if robot is not None else None
+        return moving(self.names, known) if known is not None else NOTHING
+
     async def perform(self) -> None:
         await chosen_robot(self, "move_joints").move_joints(self)
 
@@ -139,6 +163,9 @@ class DetectingMotion(BaseMotion):
     concept: ClassVar[str | None] = "LookingFor"
 
     object_type: ObjectType
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.HEAD})
 
     async def perform(self) -> ObjectDesignator:
         looking = chosen_robot(self, "detecting").detecting(self)
@@ -173,6 +200,9 @@ class OpeningMotion(BaseMotion):
     object_part: ObjectPart
     arm: Arms
 
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
     async def perform(self) -> None:
         await chosen_robot(self, "open").open(self)
 
@@ -185,6 +215,9 @@ class ClosingMotion(BaseMotion):
 
     object_part: ObjectPart
     arm: Arms
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
 
     async def perform(self) -> None:
         await chosen_robot(self, "close").close(self)
@@ -211,6 +244,9 @@ class AccessingMotion(BaseMotion):
     drawer_joint: str
     drawer_handle: str
     distance: float
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
 
     async def perform(self) -> None:
         await chosen_robot(self, "accessing").accessing(self)
