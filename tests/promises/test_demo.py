@@ -115,8 +115,8 @@ def same(row: Any, pose: Pose) -> bool:
     return (row.x, row.y, row.z) == pose.position and (row.qx, row.qy, row.qz, row.qw) == pose.orientation
 
 
-async def test_the_demo_is_remembered_as_it_was(tmp_path: Path) -> None:
-    async with Memory.open(f"sqlite:///{tmp_path}/demo.db") as memory:
+async def test_the_demo_is_remembered_as_it_was(tmp_path: Path, database_url: str) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         async with memory.episode(description="Tutorial for getting familiar with the memory") as episode:
             with BulletWorld() as world:
                 kitchen_world()
