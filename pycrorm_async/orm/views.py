@@ -15,6 +15,9 @@ __all__ = ["PickUpWithContextView"]
 class PickUpWithContextView(Base):
     """Every pick-up with what was around it: the sample the thesis learns from (section 5.2).
 
+    Where the robot stood is there twice: along the axes of the map, as in the thesis, and as seen from the object. The
+    latter is what can be learned for an object that is turned otherwise.
+
     Attributes:
         torso_height: of the robot, m.
         relative_x, relative_y: robot minus object, m, along the axes of the map.
@@ -23,6 +26,9 @@ class PickUpWithContextView(Base):
         status: of the action's node.
         process_metadata_id: the episode.
         node_id: the node; the same number as `id`.
+        object_x, object_y, object_z: of the robot's base in the object's own frame, m.
+        object_qx, object_qy, object_qz, object_qw: of the robot's base, turned into the object's own frame. They and
+            `object_z` are read only when asked for by name: `select(PickUpWithContextView.object_z)`.
     """
 
     __tablename__ = "PickUpWithContextView"
@@ -41,3 +47,10 @@ class PickUpWithContextView(Base):
     status: Mapped[TaskStatus]
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
     node_id: Mapped[int] = mapped_column(ForeignKey("task_tree_node.id"))
+    object_x: Mapped[float]
+    object_y: Mapped[float]
+    object_z: Mapped[float] = mapped_column(deferred=True)
+    object_qx: Mapped[float] = mapped_column(deferred=True)
+    object_qy: Mapped[float] = mapped_column(deferred=True)
+    object_qz: Mapped[float] = mapped_column(deferred=True)
+    object_qw: Mapped[float] = mapped_column(deferred=True)

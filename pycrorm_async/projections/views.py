@@ -6,12 +6,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from sqlalchemy import Dialect, Select, TableClause, column, select, table
+from sqlalchemy import ColumnElement, Dialect, Select, TableClause, column, select, table
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError
@@ -79,6 +79,7 @@ def _pick_up_with_context() -> Select[*tuple[Any, ...]]:
             node.c.status,
             node.c.process_metadata_id,
             node.c.id.label("node_id"),
+            *_seen_from(there, robot),
         )
         .select_from(picked)
         .join(node, node.c.id == picked.c.id)
@@ -86,6 +87,21 @@ def _pick_up_with_context() -> Select[*tuple[Any, ...]]:
         .join(Object, Object.id == picked.c.object_designator_id)
         .join(there, there.id == Object.pose_id)
     )
+
+
+def _seen_from(thing: Any, robot: Any) -> Iterator[ColumnElement[Any]]:
+    """Position (m) and orientation of the robot in the thing's own frame; plain arithmetic, for every database."""
+    dx, dy, dz = robot.x - thing.x, robot.y - thing.y, robot.z - thing.z
+    x, y, z, w = thing.qx, thing.qy, thing.qz, thing.qw
+    # The rows of the transposed rotation matrix.
+    yield ((1 - 2 * (y * y + z * z)) * dx + 2 * (x * y + z * w) * dy + 2 * (x * z - y * w) * dz).label("object_x")
+    yield (2 * (x * y - z * w) * dx + (1 - 2 * (x * x + z * z)) * dy + 2 * (y * z + x * w) * dz).label("object_y")
+    yield (2 * (x * z + y * w) * dx + 2 * (y * z - x * w) * dy + (1 - 2 * (x * x + y * y)) * dz).label("object_z")
+    # The conjugate of the thing's quaternion times the robot's.
+    yield (w * robot.qx - x * robot.qw - y * robot.qz + z * robot.qy).label("object_qx")
+    yield (w * robot.qy + x * robot.qz - y * robot.qw - z * robot.qx).label("object_qy")
+    yield (w * robot.qz - x * robot.qy + y * robot.qx - z * robot.qw).label("object_qz")
+    yield (w * robot.qw + x * robot.qx + y * robot.qy + z * robot.qz).label("object_qw")
 
 
 BUILT_IN_VIEWS = (UserView("PickUpWithContextView", _pick_up_with_context()),)

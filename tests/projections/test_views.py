@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from sqlalchemy import func, select
 from sqlalchemy.dialects import sqlite
 from sqlalchemy.ext.asyncio import AsyncSession
@@ -15,6 +19,7 @@ from pycrorm_async.events.happenings import (
     ObjectAdded,
     ObjectMoved,
     ObjectReference,
+    PoseValue,
     RobotValue,
 )
 from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextView, TaskTreeNode
@@ -26,7 +31,7 @@ from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.projections.asking import ask, names, stored_and_folded
-from tests.projections.script import PICK_UP, Script, declarations, declared, field, name_of, pose, row
+from tests.projections.script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
 
 
 def two_pick_ups() -> Script:
@@ -52,11 +57,58 @@ async def test_the_view_of_pick_ups_has_the_columns_of_the_thesis_and_the_pose_a
         assert list(answer.keys()) == [
             "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
             "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
+            "object_x", "object_y", "object_z", "object_qx", "object_qy", "object_qz", "object_qw",
         ]  # fmt: skip
-        assert [tuple(each) for each in answer] == [
+        assert [tuple(each)[:14] for each in answer] == [
             (row(2), "LEFT", "TOP", 0.3, -0.75, 0.5, 0.0, 0.0, 0.6, 0.8, "MILK", "FAILED", 1, row(2)),
             (row(5), "RIGHT", "FRONT", None, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, "MILK", "SUCCEEDED", 1, row(5)),
         ]
+
+
+def turn(axis: tuple[float, float, float], angle: float) -> NDArray[np.float64]:
+    """The rotation matrix, by Rodrigues' formula."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix: NDArray[np.float64] = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return matrix
+
+
+def turned(axis: tuple[float, float, float], angle: float) -> tuple[float, float, float, float]:
+    """The same rotation as a quaternion."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis) * math.sin(angle / 2)
+    return float(x), float(y), float(z), math.cos(angle / 2)
+
+
+@pytest.mark.parametrize(
+    ("axis", "angle"), [((0, 0, 1), 0.0), ((0, 0, 1), math.pi / 2), ((0, 0, 1), -2.5), ((1, -2, 0.5), 2.0)]
+)
+async def test_the_view_says_where_the_robot_stood_as_seen_from_the_object(
+    log: EventLog, axis: tuple[float, float, float], angle: float
+) -> None:
+    script = Script()
+    there = np.array([1.3, 1.0, 0.9])
+    milk = script.put(ObjectAdded("milk", "MILK", PoseValue((1.3, 1.0, 0.9), turned(axis, angle), "map", T0_NS)))
+    stand, heading = np.array([0.6, 0.4, 0.0]), 0.7
+    robot = RobotValue(PoseValue((0.6, 0.4, 0.0), turned((0, 0, 1), heading), "map", T0_NS), "ROBOT", 0.3)
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+    script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, robot))
+    await stored_and_folded(log, [*declarations(PICK_UP), *script.records])
+    view = PickUpWithContextView
+    async with AsyncSession(log.engine) as session:
+        (seen,) = await session.execute(
+            select(
+                view.object_x, view.object_y, view.object_z,
+                view.object_qx, view.object_qy, view.object_qz, view.object_qw,
+            )
+        )  # fmt: skip
+    of_thing = turn(axis, angle)
+    np.testing.assert_allclose(seen[:3], of_thing.T @ (stand - there), atol=1e-12)
+    # The robot's heading, as a direction: turned by the quaternion it is what the object sees.
+    x, y, z, w = seen[3:]
+    ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+    upwards = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+    np.testing.assert_allclose(ahead, of_thing.T @ [math.cos(heading), math.sin(heading), 0], atol=1e-12)
+    np.testing.assert_allclose(upwards, of_thing.T @ [0, 0, 1], atol=1e-12)
 
 
 async def test_the_mapped_view_gives_and_takes_members(log: EventLog) -> None:
