@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
 
 from pycrorm_async.plan import simulated_robot
-from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode
+from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose, WorldMode
+from pycrorm_async.world.robot import PR2
 
 
 class Scene(NamedTuple):
@@ -30,3 +32,9 @@ def scene() -> Iterator[Scene]:
             Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9])),
             Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95])),
         )
+
+
+@pytest.fixture
+def one_armed(scene: Scene) -> None:
+    """The scene's robot is of a kind that has a left arm only."""
+    scene.robot.robot_description = replace(PR2, arms={Arms.LEFT: PR2.arms[Arms.LEFT]})

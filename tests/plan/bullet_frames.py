@@ -1,0 +1,23 @@
+"""Where Bullet's own forward kinematics puts a link: asked past everything of ours, in single precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pybullet
+
+from pycrorm_async.world import Object
+from tests.world.witness import Matrix
+
+
+def bullet_frame(thing: Object, link: str) -> Matrix:
+    """The link's frame in the map as a 4 by 4 matrix."""
+    number, client = thing.body.number, thing.world.client
+    names = [
+        pybullet.getJointInfo(number, joint, physicsClientId=client)[12].decode()
+        for joint in range(pybullet.getNumJoints(number, physicsClientId=client))
+    ]
+    state = pybullet.getLinkState(number, names.index(link), computeForwardKinematics=True, physicsClientId=client)
+    result = np.eye(4)
+    result[:3, :3] = np.reshape(pybullet.getMatrixFromQuaternion(state[5]), (3, 3))
+    result[:3, 3] = state[4]
+    return result
