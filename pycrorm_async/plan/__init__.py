@@ -41,6 +41,7 @@ from pycrorm_async.plan.errors import NoRobotChosen, NoRobotHere, PerformNotAsyn
 from pycrorm_async.plan.failures import IKError, PlanFailure
 from pycrorm_async.plan.fetching import DetectActionPerformable, TransportActionPerformable
 from pycrorm_async.plan.locations import (
+    AccessingLocation,
     CostmapLocation,
     Location,
     LocationDesignator,
@@ -151,6 +152,7 @@ __all__ = [
     "Location",
     "ObjectRelativeLocation",
     "CostmapLocation",
+    "AccessingLocation",
     "SemanticCostmapLocation",
     "NoRobotChosen",
     "NoRobotHere",

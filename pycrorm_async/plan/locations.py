@@ -15,21 +15,30 @@ from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 
 from pycrorm_async.plan.failures import (
+    EnvironmentUnreachable,
     LookingHighLevelFailure,
     ObjectUnavailable,
     ObjectUnreachable,
     PlanFailure,
     ReachabilityFailure,
 )
-from pycrorm_async.plan.objects import ObjectLike, designator_of
+from pycrorm_async.plan.objects import ObjectLike, ObjectPart, designator_of
+from pycrorm_async.plan.opening_stands import opening_stands
 from pycrorm_async.plan.ports import Candidate, recorder
 from pycrorm_async.plan.standing import stands
 from pycrorm_async.plan.surfaces import places_on
 from pycrorm_async.plan.task_tree import current_node
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["CostmapLocation", "Location", "LocationDesignator", "ObjectRelativeLocation", "SemanticCostmapLocation"]
+__all__ = [
+    "AccessingLocation",
+    "CostmapLocation",
+    "Location",
+    "LocationDesignator",
+    "ObjectRelativeLocation",
+    "SemanticCostmapLocation",
+]
 
 
 class LocationDesignator(ABC):
@@ -42,6 +51,10 @@ class LocationDesignator(ABC):
     @abstractmethod
     def _nowhere(self) -> PlanFailure:
         """What it means for a plan that there is no place."""
+
+    def _name(self) -> str:
+        """What a recorder is told."""
+        return type(self).__name__
 
     def resolve(self) -> Location:
         """The first place that will do. Raises a plan failure, which each designator names, if there is none."""
@@ -65,13 +78,13 @@ class LocationDesignator(ABC):
                 considered += 1
                 if place is not None:
                     taken = len(offered)
-                    offered.append(Candidate(place.pose, place.reachable_arms))
+                    offered.append(Candidate(place.pose, place.reachable_arms, place.grasp, place.torso_height))
                     yield place
                     taken = None
         finally:
             if observer is not None:
                 observer.location_resolved(
-                    location=type(self).__name__,
+                    location=self._name(),
                     offered=tuple(offered),
                     taken=taken,
                     considered=considered,
@@ -81,10 +94,15 @@ class LocationDesignator(ABC):
 
 @dataclass(frozen=True)
 class Location(LocationDesignator):
-    """A place: a pose in the map, and the arms that reach what it was looked for. Resolves to itself."""
+    """A place: a pose in the map, and the arms that reach what it was looked for. Resolves to itself.
+
+    A place that comes from experience also says with which grasp and torso height (m) it went well.
+    """
 
     pose: Pose
     reachable_arms: tuple[Arms, ...] = ()
+    grasp: Grasp | None = None
+    torso_height: float | None = None
 
     def _look(self) -> Iterator[Location | None]:
         yield self
@@ -146,6 +164,39 @@ class CostmapLocation(LocationDesignator):
             return ReachabilityFailure(f"there is no place to stand and reach {self.target}", self.target)
         name = self.target.name
         return ObjectUnreachable(f"there is no place to stand and pick up {name}", name)
+
+
+@dataclass(frozen=True)
+class AccessingLocation(LocationDesignator):
+    """Where a robot can stand to open a drawer or a door by its handle, and to close it again.
+
+    >>> handle = ObjectPart("sink_area_drawer_handle", kitchen)
+    >>> stand = AccessingLocation(handle, robot).resolve()
+    >>> await NavigateActionPerformable(stand.pose).perform()
+    >>> await OpenActionPerformable(handle, stand.reachable_arms[0]).perform()
+
+    Args:
+        handle: the part that the hand takes.
+        robot: who is to do it: with its torso as it is now, within the limits of the chosen robot
+            (`simulated_robot_within`).
+        arm: only places where this arm can do it; for BOTH, each of the two.
+
+    Places are 0.4 m clear of what is around. Those that drawer or door will sweep come last. Resolving raises
+    `EnvironmentUnreachable`, `EnvironmentManipulationImpossible` (nothing moves the handle),
+    `PerceptionObjectNotInWorld`, `CapabilityAbsenceFailure` and `UnknownLink`.
+    """
+
+    handle: ObjectPart
+    robot: ObjectLike
+    arm: Arms | None = None
+
+    def _look(self) -> Iterator[Location | None]:
+        for pose, arms in opening_stands(self.handle, self.robot, self.arm):
+            yield Location(pose, arms) if arms is not None else None
+
+    def _nowhere(self) -> PlanFailure:
+        name = self.handle.name
+        return EnvironmentUnreachable(f"there is no place to stand and open and close {name}", name)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ and arms as they are now, within the limits of the chosen robot. Nothing is move
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 
 from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.grasping import pick_up_poses, place_pose, retracted
@@ -17,10 +18,9 @@ from pycrorm_async.plan.process_modules import chosen_limits
 from pycrorm_async.world.costmaps import Costmap, GaussianCostmap, OccupancyCostmap, VisibilityCostmap
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.kinematics import Unreachable, solve
-from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 
-__all__ = ["stands"]
+__all__ = ["facing", "reaching_arms", "robot_meant", "stands"]
 
 CELLS_MAX = 600
 VISIBLE_SHARE_MIN = 0.5
@@ -34,33 +34,69 @@ def stands(
     reachable_arm: Arms | None,
 ) -> Iterator[tuple[Pose, tuple[Arms, ...] | None]]:
     """Poses of the base that face the target, best first, each with the arms that reach; None if it will not do."""
-    reacher = _robot(reachable_for) if reachable_for is not None else None
-    seer = _robot(visible_for) if visible_for is not None else None
+    reacher = robot_meant(reachable_for) if reachable_for is not None else None
+    seer = robot_meant(visible_for) if visible_for is not None else None
     goal = target if isinstance(target, Pose) else designator_of(target).pose
     costmap = _costmap(target, goal, [each for each in (reacher, seer) if each is not None], seer)
     for cell in costmap.best(CELLS_MAX):
-        x, y, _ = cell.position
-        heading = math.atan2(goal.position.y - y, goal.position.x - x)
-        stand = Pose((x, y, 0.0), yaw_quaternion(heading))
+        stand = facing(cell, goal)
         if seer is not None and not _sees(seer, stand, target, goal):
             yield stand, None
         elif reacher is not None:
-            yield stand, _reaching(reacher, stand, target, goal, reachable_arm)
+            yield stand, reaching_arms(reacher, reachable_arm, stand, partial(_goals, reacher, stand, target, goal))
         else:
             yield stand, ()
 
 
-def _robot(meant: ObjectLike) -> RobotHere:
+def robot_meant(meant: ObjectLike) -> RobotHere:
+    """The robot that is meant. Raises `NoRobotHere` if it is none, or of a kind that is not known here."""
     body = in_world(meant)
     if body.robot_description is None:
         raise NoRobotHere(f"{body.name!r} is not a robot of a kind that is known here")
     return RobotHere(body, body.robot_description)
 
 
+def facing(place: Pose, goal: Pose, *, turned: float = 0.0) -> Pose:
+    """On the floor at the place, looking towards the goal, or `turned` (rad) from that to the left."""
+    x, y, _ = place.position
+    heading = math.atan2(goal.position.y - y, goal.position.x - x) + turned
+    return Pose((x, y, 0.0), yaw_quaternion(heading))
+
+
+def reaching_arms(
+    robot: RobotHere,
+    wanted: Arms | None,
+    stand: Pose,
+    goals: Callable[[Arms], Iterable[Pose]],
+    *,
+    torso_height: float | None = None,
+) -> tuple[Arms, ...] | None:
+    """The arms that reach all their goals when the base is there; None if those that are wanted do not.
+
+    Args:
+        wanted: one arm, or BOTH: each of the two; None: any.
+        torso_height: m; as it is now, if left out.
+
+    Raises `CapabilityAbsenceFailure` for an arm that the robot lacks.
+    """
+    limits = chosen_limits()
+    arms = tuple(robot.description.arms if wanted is None else robot.each_arm(wanted))
+    reaching = []
+    for arm in arms:
+        try:
+            for each in goals(arm):
+                solve(robot.body, arm, each, base=stand, torso_height=torso_height, limits=limits)
+        except Unreachable:
+            continue
+        reaching.append(arm)
+    enough = reaching == list(arms) if wanted is Arms.BOTH else bool(reaching)
+    return tuple(reaching) if enough else None
+
+
 def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[RobotHere], seer: RobotHere | None) -> Costmap:
     world = world_here()
     origin = Pose((goal.position.x, goal.position.y, 0.0))
-    ignored = {part for robot in robots for part in _with_load(robot.body)}
+    ignored = {part for robot in robots for part in robot.with_load()}
     costmap = OccupancyCostmap(world, origin, ignore=ignored) * GaussianCostmap(origin)
     if seer is None:
         return costmap
@@ -69,31 +105,7 @@ def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[RobotHere], see
     return costmap * VisibilityCostmap(world, seen, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored)
 
 
-def _with_load(body: Object) -> set[Object]:
-    """The object and all that is attached to it, however deep."""
-    return {body, *body.world.attachments.below(body)}
-
-
-def _reaching(
-    robot: RobotHere, stand: Pose, target: Pose | ObjectLike, goal: Pose, wanted: Arms | None
-) -> tuple[Arms, ...] | None:
-    """The arms that reach all goals from there; None if those that are wanted do not."""
-    limits = chosen_limits()
-    arms = (Arms.LEFT, Arms.RIGHT) if wanted in (None, Arms.BOTH) else (wanted,)
-    reaching = []
-    for arm in arms:
-        goals = _goals(robot, arm, stand, target, goal)
-        try:
-            for each in goals:
-                solve(robot.body, arm, each, base=stand, limits=limits)
-        except Unreachable:
-            continue
-        reaching.append(arm)
-    enough = len(reaching) == 2 if wanted is Arms.BOTH else bool(reaching)
-    return tuple(reaching) if enough else None
-
-
-def _goals(robot: RobotHere, arm: Arms, stand: Pose, target: Pose | ObjectLike, goal: Pose) -> tuple[Pose, ...]:
+def _goals(robot: RobotHere, stand: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
     body, description = robot
     tool_frame = description.arms[arm].tool_frame
     tool = body.link_pose(tool_frame)
@@ -109,5 +121,5 @@ def _sees(robot: RobotHere, stand: Pose, target: Pose | ObjectLike, goal: Pose) 
     body, description = robot
     eye = (stand @ body.link_pose(description.camera_link).relative_to(body.pose)).position
     if isinstance(target, Pose):
-        return world_here().ray_test([eye], [goal.position], ignore=_with_load(body)) == [None]
-    return world_here().visible(in_world(target), eye, ignore=_with_load(body)) >= VISIBLE_SHARE_MIN
+        return world_here().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
+    return world_here().visible(in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN

@@ -62,6 +62,15 @@ class Costmap:
             raise CostmapMismatch(f"maps at {mine} and {theirs} (origin, cells, metres a cell) do not fit")
         return Costmap(self.map * other.map, self.origin, resolution_m=self.resolution_m)
 
+    def value_at(self, x: float, y: float) -> float:
+        """The value of the cell in which the point lies; 0 outside the square."""
+        middle = self.origin.position
+        row = math.floor((x - middle.x) / self.resolution_m + self.size_cells / 2)
+        column = math.floor((y - middle.y) / self.resolution_m + self.size_cells / 2)
+        if not (0 <= row < self.size_cells and 0 <= column < self.size_cells):
+            return 0.0
+        return float(self.map[row, column])
+
     def best(self, count_max: int) -> list[Pose]:
         """The middles of the best cells, the highest value first, those of value 0 never.
 
@@ -88,7 +97,7 @@ class OccupancyCostmap(Costmap):
     """1 where the floor is free, 0 where a link's box, grown sideways by the distance, covers the cell's middle.
 
     What begins above 2 m or does not rise above the floor is no obstacle. Left out, `ignore` is the robot and what it
-    carries.
+    carries; `also` are boxes to stay clear of although nothing is there now.
     """
 
     def __init__(
@@ -100,9 +109,10 @@ class OccupancyCostmap(Costmap):
         size_cells: int = 200,
         resolution_m: float = 0.02,
         ignore: Iterable[Object] | None = None,
+        also: Iterable[BoundingBox] = (),
     ) -> None:
         values = np.ones((size_cells, size_cells))
-        for box in _obstacles(world, ignore):
+        for box in (*_obstacles(world, ignore), *filter(_in_the_way, also)):
             cells = _cells(box, origin, size_cells, resolution_m, grown_m=distance_to_obstacle_m)
             values[cells] = 0.0
         super().__init__(values, origin, resolution_m=resolution_m)
@@ -187,8 +197,12 @@ def _obstacles(world: BulletWorld, ignore: Iterable[Object] | None) -> Iterator[
         if thing not in ignored:
             for link in thing.links:
                 box = thing.bounding_box(link)
-                if any(box.size) and box.max.z > 0.0 and box.min.z < _TALLEST_M:
+                if _in_the_way(box):
                     yield box
+
+
+def _in_the_way(box: BoundingBox) -> bool:
+    return any(box.size) and box.max.z > 0.0 and box.min.z < _TALLEST_M
 
 
 def _or_robot(world: BulletWorld, ignore: Iterable[Object] | None) -> set[Object]:

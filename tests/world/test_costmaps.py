@@ -18,8 +18,9 @@ from pycrorm_async.world import (
     SemanticCostmap,
     VisibilityCostmap,
 )
+from pycrorm_async.world.boxes import BoundingBox
 from pycrorm_async.world.errors import CostmapMismatch, UnknownLink
-from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.pose import Vector, yaw_quaternion
 
 
 def block(name: str, size: tuple[float, float, float], at: tuple[float, float, float], yaw: float = 0.0) -> Object:
@@ -51,6 +52,25 @@ def test_cells_inside_a_grown_box_are_occupied_and_no_others(world: BulletWorld)
         in_post = abs(x + 0.6) <= half and abs(y + 0.7) <= half
         assert costmap.map[i, j] == (0.0 if in_table or in_post else 1.0), (x, y)
     assert 0 < costmap.map.sum() < 100 * 100
+
+
+def test_boxes_to_stay_clear_of_count_as_if_they_were_there(world: BulletWorld) -> None:
+    kerb = BoundingBox(Vector(0.2, -0.1, 0.0), Vector(0.5, 0.3, 0.4))
+    lamp = BoundingBox(Vector(-0.5, -0.5, 2.1), Vector(0.0, 0.0, 2.4))
+    costmap = OccupancyCostmap(
+        world, Pose(), distance_to_obstacle_m=0.25, size_cells=50, resolution_m=0.03, also=[kerb, lamp]
+    )
+    for i, j, x, y in middles(costmap):
+        inside = -0.05 <= x <= 0.75 and -0.35 <= y <= 0.55
+        assert costmap.map[i, j] == (0.0 if inside else 1.0), (x, y)
+
+
+def test_the_value_at_a_point_is_that_of_its_cell_and_nothing_is_known_outside(world: BulletWorld) -> None:
+    costmap = Costmap(np.array([[0.1, 0.2], [0.3, 0.4]]), Pose([1.0, -2.0, 0]), resolution_m=0.5)
+    inside = {(0.51, -2.49): 0.1, (0.99, -1.51): 0.2, (1.01, -2.01): 0.3, (1.49, -1.99): 0.4}
+    assert {point: costmap.value_at(*point) for point in inside} == inside
+    for point in ((0.49, -2.0), (1.51, -2.0), (1.0, -2.51), (1.0, -1.49)):
+        assert costmap.value_at(*point) == 0.0
 
 
 def test_the_links_of_a_thing_count_one_by_one(world: BulletWorld) -> None:
