@@ -220,12 +220,16 @@ class DesignatorTypeDeclared(Happening, frozen=True):
 
 
 class ObjectAdded(Happening, frozen=True):
-    """An object is in the world. Its sequence is the object's identity in this episode. `joints` in rad or m."""
+    """An object is in the world. Its sequence is the object's identity in this episode. `joints` in rad or m.
+
+    `node` put it there; None for what was there before, or came by no node.
+    """
 
     name: str
     object_type: str
     pose: PoseValue
     joints: dict[str, float] = {}
+    node: int | None = None
 
 
 class ObjectRemoved(Happening, frozen=True):

@@ -82,7 +82,11 @@ class WorldRecorder:
     def object_added(self, added: Object) -> None:
         sequence = self._put(
             lambda: ObjectAdded(
-                clean(added.name), added.object_type.name, pose_value(added.pose), dict(added.joint_positions())
+                clean(added.name),
+                added.object_type.name,
+                pose_value(added.pose),
+                dict(added.joint_positions()),
+                self._node(),
             )
         )
         if sequence is not None:

@@ -26,7 +26,7 @@ class Object(Base):
     Attributes:
         identity_id: the row that was written when it was added; None for what the world does not hold.
         joints: positions (rad or m) when it was added; None in later rows.
-        node_id: the node that moved it; None if no node did.
+        node_id: the node that moved it, or put it into the world; None if no node did.
     """
 
     __tablename__ = "object"

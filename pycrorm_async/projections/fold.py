@@ -159,10 +159,10 @@ def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators,
 
 
 def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designators, rows: Rows) -> None:
-    identity = row(event.number, event.sequence)
+    identity, node = row(event.number, event.sequence), _node(event, added.node)
     joints = json_text(added.joints) if added.joints else None
     rows.inserts["pose"].append(_pose_row(event, 0, added.pose))
-    rows.inserts["object"].append(_object_row(event, added, identity, None, joints))
+    rows.inserts["object"].append(_object_row(event, added, identity, node, joints))
 
 
 def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designators, rows: Rows) -> None:

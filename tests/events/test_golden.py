@@ -49,6 +49,7 @@ def test_the_golden_bytes_mean_what_they_say() -> None:
         6: ObjectAdded(
             "milk", "MILK", PoseValue((1.3, 1.0, 0.9), (0.0, 0.0, 0.0, 1.0), "map", 1_700_000_000_000_000_001)
         ),
+        25: ObjectAdded("bowl", "BOWL", PoseValue((0.0, 0.0, 0.5), (0.0, 0.0, 0.0, 1.0), "map", 2), node=9),
         13: NodeStarted("root"),
         14: NodeStarted(
             "action",

@@ -14,7 +14,7 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, simulated_robot
-from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldObserver
 
 MILK_AT = (1.3, 1.0, 0.9)
 CEREAL_AT = (1.3, 0.7, 0.95)
@@ -30,9 +30,14 @@ class Lab(NamedTuple):
 
 
 @contextmanager
-def lab() -> Iterator[Lab]:
-    """Robot at the origin, milk and cereal where the thesis has them, nothing below them; motions are simulated."""
+def lab(observer: WorldObserver | None = None) -> Iterator[Lab]:
+    """Robot at the origin, milk and cereal where the thesis has them, nothing below them; motions are simulated.
+
+    The observer sees all of it, after the memory.
+    """
     with BulletWorld() as world, simulated_robot:
+        if observer is not None:
+            world.observe(observer)
         yield Lab(
             world,
             Object("pr2", ObjectType.ROBOT),
@@ -68,7 +73,7 @@ async def remembered(folder: Path) -> AsyncIterator[Memory]:
 async def every(memory: Memory | Reading, statement: Select[Any]) -> list[Any]:
     """All that the question gives, of one column or class."""
     async with memory.session() as session:
-        return list((await session.scalars(statement)).unique().all())
+        return list(await session.scalars(statement))
 
 
 async def asked(folder: Path, statement: Select[Any]) -> list[Any]:

@@ -1,0 +1,138 @@
+"""What happened to the objects of a world, told twice: by an observer of our own, and by the tables of a memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import pybullet
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.orm import Attachment, JointChange, ObjectRemoval, TaskTreeNode
+from pycrorm_async.orm import Object as ObjectRow
+from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.world import Object, Pose
+from tests.promises.remembering import at, every, turned
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class Entry(NamedTuple):
+    """One change: what it was, what caused it (a dtype; None: no node), when."""
+
+    what: tuple[Any, ...]
+    cause: str | None
+    moment: datetime
+
+
+class Chronicle:
+    """An observer of a world that writes down what it is told, after checking it against Bullet itself.
+
+    It comes after the memory's own observer, so each change is in the memory between its last note and this one.
+    """
+
+    def __init__(self) -> None:
+        self.entries: list[Entry] = []
+
+    def object_added(self, added: Object) -> None:
+        assert_bullet_says(added, added.pose)
+        self._note("added", added.name, numbers(added.pose), dict(added.joint_positions()))
+
+    def object_removed(self, removed: Object) -> None:
+        self._note("removed", removed.name)
+
+    def object_moved(self, moved: Object) -> None:
+        assert_bullet_says(moved, moved.pose)
+        self._note("moved", moved.name, numbers(moved.pose))
+
+    def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
+        of_bullet = joints_of_bullet(moved)
+        assert {joint: of_bullet[joint] for joint in positions} == pytest.approx(dict(positions), abs=1e-9)
+        self._note("joints", moved.name, dict(positions))
+
+    def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
+        self._note("attached", parent.name, child.name, link)
+
+    def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
+        self._note("detached", parent.name, child.name, link)
+
+    def _note(self, *what: Any) -> None:
+        node = current_node.get()
+        cause = type(node.designator).dtype if node is not None and node.designator is not None else None
+        microseconds = -(-time.time_ns() // 1000)
+        self.entries.append(Entry(what, cause, _EPOCH + timedelta(microseconds=microseconds)))
+
+    def short(self) -> list[tuple[Any, ...]]:
+        """What happened to whom and because of what, without numbers."""
+        return [(*each.what[:2], each.cause) for each in self.entries]
+
+
+async def told_by_memory(memory: Memory | Reading, number: int = 1) -> list[Entry]:
+    """The same of the tables: every change of the episode, in the order of the log."""
+    entries: dict[int, Entry] = {}
+    causes = {
+        node.id: node.dtype for node in await every(memory, select(TaskTreeNode).where(TaskTreeNode.dtype.is_not(None)))
+    }
+
+    def note(row: Any, *what: Any) -> None:
+        assert row.id not in entries
+        cause = causes[row.node_id] if row.node_id is not None else None
+        entries[row.id] = Entry(what, cause, row.time)
+
+    def of(mapped: Any) -> Any:
+        return select(mapped).where(mapped.process_metadata_id == number).order_by(mapped.id)
+
+    for row in await every(memory, of(ObjectRow).where(ObjectRow.identity_id.is_not(None))):
+        pose = (*at(row.pose), *turned(row.pose))
+        if row.id == row.identity_id:
+            note(row, "added", row.name, pose, row.joints or {})
+        else:
+            note(row, "moved", row.name, pose)
+    for row in await every(memory, of(ObjectRemoval)):
+        note(row, "removed", row.object.name)
+    for row in await every(memory, of(Attachment)):
+        note(row, row.kind, row.parent.name, row.child.name, row.link)
+    for _, rows in groupby(await every(memory, of(JointChange)), key=lambda row: row.id):
+        first, *others = rows
+        note(first, "joints", first.object.name, {row.joint: row.position for row in (first, *others)})
+    return [entries[key] for key in sorted(entries)]
+
+
+def assert_same(remembered: list[Entry], observed: list[Entry]) -> None:
+    """The same changes with the very same numbers and causes, and each at its time."""
+    assert [each[:2] for each in remembered] == [each[:2] for each in observed]
+    before = [each.moment - timedelta(microseconds=2) for each in observed]
+    for earliest, row, note in zip([_EPOCH, *before[:-1]], remembered, observed, strict=True):
+        assert earliest <= row.moment <= note.moment, row
+
+
+def numbers(pose: Pose) -> tuple[float, ...]:
+    return (*pose.position, *pose.orientation)
+
+
+def assert_bullet_says(thing: Object, pose: Pose) -> None:
+    """The root link is there in Bullet, which itself speaks of the centre of mass."""
+    body, client = thing.body.number, thing.world.client
+    facts = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
+    to_root = pybullet.invertTransform(facts[3], facts[4])
+    centre = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+    position, orientation = pybullet.multiplyTransforms(*centre, *to_root)
+    assert position == pytest.approx(pose.position, abs=1e-6)
+    same_sign = sum(a * b for a, b in zip(orientation, pose.orientation, strict=True)) > 0
+    assert [each if same_sign else -each for each in orientation] == pytest.approx(list(pose.orientation), abs=1e-5)
+
+
+def joints_of_bullet(thing: Object) -> dict[str, float]:
+    """Every joint's position as Bullet has it."""
+    body, client = thing.body.number, thing.world.client
+    return {
+        pybullet.getJointInfo(body, index, physicsClientId=client)[1].decode(): pybullet.getJointState(
+            body, index, physicsClientId=client
+        )[0]
+        for index in range(pybullet.getNumJoints(body, physicsClientId=client))
+    }

@@ -1,0 +1,293 @@
+"""Every change of every object is in the memory: what, where to, when, and because of which node of the plan."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.orm import Object as ObjectRow
+from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.plan import (
+    ActionAbstract,
+    IKError,
+    NavigateActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+)
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.memory.notes import NoteActionPerformable
+from tests.promises.chronicle import Chronicle, assert_same, told_by_memory
+from tests.promises.remembering import WITHIN_REACH, Lab, at, every, lab, remembered, url_of
+
+ARM = "l_gripper_tool_frame"
+
+
+@dataclass
+class RearrangingActionPerformable(ActionAbstract):
+    """Changes the world with its own hands, as a simulation of people or of processes does."""
+
+    _change: Any
+
+    async def perform(self) -> None:
+        self._change()
+
+
+async def test_every_change_of_a_plan_is_remembered_with_its_cause(tmp_path: Path) -> None:
+    async with remembered(tmp_path) as memory:
+        chronicle = Chronicle()
+        with lab(chronicle) as scene:
+            spoon = Object("spoon", ObjectType.SPOON, pose=Pose([1.3, 1, 1.05]))
+            scene.cereal.set_pose(Pose([1.4, 0.5, 0.95], yaw_quaternion(0.3)))
+            await NavigateActionPerformable(WITHIN_REACH).perform()
+            scene.milk.attach(spoon)
+            await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+            await NavigateActionPerformable(Pose([0.5, 0.8, 0], yaw_quaternion(0.2))).perform()
+            await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([1.2, 1.0, 0.9])).perform()
+            await RearrangingActionPerformable(lambda: scene.milk.set_pose(Pose([3, 3, 0]))).perform()
+            await RearrangingActionPerformable(spoon.remove).perform()
+        await memory.flush()
+        assert [each for each in chronicle.short() if each[0] != "added"] == [
+            ("moved", "cereal", None),
+            ("moved", "pr2", "MoveMotion"),
+            ("attached", "milk", None),
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("joints", "pr2", "MoveGripperMotion"),
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("joints", "pr2", "MoveGripperMotion"),
+            ("attached", "pr2", "PickUpAction"),
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("moved", "milk", "MoveTCPMotion"),
+            ("moved", "spoon", "MoveTCPMotion"),
+            ("moved", "pr2", "MoveMotion"),
+            ("moved", "milk", "MoveMotion"),
+            ("moved", "spoon", "MoveMotion"),
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("moved", "milk", "MoveTCPMotion"),
+            ("moved", "spoon", "MoveTCPMotion"),
+            ("joints", "pr2", "MoveGripperMotion"),
+            ("detached", "pr2", "PlaceAction"),
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("moved", "milk", "RearrangingAction"),
+            ("moved", "spoon", "RearrangingAction"),
+            ("detached", "milk", "RearrangingAction"),
+            ("removed", "spoon", "RearrangingAction"),
+        ]
+        told = await told_by_memory(memory)
+        assert_same(told[: len(chronicle.entries)], chronicle.entries)
+        # The world was left inside the episode: then nothing is in it any more, and no node did that.
+        assert [(each.what, each.cause) for each in told[len(chronicle.entries) :]] == [
+            (("removed", name), None) for name in ("pr2", "milk", "cereal")
+        ]
+
+
+async def test_what_a_failed_action_had_changed_before_is_remembered(tmp_path: Path) -> None:
+    async with remembered(tmp_path) as memory:
+        chronicle = Chronicle()
+        with lab(chronicle) as scene:
+            # From 0.32 the arm gets before the milk and not to it; at 1.22 m the milk is grasped and cannot be lifted.
+            for stand, height in ((0.32, 0.9), (0.6, 1.22)):
+                scene.world.reset()
+                scene.milk.set_pose(Pose([1.3, 1, height]))
+                await NavigateActionPerformable(Pose([stand, 0.9, 0])).perform()
+                with pytest.raises(IKError):
+                    await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+            assert scene.robot.attachments == {scene.milk: ARM}
+        await memory.flush()
+        assert [each for each in chronicle.short() if each[2] not in (None, "MoveMotion")] == [
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("joints", "pr2", "MoveGripperMotion"),
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("joints", "pr2", "MoveGripperMotion"),
+            ("joints", "pr2", "MoveTCPMotion"),
+            ("joints", "pr2", "MoveGripperMotion"),
+            ("attached", "pr2", "PickUpAction"),
+        ]
+        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        failed = select(TaskTreeNode.dtype).where(TaskTreeNode.status == TaskStatus.FAILED).order_by(TaskTreeNode.id)
+        assert await every(memory, failed) == ["PickUpAction", "MoveTCPMotion"] * 2
+
+
+@dataclass
+class BranchActionPerformable(ActionAbstract):
+    label: str
+    _thing: Object
+
+    async def perform(self) -> None:
+        for step in range(1, 6):
+            await asyncio.sleep(0)
+            await StepActionPerformable(self.label, step, self._thing).perform()
+
+
+@dataclass
+class StepActionPerformable(ActionAbstract):
+    label: str
+    step: int
+    _thing: Object
+
+    async def perform(self) -> None:
+        await asyncio.sleep(0)
+        self._thing.set_pose(Pose([self.step, 0, 1]))
+        await asyncio.sleep(0)
+
+
+async def test_branches_at_the_same_time_each_cause_their_own_changes(tmp_path: Path) -> None:
+    async with remembered(tmp_path) as memory:
+        chronicle = Chronicle()
+        with lab(chronicle) as scene:
+            async with asyncio.TaskGroup() as group:
+                for thing in (scene.milk, scene.cereal, scene.robot):
+                    group.create_task(BranchActionPerformable(f"moves {thing.name}", thing).perform())
+        await memory.flush()
+        moved = [each.what[1] for each in chronicle.entries if each.what[0] == "moved"]
+        assert len(moved) == 15
+        assert len(set(moved[:3])) == 3  # they took turns
+        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        steps = {step.id: step for step in await every(memory, select(memory.mapped("StepAction")))}
+        rows = await every(memory, select(ObjectRow).where(ObjectRow.id != ObjectRow.identity_id))
+        caused = [steps[row.node_id] for row in rows]
+        assert [(f"moves {row.name}", row.pose.x) for row in rows] == [(step.label, step.step) for step in caused]
+
+
+async def test_a_reset_between_rollouts_is_remembered_and_no_node_did_it(tmp_path: Path) -> None:
+    async with remembered(tmp_path) as memory:
+        chronicle = Chronicle()
+        with lab(chronicle) as scene:
+            for _ in range(2):
+                await NavigateActionPerformable(WITHIN_REACH).perform()
+                await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+                held = scene.milk.pose
+                begun = len(chronicle.entries)
+                scene.world.reset()
+                reset = chronicle.short()[begun:]
+                assert sorted(set(reset)) == [
+                    ("detached", "pr2", None),
+                    ("joints", "pr2", None),
+                    ("moved", "milk", None),
+                    ("moved", "pr2", None),
+                ]
+        await memory.flush()
+        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        milk = await every(memory, select(ObjectRow).where(ObjectRow.name == "milk").order_by(ObjectRow.id))
+        assert [at(row.pose) for row in milk] == [
+            (1.3, 1.0, 0.9),
+            held.position,
+            (1.3, 1.0, 0.9),
+            held.position,
+            (1.3, 1.0, 0.9),
+        ]
+        assert [row.node_id is None for row in milk] == [True, False, True, False, True]
+
+
+async def test_each_episode_in_one_world_begins_with_all_that_is_there(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with lab() as scene:
+            async with memory.episode(description="first"):
+                await NavigateActionPerformable(WITHIN_REACH).perform()
+                await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+            scene.cereal.set_pose(Pose([9, 9, 9]))  # while no episode is open
+            async with memory.episode(description="second"):
+                scene.world.observe(chronicle := Chronicle())
+                scene.world.reset()
+                scene.world.unobserve(chronicle)
+            scene.cereal.set_pose(Pose([8, 8, 8]))
+            await NoteActionPerformable("in an episode of its own").perform()
+        await memory.flush()
+        assert memory.status.faults.total == 0
+        told = await told_by_memory(memory, 2)
+        # What was attached when the episode began is told after what is there.
+        assert told[3].what == ("attached", "pr2", "milk", ARM)
+        assert [each.what[:2] for each in told[:3]] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
+        assert (told[0].what[3]["l_gripper_l_finger_joint"], told[2].what[2][:3]) == (0.0, (9, 9, 9))
+        assert_same(told[4:], chronicle.entries)
+        third = await told_by_memory(memory, 3)
+        assert [each.what[:2] for each in third] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
+        assert third[2].what[2][:3] == (8, 8, 8)
+
+
+class Meddler:
+    """Does whatever can be done to the objects of a world, at random."""
+
+    def __init__(self, scene: Lab, seed: int) -> None:
+        self.rng = random.Random(seed)
+        self.world = scene.world
+        self.made = 0
+        self.state = scene.world.save_state()
+
+    def meddle(self) -> None:
+        choices = [self.move, self.move, self.turn, self.attach, self.detach, self.add, self.remove]
+        self.rng.choice([*choices, self.reset, self.save, self.restore])()
+
+    def anything(self) -> Object:
+        return self.rng.choice(self.world.objects)
+
+    def move(self) -> None:
+        place = [self.rng.uniform(-3, 3) for _ in range(3)]
+        self.anything().set_pose(Pose(place, [self.rng.gauss(0, 1) for _ in range(4)]))
+
+    def turn(self) -> None:
+        robot = self.world.object("pr2")
+        joints = self.rng.sample(["torso_lift_joint", "l_shoulder_pan_joint", "r_wrist_roll_joint"], 2)
+        robot.set_joint_positions({joint: self.rng.uniform(0, 0.3) for joint in joints})
+
+    def attach(self) -> None:
+        parent, child = self.anything(), self.anything()
+        above: Object | None = parent
+        while above is not None and above is not child:
+            above = above.attached_to
+        if above is None and child.attached_to is None:
+            parent.attach(child, self.rng.choice([None, ARM]) if parent.name == "pr2" else None)
+
+    def detach(self) -> None:
+        held = list(self.world.attachments)
+        if held:
+            each = self.rng.choice(held)
+            each.parent.detach(each.child)
+
+    def add(self) -> None:
+        self.made += 1
+        Object(f"bowl {self.made}", ObjectType.BOWL, pose=Pose([self.made, 0, 0]), world=self.world)
+
+    def remove(self) -> None:
+        thing = self.anything()
+        if thing.object_type is ObjectType.BOWL:
+            thing.remove()
+
+    def reset(self) -> None:
+        self.world.reset()
+
+    def save(self) -> None:
+        self.state = self.world.save_state()
+
+    def restore(self) -> None:
+        names = {thing.name for thing in self.world.objects}
+        if set(self.state.objects) <= names:
+            self.world.restore_state(self.state)
+
+
+@pytest.mark.parametrize("seed", range(3))
+async def test_whatever_happens_to_a_world_is_remembered(tmp_path: Path, seed: int) -> None:
+    async with remembered(tmp_path):
+        chronicle = Chronicle()
+        with lab(chronicle) as scene:
+            meddler = Meddler(scene, seed)
+            for index in range(300):
+                if index % 3:
+                    await RearrangingActionPerformable(meddler.meddle).perform()
+                else:
+                    meddler.meddle()
+    async with Reading.open(url_of(tmp_path)) as reading:
+        told = await told_by_memory(reading)
+    assert_same(told[: len(chronicle.entries)], chronicle.entries)
+    kinds = {each.what[0] for each in chronicle.entries}
+    assert kinds == {"added", "moved", "joints", "attached", "detached", "removed"}
+    assert {each.cause for each in chronicle.entries} == {None, "RearrangingAction"}
+    assert len(chronicle.entries) > 250
