@@ -25,7 +25,7 @@ from pycrorm_async.plan.motions import (
     MoveMotion,
     MoveTCPMotion,
 )
-from pycrorm_async.plan.objects import ObjectDesignator, in_world
+from pycrorm_async.plan.objects import ObjectDesignator, designator_of, in_world
 from pycrorm_async.plan.properties import check_properties
 from pycrorm_async.plan.resources import Resource, arms, reaching
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
@@ -232,5 +232,5 @@ class MoveAndPickUpPerformable(CheckedAction):
 
     async def perform(self) -> None:
         await NavigateActionPerformable(self.standing_position).perform()
-        await FaceAtPerformable(self.object_designator.pose).perform()
+        await FaceAtPerformable(designator_of(self.object_designator).pose).perform()
         await PickUpActionPerformable(self.object_designator, self.arm, self.grasp).perform()

@@ -4,6 +4,9 @@ Wherever a designator is wanted, the world's own `Object` will do as well. Five 
 meant: `Object` and `ObjectDesignator` one of the world, `ObjectPart` a link of one, `LocatedObject` one whose
 place was told relative to another, `BelieveObject` one that nobody has seen.
 
+What is meant is the object of the world that the plan acts in: in a copy of the world (`plan.thinking`) a
+designator stands for the copy of its object, and one that was made there for the real one again outside.
+
 >>> ObjectDesignatorDescription(names=["milk"]).resolve().pose
 Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
 """
@@ -13,15 +16,20 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.plan.errors import ResolutionError
 from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWorld
 from pycrorm_async.plan.here import world_here
+from pycrorm_async.world.copying import counterpart, original, related
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.watch import current_world
+
+if TYPE_CHECKING:
+    from pycrorm_async.world.bullet import BulletWorld
 
 __all__ = [
     "ObjectDesignator",
@@ -60,7 +68,7 @@ class ObjectDesignator:
         if self.frozen_pose is not None:
             return self.frozen_pose
         assert self.world_object is not None
-        return self.world_object.pose
+        return _meant_here(self.world_object).pose
 
     def frozen_copy(self) -> ObjectDesignator:
         """The object as it is now, whatever becomes of it."""
@@ -238,7 +246,8 @@ class LocatedObjectDescription(ObjectDesignatorDescription):
     def __iter__(self) -> Iterator[LocatedObject]:
         for found in super().__iter__():
             for reference in self.references:
-                if reference.world_object is None or reference.world_object is not found.world_object:
+                other = reference.world_object
+                if other is None or _meant_here(other) is not found.world_object:
                     relative = found.pose.relative_to(reference.pose)
                     yield LocatedObject(
                         found.name, found.object_type, relative, reference, world_object=found.world_object
@@ -267,11 +276,30 @@ def designator_of(meant: ObjectLike) -> ObjectDesignator:
 
 
 def in_world(meant: ObjectLike) -> Object:
-    """The world object that is meant. Raises `PerceptionObjectNotInWorld` if there is none, or it was removed."""
-    found = meant.world_object if isinstance(meant, ObjectDesignator) else meant
-    if found is None or all(each is not found for each in found.world.objects):
+    """The world object that is meant, in the world of this context if that is its own, a copy of it or its original.
+
+    Raises:
+        PerceptionObjectNotInWorld: there is none, it was removed, or it is only in a copy.
+    """
+    thing = meant.world_object if isinstance(meant, ObjectDesignator) else meant
+    found = counterpart(thing, _world_of(thing)) if thing is not None else None
+    if found is None:
         raise PerceptionObjectNotInWorld(f"{meant.name} is not an object of the world", meant.name)
     return found
+
+
+def _meant_here(thing: Object) -> Object:
+    """As `in_world`; one that is not there itself, whose last pose can still be read."""
+    world = _world_of(thing)
+    return thing if thing.world is world else counterpart(thing, world) or thing
+
+
+def _world_of(thing: Object) -> BulletWorld:
+    """The one of this context, unless the object's has nothing to do with it."""
+    here = current_world.get()
+    if here is None:
+        return original(thing.world)
+    return here if related(here, thing.world) else thing.world
 
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)

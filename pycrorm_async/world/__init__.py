@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pycrorm_async.world.boxes import BoundingBox
     from pycrorm_async.world.bullet import BulletWorld
+    from pycrorm_async.world.copying import copied
     from pycrorm_async.world.costmaps import (
         Costmap,
         GaussianCostmap,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BulletWorld",
+    "copied",
     "Object",
     "Pose",
     "Vector",
@@ -61,6 +63,7 @@ __all__ = [
 _HOME = {
     "boxes": ("BoundingBox",),
     "bullet": ("BulletWorld",),
+    "copying": ("copied",),
     "costmaps": ("Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"),
     "enums": ("Arms", "Grasp", "GripperState", "JointType", "ObjectType", "WorldMode"),
     "objects": ("Object",),

@@ -69,7 +69,11 @@ class Attachments:
     def put(self, parent: Object, child: Object, link: str | None) -> None:
         """Note that `child` hangs on that link, where it is now."""
         relative = child.pose.relative_to(parent.link_pose(link))
-        self._of_child[child] = Attachment(parent, child, link, relative)
+        self.keep(Attachment(parent, child, link, relative))
+
+    def keep(self, attachment: Attachment) -> None:
+        """Note an attachment as it is given; the child is taken to be where it says."""
+        self._of_child[attachment.child] = attachment
 
     def remove(self, parent: Object, child: Object) -> Attachment:
         """Take one away and return it; raises `AttachmentRefused` if it is not there."""

@@ -35,10 +35,15 @@ class BulletWorld:
 
     Entering takes some 50 ms, raises `WorldUnavailable`, and whatever this context's watcher refuses it with.
     Afterwards everything that would change the world raises `WorldClosed`; what was last known can still be read.
+
+    Args:
+        mode: with a window, or without.
+        copy_of: for `copying.copied` only: the world that this one is filled from. No watcher is told of a copy.
     """
 
-    def __init__(self, mode: WorldMode = WorldMode.DIRECT) -> None:
+    def __init__(self, mode: WorldMode = WorldMode.DIRECT, *, copy_of: BulletWorld | None = None) -> None:
         self.mode = mode
+        self.copy_of = copy_of
         self.attachments = Attachments()
         self._objects: dict[int, Object] = {}
         self._robot: Object | None = None
@@ -59,7 +64,7 @@ class BulletWorld:
         self._client = _connected(self.mode)
         self._outer = current_world.get()
         current_world.set(self)
-        self._watcher = watcher.get()
+        self._watcher = watcher.get() if self.copy_of is None else None
         if self._watcher is not None:
             try:
                 self._watcher.world_entered(self)

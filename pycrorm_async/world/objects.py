@@ -63,6 +63,8 @@ class Object:
     robot_description: RobotDescription | None
     body: Body
     """For the world's own parts only: moving it tells nobody."""
+    copy_of: Object | None
+    """In a copied world: the object of the other world that this one was made from."""
 
     def __init__(
         self,
@@ -84,6 +86,7 @@ class Object:
         self.name = name
         self.object_type = object_type
         self.world = world
+        self.copy_of = None
         self.original_pose = _accepted(name, pose if pose is not None else Pose())
         self.description_text = urdf_text(
             name, built_in_urdf(name, object_type) if description is None else description
