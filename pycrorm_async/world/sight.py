@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["first_met", "met_towards", "visible_share"]
 
 _RAYS_AT_ONCE = 16_000  # Bullet takes 16,384
-_SHAPES_LOOKED_THROUGH = 64  # in one ray's way; it meets a convex shape once
 
 
 def first_met(
@@ -32,23 +32,30 @@ def first_met(
     if len(starts) != len(ends):
         raise ValueError(f"{len(starts)} starts and {len(ends)} ends are no rays")
     by_number = {thing.body.number: thing for thing in world.objects}
-    met: list[Object | None] = [None] * len(starts)
-    begins = [tuple(start) for start in starts]
-    pending = list(range(len(starts)))
-    for _ in range(1 + (_SHAPES_LOOKED_THROUGH if ignore else 0)):
-        hits = _hits(world.client, [begins[ray] for ray in pending], [ends[ray] for ray in pending])
-        again = []
-        for ray, (number, point) in zip(pending, hits, strict=True):
-            thing = by_number.get(number)
-            if thing in ignore:
-                begins[ray] = _just_behind(point, ends[ray])
-                again.append(ray)
-            else:
-                met[ray] = thing
-        pending = again
-        if not pending:
-            break
-    return met
+    with _looked_through(world, ignore):
+        return [by_number.get(number) for number in _hits(world.client, starts, ends)]
+
+
+@contextmanager
+def _looked_through(world: BulletWorld, ignore: AbstractSet[Object]) -> Iterator[None]:
+    """Inside, rays pass through these objects.
+
+    They are taken out of all of Bullet's groups. To begin a ray anew behind each surface it meets does not do: Bullet
+    may let a ray that begins just inside a shape meet it at once, again and again.
+    """
+    through = [thing for thing in ignore if world.has(thing)]
+    try:
+        for thing in through:
+            _group(thing, 0)
+        yield
+    finally:
+        for thing in through:
+            _group(thing, 1)
+
+
+def _group(thing: Object, group: int) -> None:
+    for link in range(-1, len(thing.body.links) - 1):
+        engine().setCollisionFilterGroupMask(thing.body.number, link, group, -1, physicsClientId=thing.body.client)
 
 
 def visible_share(world: BulletWorld, thing: Object, eye: Sequence[float], *, ignore: AbstractSet[Object]) -> float:
@@ -77,19 +84,10 @@ def _placed(thing: Object, link: str) -> list[list[float]]:
     return placed
 
 
-def _hits(
-    client: int, starts: Sequence[Sequence[float]], ends: Sequence[Sequence[float]]
-) -> list[tuple[int, Sequence[float]]]:
-    """For every ray the number of the body it meets first, and where."""
-    found = []
+def _hits(client: int, starts: Sequence[Sequence[float]], ends: Sequence[Sequence[float]]) -> list[int]:
+    """For every ray the number of the body it meets first."""
+    found: list[int] = []
     for begin in range(0, len(starts), _RAYS_AT_ONCE):
         chunk = slice(begin, begin + _RAYS_AT_ONCE)
-        found += engine().rayTestBatch(starts[chunk], ends[chunk], physicsClientId=client)
-    return [(hit[0], hit[3]) for hit in found]
-
-
-def _just_behind(point: Sequence[float], end: Sequence[float]) -> tuple[float, ...]:
-    """A little further along the way, so that the same surface is not met again."""
-    way = np.subtract(end, point)
-    length = float(np.linalg.norm(way))
-    return tuple((np.array(point) + way * min(1.0, 1e-4 / length if length else 0.0)).tolist())
+        found += [hit[0] for hit in engine().rayTestBatch(starts[chunk], ends[chunk], physicsClientId=client)]
+    return found

@@ -1,0 +1,33 @@
+"""What is looked through is as if it were not there: told by the same rays in a world where it is not."""
+
+from __future__ import annotations
+
+from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world.kinematics import solve
+from pycrorm_async.world.sight import met_towards
+
+
+def test_a_hand_before_a_thing_is_looked_through_all_the_way(world: BulletWorld) -> None:
+    """The rays go a long way through the stretched arm and what it holds, and out of them into the counter."""
+    Object("kitchen", ObjectType.ENVIRONMENT)
+    cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.56, 1.022, 0.8]))
+    eye = (0.65, 0.9455, 1.2573)
+    alone = met_towards(world, cereal, eye, ignore=frozenset())
+    assert {None if each is None else each.name for each in alone} == {"cereal", "kitchen"}
+    robot = Object("pr2", ObjectType.ROBOT, pose=Pose([0.6, 0.9, 0]))
+    robot.set_joint_positions(solve(robot, Arms.LEFT, Pose([1.3, 1, 0.93])))
+    milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.93]))
+    assert met_towards(world, cereal, eye, ignore=frozenset()) != alone
+    for _ in range(2):
+        assert met_towards(world, cereal, eye, ignore=frozenset({robot, milk})) == alone
+    assert met_towards(world, cereal, eye, ignore=frozenset({milk})) != alone
+    world.remove(milk)
+    assert met_towards(world, cereal, eye, ignore=frozenset({robot, milk})) == alone
+
+
+def test_what_was_looked_through_is_met_again_afterwards(world: BulletWorld) -> None:
+    robot = Object("pr2", ObjectType.ROBOT, pose=Pose([1, 0, 0]))
+    ray = ([(0.0, 0.0, 0.2)], [(2.0, 0.0, 0.2)])
+    assert world.ray_test(*ray) == [robot]
+    assert world.ray_test(*ray, ignore=[robot]) == [None]
+    assert world.ray_test(*ray) == [robot]
