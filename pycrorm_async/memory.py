@@ -33,8 +33,10 @@ from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter, Faults
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.recorder import Recorder, current_episode
+from pycrorm_async.plan.experience import experience
 from pycrorm_async.plan.ports import recorder
 from pycrorm_async.projections.views import UserView
+from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.locks import in_forked_child
 from pycrorm_async.queue.recorder import RecorderQueue
@@ -82,6 +84,7 @@ class _Parts(NamedTuple):
     reading: Reading
     emitter: Emitter
     recorder: Recorder
+    experience: PickUpExperience
 
 
 class Memory:
@@ -148,7 +151,7 @@ class Memory:
     async def __aenter__(self) -> Self:
         try:
             self._parts = await self._open()
-            self._stack.enter_context(self._recording(self._parts.recorder))
+            self._stack.enter_context(self._recording(self._parts))
         except BaseException:
             await self._stack.aclose()
             raise
@@ -176,7 +179,8 @@ class Memory:
         self._stack.push_async_exit(partial(self._drain, queue, writer))
         reading = await self._stack.enter_async_context(Reading.open_address(address))
         emitter = Emitter(queue, self._settings)
-        return _Parts(queue, writer, reading, emitter, Recorder(emitter, clock=self._clock, software=__version__))
+        told = Recorder(emitter, clock=self._clock, software=__version__)
+        return _Parts(queue, writer, reading, emitter, told, PickUpExperience(reading))
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -186,7 +190,7 @@ class Memory:
         told = self._parts.recorder
         for episode in told.open_episodes:
             told.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
-        self._parts.emitter.over = True
+        self._parts.emitter.over = self._parts.experience.over = True
         await self._stack.__aexit__(kind, error, traceback)
 
     async def _drain(
@@ -220,7 +224,7 @@ class Memory:
     def _forked(self) -> None:
         """In a forked child: the memory is its parent's; plans go on and nothing is told."""
         if self._parts is not None:
-            self._parts.emitter.over = True
+            self._parts.emitter.over = self._parts.experience.over = True
             self._parts = None
 
     # --- recording --------------------------------------------------------------------------------------------
@@ -241,12 +245,13 @@ class Memory:
         Raises:
             EpisodeRefused: one is open in this task already. A child task may open its own.
         """
-        told = self._now.recorder
+        parts = self._now
+        told = parts.recorder
         if (room := told.admit()) is not None:
             await room
         episode = told.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
         failure: BaseException | None = None
-        with self._recording(told), _set(current_episode, episode):
+        with self._recording(parts), _set(current_episode, episode):
             try:
                 yield episode
             except BaseException as raised:
@@ -338,9 +343,9 @@ class Memory:
         return self._parts
 
     @contextmanager
-    def _recording(self, told: Recorder) -> Iterator[None]:
-        """What is performed and entered in this context is told to this memory."""
-        with _set(recorder, told), _set(watcher, told):
+    def _recording(self, parts: _Parts) -> Iterator[None]:
+        """What is performed and entered in this context is told to this memory, and it is asked what went well."""
+        with _set(recorder, parts.recorder), _set(watcher, parts.recorder), _set(experience, parts.experience):
             yield
 
 

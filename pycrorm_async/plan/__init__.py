@@ -83,7 +83,9 @@ from pycrorm_async.plan.process_modules import (
     simulated_robot,
     simulated_robot_within,
 )
+from pycrorm_async.plan.remembered_places import DatabaseCostmapLocation
 from pycrorm_async.plan.task_tree import CollectedTree, TaskStatus, TaskTreeNode, collected_tree
+from pycrorm_async.plan.thinking import SimulatedTaskTree
 
 __all__ = [
     "Designator",
@@ -98,6 +100,7 @@ __all__ = [
     "ChosenRobot",
     "collected_tree",
     "CollectedTree",
+    "SimulatedTaskTree",
     "TaskStatus",
     "TaskTreeNode",
     "ActionDescription",
@@ -153,6 +156,7 @@ __all__ = [
     "ObjectRelativeLocation",
     "CostmapLocation",
     "AccessingLocation",
+    "DatabaseCostmapLocation",
     "SemanticCostmapLocation",
     "NoRobotChosen",
     "NoRobotHere",
