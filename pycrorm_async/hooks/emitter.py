@@ -31,9 +31,9 @@ class Faults(NamedTuple):
 class Emitter:
     """The hooks' way to the queue.
 
-    Only the start of a node or an episode waits for room, before it is written (`Recorder.admit`). Everything else
-    must not wait, so all that is put may use the reserve; when that is gone as well, the calling thread blocks until
-    something was stored. Nothing is dropped.
+    Only the start of a node or an episode waits for room, before it is written (`Recorder.admit`). Everything else, a
+    thought's start too, must not wait, so all that is put may use the reserve; when that is gone as well, the calling
+    thread blocks until something was stored. Nothing is dropped.
     """
 
     def __init__(self, sink: EventSink, settings: Settings) -> None:

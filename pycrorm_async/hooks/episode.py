@@ -20,6 +20,7 @@ from pycrorm_async.events.happenings import (
     LocationResolved,
     MissingValue,
     NodeEnded,
+    NodeReference,
     NodeStarted,
     NodeStatus,
     ObjectDetected,
@@ -58,6 +59,8 @@ class EpisodeOpening(NamedTuple):
     plan: str | None = None
     seed: int | None = None
     world: str | None = None
+    simulated: bool = False
+    thought_by: NodeReference | None = None
 
 
 class NodeRecord(NamedTuple):
@@ -77,14 +80,17 @@ class Episode:
     Attributes:
         id: 16 bytes of a UUIDv7; `str(episode)` is its text.
         task: the asyncio task that opened it; None outside any.
+        simulated: it is thought through in a copy of the world, and nothing of it happens.
+        world: who watches its world; None without one.
     """
 
     def __init__(self, emitter: Emitter, episode: EpisodeId, opening: EpisodeOpening) -> None:
         self.id: Final = episode
         self.task = current_task()
         self.closed = False
+        self.simulated: Final = opening.simulated
+        self.world: WorldRecorder | None = None
         self._emitter = emitter
-        self._world: WorldRecorder | None = None
         self._open_nodes: set[int] = set()
         emitter.put(
             episode,
@@ -97,9 +103,11 @@ class Episode:
                 plan=clean(opening.plan) if opening.plan is not None else None,
                 seed=opening.seed,
                 world=clean(opening.world) if opening.world is not None else None,
+                simulated=opening.simulated,
+                thought_by=opening.thought_by,
             ),
         )
-        self._root = emitter.put(episode, NodeStarted("root"))
+        self._root = emitter.put(episode, NodeStarted("root", simulated=opening.simulated))
 
     def __str__(self) -> str:
         return episode_text(self.id)
@@ -111,36 +119,40 @@ class Episode:
 
     def enter_world(self, world: BulletWorld) -> None:
         """This world belongs to the episode from now on. A second one at the same time is refused."""
-        if self._world is not None:
+        if self.world is not None:
             raise EpisodeRefused(
                 "this episode has a world already: leave it first, or open an episode of its own for the second world"
                 " in a task of its own"
             )
-        self._world = WorldRecorder(self._emitter, self.id, world)
+        self.world = WorldRecorder(self._emitter, self.id, world)
 
     def leave_world(self, world: BulletWorld, *, emptied: bool) -> None:
         """Look at it no longer; `emptied` if it is gone with all its objects, and not only the episode over."""
-        if self._world is not None and self._world.world is world:
+        if self.world is not None and self.world.world is world:
             if emptied:
-                self._world.empty()
-            self._world.stop()
-            self._world = None
+                self.world.empty()
+            self.world.stop()
+            self.world = None
 
     def reference(self, world_object: Object) -> ObjectReference | None:
         """The row in force of this object in this episode."""
-        return self._world.reference(world_object) if self._world is not None else None
+        return self.world.reference(world_object) if self.world is not None else None
+
+    def naming(self, node: TaskTreeNode | None) -> NodeReference:
+        """How other episodes name this node of it, or the nearest recorded one above; the root for None."""
+        return NodeReference(str(self), self._parent_of(node))
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
     def start_node(self, node: TaskTreeNode, declared: DeclaredType) -> int:
         """Write down that the node starts; its sequence. Raises `Unrecordable` for a parameter, if so chosen."""
-        parent = self._parent_of(node)
         event = NodeStarted(
             kind=node.kind,
-            parent=parent,
+            parent=self._parent_of(node.parent),
             designator=declared.fingerprint,
             parameters=self._parameters(node, declared),
             robot=self._robot(),
+            simulated=self.simulated,
         )
         try:
             sequence = self._emitter.put(self.id, event)
@@ -208,8 +220,8 @@ class Episode:
         if self.closed:
             return
         self.closed = True
-        if self._world is not None:
-            self.leave_world(self._world.world, emptied=False)
+        if self.world is not None:
+            self.leave_world(self.world.world, emptied=False)
         for sequence in sorted(self._open_nodes, reverse=True):
             self._put_end(NodeEnded(sequence, "LOST"))
         self._open_nodes.clear()
@@ -223,8 +235,8 @@ class Episode:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _parent_of(self, node: TaskTreeNode) -> int:
-        return self._sequence_of(node.parent) or self._root
+    def _parent_of(self, above: TaskTreeNode | None) -> int:
+        return self._sequence_of(above) or self._root
 
     def _sequence_of(self, node: TaskTreeNode | None) -> int | None:
         """The nearest recorded node of this episode, from this one upwards."""
@@ -270,10 +282,10 @@ class Episode:
         return self._emitter.put(self.id, replace(event, parameters=kept))
 
     def _robot(self) -> RobotValue | None:
-        if self._world is None:
+        if self.world is None:
             return None
         try:
-            return self._world.robot()
+            return self.world.robot()
         except Exception as error:  # noqa: BLE001  the action itself is recorded all the same
             self._emitter.note_fault("robot state", error)
             return None

@@ -15,11 +15,12 @@ from typing import Literal
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError, DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
 from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.happenings import NodeReference
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode, EpisodeOpening, NodeRecord, current_task
-from pycrorm_async.plan.ports import Candidate, Seen
+from pycrorm_async.plan.ports import Candidate, Seen, Thought, thinking
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
@@ -68,13 +69,26 @@ class Recorder:
                 f"episode {open_here} is open in this task already: end it first, or open the second in its own task"
             )
         _check_arguments(description=description, plan=plan, seed=seed)
+        return self._begin(description, plan=plan, seed=seed)
+
+    def _begin(self, description: str, *, plan: str | None = None, seed: int | None = None) -> Episode:
+        """An episode of what happens in this context, or is thought in it."""
+        thought, world = thinking.get(), current_world.get()
         name = episode_id(self._clock.wall_ns(), self._randomness(10))
-        world = current_world.get()
-        opening = EpisodeOpening(description, self._software, plan, seed, world.description if world else None)
+        opening = EpisodeOpening(
+            description,
+            self._software,
+            plan,
+            seed,
+            world.description if world else None,
+            simulated=thought is not None,
+            thought_by=_thinker(thought),
+        )
         episode = Episode(self._emitter, name, opening)
         self._open[name] = episode
-        self._recent.append(name)
-        self.opened_count += 1
+        if not episode.simulated:
+            self._recent.append(name)
+            self.opened_count += 1
         if world is not None:
             episode.enter_world(world)
         return episode
@@ -100,9 +114,11 @@ class Recorder:
         return tuple(map(episode_text, self._recent))
 
     def _open_here(self) -> Episode | None:
-        """The open episode of this memory in this context."""
+        """The open episode of this memory in this context; never that of a thought where things happen."""
         episode = current_episode.get()
-        return episode if episode is not None and not episode.closed and episode.id in self._open else None
+        if episode is None or episode.closed or episode.id not in self._open:
+            return None
+        return episode if episode.simulated is (thinking.get() is not None) else None
 
     # --- the plan layer's port ----------------------------------------------------------------------------------
 
@@ -176,6 +192,27 @@ class Recorder:
         except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
             self._emitter.note_fault("ObjectDetected", error)
 
+    def thought_began(self, thought: Thought) -> None:
+        if self._emitter.over:
+            return
+        before = current_episode.get()
+        thought.record = record = _ThoughtRecord(before.naming(thought.by) if before is not None else None, before)
+        try:
+            record.episode = self._begin(_description_of(thought))
+        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            self._emitter.note_fault("EpisodeStarted", error)
+        # None, if it could not begin: what is only thought never gets into the episode around it.
+        current_episode.set(record.episode)
+
+    def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
+        record: _ThoughtRecord | None = thought.record
+        if record is None:
+            return
+        if record.episode is not None:
+            self.close_episode(record.episode, failure)
+        if current_episode.get() is record.episode:  # a dropped plan is closed in whatever context drops it
+            current_episode.set(record.before)
+
     def _declare(self, declared: DeclaredType) -> None:
         kind = type(declared.declaration)
         self._emitter.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
@@ -191,6 +228,34 @@ class Recorder:
         episode = self._open_here()
         if episode is not None:
             episode.leave_world(world, emptied=True)
+
+
+class _ThoughtRecord:
+    """What the memory keeps at a thought.
+
+    Attributes:
+        thinker: the node in which it is thought; None where nothing was recorded around it.
+        before: the current episode of the context when it began.
+        episode: its own; None if it could not begin.
+    """
+
+    def __init__(self, thinker: NodeReference | None, before: Episode | None) -> None:
+        self.thinker = thinker
+        self.before = before
+        self.episode: Episode | None = None
+
+
+def _thinker(thought: Thought | None) -> NodeReference | None:
+    record = thought.record if thought is not None else None
+    return record.thinker if isinstance(record, _ThoughtRecord) else None
+
+
+def _description_of(thought: Thought) -> str:
+    if thought.description is not None:
+        return thought.description[:TEXT_MAX]
+    if thought.by is not None and thought.by.designator is not None:
+        return f"thinking in {thought.by.designator.dtype}"
+    return "thinking"
 
 
 def _check_arguments(*, description: object, plan: object, seed: object) -> None:

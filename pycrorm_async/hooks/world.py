@@ -25,6 +25,7 @@ from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.values import clean, pose_value
 from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world.bullet import BulletWorld
+from pycrorm_async.world.copying import counterpart, related
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
@@ -57,8 +58,12 @@ class WorldRecorder:
         self.world.unobserve(self)
 
     def reference(self, world_object: Object) -> ObjectReference | None:
-        """The row in force of this object; None if it is not of this world."""
-        return self._references.get(world_object)
+        """The row in force of this object, or of what stands for it in this world; None if there is nothing."""
+        found = self._references.get(world_object)
+        if found is None and world_object.world is not self.world and related(world_object.world, self.world):
+            here = counterpart(world_object, self.world)
+            found = self._references.get(here) if here is not None else None
+        return found
 
     def robot(self) -> RobotValue | None:
         """Base pose and torso height of the robot now; None without a robot."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Awaitable
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.objects import Object
@@ -18,8 +18,9 @@ from pycrorm_async.world.pose import Pose
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.task_tree import TaskTreeNode
+    from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = ["PlanObserver", "Candidate", "Seen", "recorder"]
+__all__ = ["PlanObserver", "Candidate", "Seen", "Thought", "recorder", "thinking"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +44,27 @@ class Seen:
     visible: float | None = None
 
 
+class Thought:
+    """Something that is thought through in a copy of the world, and does not happen (`plan.thinking`).
+
+    Attributes:
+        description: in words; None: nobody said.
+        world: the copy; None if there was no world to copy.
+        by: the node in which it is thought; None outside any.
+        record: belongs to whoever records the plan.
+    """
+
+    __slots__ = ("by", "description", "record", "world")
+
+    def __init__(self, description: str | None, world: BulletWorld | None, by: TaskTreeNode | None) -> None:
+        self.description = description
+        self.world = world
+        self.by = by
+        self.record: Any = None
+
+
 class PlanObserver(Protocol):
-    """Told of every node and every resolved location of the plans in its context."""
+    """Told of every node, resolved location, perception and thought of the plans in its context."""
 
     def admit(self) -> Awaitable[None] | None:
         """None if a node may start at once; otherwise what must be awaited first (it may raise)."""
@@ -85,5 +105,16 @@ class PlanObserver(Protocol):
         """Perception answered: what was looked for, and what was found, best seen first."""
         ...
 
+    def thought_began(self, thought: Thought) -> None:
+        """From now on what happens in this context is only thought. May set `thought.record`."""
+        ...
+
+    def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
+        """It is over; `failure` left it. Called exactly once for every thought that began, its world still open."""
+        ...
+
 
 recorder: ContextVar[PlanObserver | None] = ContextVar("recorder", default=None)
+
+thinking: ContextVar[Thought | None] = ContextVar("thinking", default=None)
+"""The innermost thought of this context; None where things really happen."""

@@ -27,7 +27,7 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import ActionAbstract, PlaceActionPerformable
-from pycrorm_async.plan.ports import PlanObserver, recorder
+from pycrorm_async.plan.ports import PlanObserver, Thought, recorder
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
@@ -105,6 +105,12 @@ class Witness:
 
     def object_detected(self, **arguments: Any) -> None:
         self.memory.object_detected(**arguments)
+
+    def thought_began(self, thought: Thought) -> None:
+        self.memory.thought_began(thought)
+
+    def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
+        self.memory.thought_ended(thought, failure)
 
 
 def tree_text(nodes: list[Any]) -> str:
