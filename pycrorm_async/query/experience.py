@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import Select, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import PickUpWithContextView, TaskTreeNode
@@ -61,28 +61,31 @@ class PickUpExperience:
         """
         if self.over:
             raise CallerError("the memory that was to tell what went well is closed: ask while it is open")
-        view, node = PickUpWithContextView, TaskTreeNode
-        question = (
-            select(
-                view.arm, view.grasp, view.torso_height, view.status, view.object_x, view.object_y, view.object_z,
-                view.object_qx, view.object_qy, view.object_qz, view.object_qw,
-            )
-            .join(node, node.id == view.node_id)
-            .where(view.obj_type == object_type, view.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]))
-            .where(~node.simulated)
-            .order_by(view.id.desc())
-            .limit(ATTEMPTS_MAX)
-        )  # fmt: skip
-        if arm is not None:
-            question = question.where(view.arm == arm)
         async with self._reading.session() as session:
-            rows = (await session.execute(question)).all()
+            rows = (await session.execute(_question(object_type, arm))).all()
         return best_first(
             [
                 Attempt(arm, grasp, torso, _seen_from_object(place), status is TaskStatus.SUCCEEDED)
                 for arm, grasp, torso, status, *place in rows
             ]
         )
+
+
+def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, ...]]:
+    view, node = PickUpWithContextView, TaskTreeNode
+    # First which, then what: the columns that are reckoned are reckoned for these only, and nothing wide is sorted.
+    latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(ATTEMPTS_MAX)
+    if arm is not None:
+        latest = latest.where(view.arm == arm)
+    return (
+        select(
+            view.arm, view.grasp, view.torso_height, view.status, view.object_x, view.object_y, view.object_z,
+            view.object_qx, view.object_qy, view.object_qz, view.object_qw,
+        )
+        .join(node, node.id == view.node_id)
+        .where(view.id.in_(latest), view.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]), ~node.simulated)
+        .order_by(view.id.desc())
+    )  # fmt: skip
 
 
 def best_first(attempts: Sequence[Attempt]) -> list[PastSuccess]:

@@ -1,0 +1,156 @@
+"""What is asked of past pick-ups: which count, how good a way of doing it is, and which comes first."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.happenings import (
+    EpisodeStarted,
+    FailureValue,
+    NodeEnded,
+    NodeStarted,
+    NodeStatus,
+    ObjectAdded,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.plan.experience import PastSuccess
+from pycrorm_async.query.experience import ATTEMPTS_MAX, Attempt, PickUpExperience, best_first
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from pycrorm_async.world.pose import Pose, yaw_quaternion
+from tests.projections.asking import stored_and_folded
+from tests.projections.script import PICK_UP, T0_NS, Script, declarations, name_of
+
+
+def tried(
+    x: float, y: float, *, succeeded: bool, arm: Arms = Arms.LEFT, z: float = -0.9, torso: float | None = 0.3
+) -> Attempt:
+    return Attempt(arm, Grasp.FRONT, torso, Pose([x, y, z]), succeeded)
+
+
+def ways(found: list[PastSuccess]) -> list[tuple[Arms, float, float, float, int]]:
+    return [(each.arm, *each.stand.position[:2], round(each.score, 9), each.times) for each in found]
+
+
+def test_a_way_is_as_good_as_the_share_of_what_went_well_near_it() -> None:
+    attempts = [
+        tried(-0.7, 0, succeeded=True),
+        tried(-0.65, 0, succeeded=True),  # 0.05 m from the first
+        tried(-0.7, 0.08, succeeded=False),  # 0.08 m from the first, 0.094 m from the second
+        tried(-0.7, 0, succeeded=False, arm=Arms.RIGHT),  # another arm
+        tried(-0.7, 0, succeeded=False, z=-0.7),  # another height
+        tried(-0.7, 0, succeeded=False, torso=0.1),  # another torso height
+        tried(-0.9, 0.2, succeeded=True),  # alone
+        tried(-0.9, 0.5, succeeded=True),
+        tried(-0.9, 0.5, succeeded=True),
+        tried(-0.9, 0.5, succeeded=True),
+        tried(0.9, 0.5, succeeded=False),
+    ]
+    assert ways(best_first(attempts)) == [
+        (Arms.LEFT, -0.9, 0.5, 0.8, 3),  # (3 + 1) / (3 + 2)
+        (Arms.LEFT, -0.9, 0.2, round(2 / 3, 9), 1),  # (1 + 1) / (1 + 2)
+        (Arms.LEFT, -0.7, 0.0, 0.6, 1),  # (2 + 1) / (3 + 2)
+        (Arms.LEFT, -0.65, 0.0, 0.6, 1),
+    ]
+
+
+def test_equally_good_ways_come_as_often_as_they_went_well_then_the_first_given() -> None:
+    attempts = [tried(x, 0, succeeded=True) for x in (-0.8, -0.75, -0.75, -0.7)]
+    assert [(each.stand.position.x, each.times) for each in best_first(attempts)] == [(-0.75, 2), (-0.8, 1), (-0.7, 1)]
+
+
+def test_without_a_torso_the_place_alone_counts_and_nothing_tried_gives_nothing() -> None:
+    attempts = [tried(-0.7, 0, succeeded=True, torso=None), tried(-0.7, 0.05, succeeded=False, torso=None)]
+    (found,) = best_first(attempts)
+    assert (found.torso_height, found.score) == (None, 0.5)
+    assert best_first([]) == []
+    assert best_first([tried(-0.7, 0, succeeded=False)]) == []
+
+
+# --- from the tables ------------------------------------------------------------------------------------------------
+
+
+def picked(
+    script: Script, thing: int, *, arm: str = "LEFT", status: NodeStatus = "SUCCEEDED", at: tuple[float, float],
+    heading: float = 0.0,
+) -> None:  # fmt: skip
+    stand = PoseValue((*at, 0.0), yaw_quaternion(heading), "map", T0_NS)
+    parameters = {"object_designator": ObjectReference(thing, thing), "arm": arm, "grasp": "FRONT"}
+    node = script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, RobotValue(stand, "ROBOT", 0.3)))
+    script.put(NodeEnded(node, status, None if status == "SUCCEEDED" else FailureValue("a.IKError", "far")))
+
+
+def added(script: Script, name: str, kind: str, at: tuple[float, float, float], heading: float = 0.0) -> int:
+    return script.put(ObjectAdded(name, kind, PoseValue(at, yaw_quaternion(heading), "map", T0_NS)))
+
+
+async def known(log: EventLog, *scripts: Script, arm: Arms | None = None) -> list[PastSuccess]:
+    await stored_and_folded(log, [*declarations(PICK_UP), *(each for script in scripts for each in script.records)])
+    return list(await PickUpExperience(Reading(log)).successes(ObjectType.MILK, arm=arm))
+
+
+async def test_stands_are_as_the_object_saw_them_however_it_was_turned(log: EventLog) -> None:
+    script = Script()
+    milk = added(script, "milk", "MILK", (1.0, 2.0, 0.9), heading=math.pi / 2)
+    picked(script, milk, at=(1.0, 1.3), heading=math.pi / 2)
+    (found,) = await known(log, script)
+    # 0.7 m behind it, where "behind" is against its own x, which points along map's y
+    assert found.stand.position == pytest.approx((-0.7, 0.0, -0.9))
+    assert found.stand.orientation == pytest.approx((0, 0, 0, 1))
+    assert (found.arm, found.grasp, found.torso_height, found.times) == (Arms.LEFT, Grasp.FRONT, 0.3, 1)
+    assert found.score == pytest.approx(2 / 3)
+
+
+async def test_other_types_other_arms_and_what_ended_neither_well_nor_badly_do_not_count(log: EventLog) -> None:
+    script = Script()
+    milk = added(script, "milk", "MILK", (1.0, 0.0, 0.9))
+    bowl = added(script, "bowl", "BOWL", (1.0, 0.0, 0.9))
+    picked(script, milk, at=(0.3, 0.0))
+    picked(script, milk, at=(0.3, 0.0), arm="RIGHT")
+    picked(script, bowl, at=(0.3, 0.0), status="FAILED")
+    for status in ("CANCELLED", "INTERRUPTED", "ERROR", "LOST"):
+        picked(script, milk, at=(0.3, 0.0), status=status)
+    found = await known(log, script)
+    assert [(each.arm, round(each.score, 6)) for each in found] == [(Arms.RIGHT, 0.666667), (Arms.LEFT, 0.666667)]
+    asked = PickUpExperience(Reading(log))
+    assert [each.arm for each in await asked.successes(ObjectType.MILK, arm=Arms.LEFT)] == [Arms.LEFT]
+    assert await asked.successes(ObjectType.SPOON, arm=None) == []
+
+
+async def test_what_was_only_thought_through_does_not_count(log: EventLog) -> None:
+    thought = Script(1)
+    thought.put(EpisodeStarted("thinking", "me", "host", "1.0", "3.11", simulated=True))
+    milk = added(thought, "milk", "MILK", (1.0, 0.0, 0.9))
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "FRONT"}
+    stand = PoseValue((0.3, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", T0_NS)
+    node = thought.put(
+        NodeStarted("action", None, name_of(PICK_UP), parameters, RobotValue(stand, "ROBOT", 0.3), simulated=True)
+    )
+    thought.put(NodeEnded(node, "SUCCEEDED"))
+    done = Script(2)
+    done.put(EpisodeStarted("doing", "me", "host", "1.0", "3.11"))
+    picked(done, added(done, "milk", "MILK", (1.0, 0.0, 0.9)), at=(0.2, 0.0))
+    assert [each.stand.position.x for each in await known(log, thought, done)] == pytest.approx([-0.8])
+
+
+async def test_the_latest_are_looked_at_and_older_ones_are_not(log: EventLog) -> None:
+    script = Script()
+    milk = added(script, "milk", "MILK", (1.0, 0.0, 0.9))
+    picked(script, milk, at=(0.4, 0.0))
+    picked(script, milk, at=(0.2, 0.0))
+    for _ in range(ATTEMPTS_MAX - 1):
+        picked(script, milk, at=(0.0, 0.0), status="FAILED")
+    assert [each.stand.position.x for each in await known(log, script)] == pytest.approx([-0.8])
+
+
+async def test_a_closed_memory_is_not_asked(log: EventLog) -> None:
+    asked = PickUpExperience(Reading(log))
+    asked.over = True
+    with pytest.raises(CallerError, match="is closed: ask while it is open"):
+        await asked.successes(ObjectType.MILK, arm=None)
