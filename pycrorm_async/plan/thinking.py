@@ -32,7 +32,10 @@ class SimulatedTaskTree:
 
     Inside, the current world is a copy of the one there was (none, if there was none), and what is performed
     has no parent outside. However it is left, everything is as it was before; exceptions go through. Thoughts
-    nest, and several tasks may think at once. The chosen robot is that of the context. Entering takes some 25 ms.
+    nest, and several tasks may think at once. Entering takes some 25 ms.
+
+    The chosen robot is that of the context: one whose modules move something outside the world does so in a
+    thought too. Think with `with SimulatedTaskTree() as tree, simulated_robot:` then.
 
     Args:
         description: what a memory calls it; left out, it says which node thinks.
