@@ -19,6 +19,9 @@ from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["Object", "ObjectPart", "BelieveObject", "LocatedObject", "ObjectRemoval", "Attachment", "JointChange"]
 
+_STEPS_MAX = 6
+"""So many relationships away from what a query is about, the whole of a part is loaded with it; none is farther."""
+
 
 class Object(Base):
     """An object of the world at a moment.
@@ -54,7 +57,7 @@ class ObjectPart(Object):
     part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
 
     part_of: Mapped[Object | None] = relationship(
-        foreign_keys=part_of_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=1
+        foreign_keys=part_of_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=_STEPS_MAX
     )
 
     __mapper_args__ = {"polymorphic_identity": "ObjectPart", "polymorphic_load": "inline"}  # noqa: RUF012
@@ -66,7 +69,7 @@ class LocatedObject(Object):
     reference_id: Mapped[int | None] = mapped_column("part_of_id", ForeignKey("object.id"), use_existing_column=True)
 
     reference: Mapped[Object | None] = relationship(
-        foreign_keys=reference_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=1
+        foreign_keys=reference_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=_STEPS_MAX
     )
 
     __mapper_args__ = {"polymorphic_identity": "LocatedObject", "polymorphic_load": "inline"}  # noqa: RUF012
