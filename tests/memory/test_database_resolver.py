@@ -1,0 +1,135 @@
+"""The four tests of the reference system's resolver, under their names: what went well is stored, and done again.
+
+A first plan picks the milk up and remembers it. A second one, in a fresh world, knows nothing but that memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory
+from pycrorm_async.orm import LocationCandidate, LocationResolution
+from pycrorm_async.plan import (
+    DatabaseCostmapLocation,
+    Location,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    ParkArmsActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    simulated_robot,
+)
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.memory.notes import url_of
+
+STAND = Pose([0.6, 0.9, 0.0])
+TORSO = 0.3
+
+
+class Scene(NamedTuple):
+    robot: Object
+    milk: Object
+
+
+@contextmanager
+def scene(*, kitchen: bool = False, milk: Pose | None = None) -> Iterator[Scene]:
+    """A fresh world with robot and milk."""
+    with BulletWorld(), simulated_robot:
+        robot = Object("pr2", ObjectType.ROBOT)
+        if kitchen:
+            Object("kitchen", ObjectType.ENVIRONMENT)
+        yield Scene(robot, Object("milk", ObjectType.MILK, pose=milk or Pose([1.3, 1, 0.9])))
+
+
+@pytest.fixture
+async def memory(tmp_path: Path) -> AsyncIterator[Memory]:
+    """A memory of one success: the milk, from 0.7 m before it and 0.1 m aside, torso up, left arm, from the front."""
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode(description="learning to pick up"):
+            with scene(kitchen=True) as here:
+                await NavigateActionPerformable(STAND).perform()
+                await MoveTorsoActionPerformable(TORSO).perform()
+                await PickUpActionPerformable(here.milk, Arms.LEFT, Grasp.FRONT).perform()
+        await memory.flush()
+        yield memory
+
+
+async def taken_up(place: Location | None, milk: Object) -> Location:
+    """Pick it up as the place says."""
+    assert place is not None
+    assert place.grasp is not None
+    assert place.torso_height is not None
+    await NavigateActionPerformable(place.pose).perform()
+    await MoveTorsoActionPerformable(place.torso_height).perform()
+    await PickUpActionPerformable(milk, place.reachable_arms[0], place.grasp).perform()
+    return place
+
+
+async def test_costmap_no_obstacles(memory: Memory) -> None:
+    with scene() as here:
+        place = await taken_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
+        assert place.pose.distance(STAND) < 1e-9
+        assert (place.reachable_arms, place.grasp, place.torso_height) == ((Arms.LEFT,), Grasp.FRONT, TORSO)
+        assert here.robot.pose.distance(STAND) < 1e-9
+        assert here.robot.attachments == {here.milk: "l_gripper_tool_frame"}
+
+
+async def test_costmap_with_obstacles(memory: Memory) -> None:
+    with scene(kitchen=True) as here:
+        await taken_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
+        assert here.milk.attached_to is here.robot
+        here.robot.detach(here.milk)
+        # Turned round, the stand would be at (2.0, 1.1): less than 0.3 m behind the kitchen's wall.
+        here.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(math.pi)))
+        assert await DatabaseCostmapLocation(here.milk, here.robot).resolve() is None
+
+
+async def test_object_at_different_location(memory: Memory) -> None:
+    turned = yaw_quaternion(math.pi)
+    with scene(kitchen=True, milk=Pose([-1.35, 1.1, 0.95], turned)) as here:
+        place = await taken_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
+        # On the island, turned round: 0.7 m from it on the other side, 0.1 m to the other hand.
+        assert place.pose.position == pytest.approx((-1.35 + 0.7, 1.1 + 0.1, 0.0))
+        assert abs(place.pose.yaw) == pytest.approx(math.pi)
+        await PlaceActionPerformable(here.milk, Arms.LEFT, Pose([-1.3, 1.2, 0.95], turned)).perform()
+        assert here.milk.pose.distance(Pose([-1.3, 1.2, 0.95])) < 1e-6
+        assert here.milk.attached_to is None
+
+
+async def test_multiple_objects(memory: Memory) -> None:
+    with scene(kitchen=True) as here:
+        other = Object("other milk", ObjectType.MILK, pose=Pose([1.3, 0.2, 0.93]))
+        bowl = Object("bowl", ObjectType.BOWL, pose=Pose([1.3, 0.6, 0.9]))
+        before = here.robot.world.save_state()
+        for milk in (here.milk, other):
+            place = await taken_up(await DatabaseCostmapLocation(milk, here.robot).resolve(), milk)
+            assert place.pose.position == pytest.approx((0.6, milk.original_pose.position.y - 0.1, 0.0))
+            assert here.robot.attachments == {milk: "l_gripper_tool_frame"}
+            here.robot.world.restore_state(before)
+        assert await DatabaseCostmapLocation(bowl, here.robot).resolve() is None
+
+
+async def test_the_choice_is_remembered_with_grasp_and_torso_height(memory: Memory) -> None:
+    async with memory.episode(description="doing it again"):
+        with scene(kitchen=True) as here:
+            await ParkArmsActionPerformable(Arms.BOTH).perform()
+            place = await DatabaseCostmapLocation(here.milk, here.robot, Arms.LEFT).resolve()
+            assert place is not None
+            assert await DatabaseCostmapLocation(here.milk, here.robot, Arms.RIGHT).resolve() is None
+    await memory.flush()
+    async with memory.session() as session:
+        chosen, none = (await session.scalars(select(LocationResolution).order_by(LocationResolution.id))).all()
+        (candidate,) = (await session.scalars(select(LocationCandidate))).all()
+    assert (chosen.location, chosen.considered, chosen.offered, chosen.taken) == ("DatabaseCostmapLocation", 1, 1, 0)
+    assert (none.location, none.considered, none.offered, none.taken) == ("DatabaseCostmapLocation", 0, 0, None)
+    assert (candidate.x, candidate.y, candidate.z) == pytest.approx((0.6, 0.9, 0.0))
+    assert (candidate.grasp, candidate.torso_height, candidate.taken) == (Grasp.FRONT, TORSO, True)
+    assert candidate.reachable_arms == [Arms.LEFT]

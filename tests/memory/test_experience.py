@@ -1,0 +1,97 @@
+"""Which memory a plan asks for experience, and what of it is known when."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import CallerError
+from pycrorm_async.plan import (
+    DatabaseCostmapLocation,
+    Location,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    PickUpActionPerformable,
+)
+from pycrorm_async.plan.experience import experience
+from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from tests.memory.test_database_resolver import STAND, TORSO, scene
+
+
+async def pick_up(stand: Pose = STAND, *, torso: float = TORSO) -> None:
+    with scene(kitchen=True) as here:
+        await NavigateActionPerformable(stand).perform()
+        await MoveTorsoActionPerformable(torso).perform()
+        await PickUpActionPerformable(here.milk, Arms.LEFT, Grasp.FRONT).perform()
+
+
+async def asked(known: PickUpExperience | None = None) -> Location | None:
+    with BulletWorld():
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9]))
+        return await DatabaseCostmapLocation(milk, experience=known).resolve()
+
+
+def place_of(found: Location | None) -> tuple[float, float]:
+    assert found is not None
+    return found.pose.position.x, found.pose.position.y
+
+
+async def test_experience_is_there_after_a_flush_also_in_the_same_episode(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory, memory.episode(description="trying"):
+        assert await asked() is None
+        await pick_up()
+        await memory.flush()
+        assert place_of(await asked()) == pytest.approx((0.6, 0.9))
+
+
+async def test_experience_outlives_the_process_that_made_it(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
+        await pick_up()
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
+        assert place_of(await asked()) == pytest.approx((0.6, 0.9))
+    async with Reading.open(f"sqlite:///{tmp_path}/memory.db") as reading:
+        assert place_of(await asked(PickUpExperience(reading))) == pytest.approx((0.6, 0.9))
+
+
+async def test_of_two_memories_the_one_opened_last_is_asked_or_the_one_whose_episode_is_open(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/old.db") as old:
+        await pick_up()
+        await old.flush()
+        async with Memory.open(f"sqlite:///{tmp_path}/new.db"):
+            assert await asked() is None
+            async with old.episode(description="remembering"):
+                assert place_of(await asked()) == pytest.approx((0.6, 0.9))
+            assert await asked() is None
+        assert place_of(await asked()) == pytest.approx((0.6, 0.9))
+    assert experience.get() is None
+
+
+async def test_a_memory_that_is_closed_is_no_longer_asked(tmp_path: Path) -> None:
+    closed = asyncio.Event()
+
+    async def later() -> Location | None:
+        await closed.wait()
+        return await asked()
+
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
+        task = asyncio.create_task(later())
+        await asyncio.sleep(0)
+    closed.set()
+    with pytest.raises(CallerError, match="is closed: ask while it is open"):
+        await task
+    with pytest.raises(CallerError, match="asked of a memory"):
+        await asked()
+
+
+async def test_the_better_way_comes_first(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        async with memory.episode(description="trying"):
+            await pick_up(Pose([0.65, 1.0, 0]))
+            for _ in range(2):
+                await pick_up(Pose([0.5, 0.8, 0]))
+        await memory.flush()
+        assert place_of(await asked()) == pytest.approx((0.5, 0.8))
