@@ -9,7 +9,11 @@ import pytest
 
 from pycrorm_async.plan import (
     BelieveObject,
+    CloseActionPerformable,
+    DetectActionPerformable,
     FaceAtPerformable,
+    GraspingActionPerformable,
+    GripActionPerformable,
     IKError,
     LookAtActionPerformable,
     MoveAndPickUpPerformable,
@@ -17,12 +21,15 @@ from pycrorm_async.plan import (
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     ObjectPart,
+    OpenActionPerformable,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
     PlaceActionPerformable,
+    ReleaseActionPerformable,
     ResolutionError,
     SetGripperActionPerformable,
     TaskStatus,
+    TransportActionPerformable,
     collected_tree,
 )
 from pycrorm_async.plan.designator import ActionAbstract
@@ -60,6 +67,18 @@ def targets(tree: CollectedTree) -> list[Pose]:
         (PlaceActionPerformable, "PlaceAction", "Placing", ["object_designator", "arm", "target_location"]),
         (LookAtActionPerformable, "LookAtAction", "LookingAt", ["target"]),
         (FaceAtPerformable, "FaceAtAction", "LookingAt", ["pose"]),
+        (GripActionPerformable, "GripAction", "Holding", ["gripper", "object_designator", "effort"]),
+        (ReleaseActionPerformable, "ReleaseAction", "Releasing", ["gripper", "object_designator"]),
+        (GraspingActionPerformable, "GraspingAction", "Grasping", ["arm", "object_desig"]),
+        (OpenActionPerformable, "OpenAction", "Opening", ["object_designator", "arm"]),
+        (CloseActionPerformable, "CloseAction", "Closing", ["object_designator", "arm"]),
+        (DetectActionPerformable, "DetectAction", "LookingFor", ["object_designator"]),
+        (
+            TransportActionPerformable,
+            "TransportAction",
+            "Transporting",
+            ["object_designator", "arm", "target_location"],
+        ),
         (
             MoveAndPickUpPerformable,
             "MoveAndPickUpAction",

@@ -5,6 +5,14 @@ from __future__ import annotations
 import pytest
 
 from pycrorm_async.plan import (
+    CloseAction,
+    CloseActionPerformable,
+    DetectAction,
+    DetectActionPerformable,
+    GraspingAction,
+    GraspingActionPerformable,
+    GripAction,
+    GripActionPerformable,
     LookAtAction,
     LookAtActionPerformable,
     MoveTorsoAction,
@@ -12,14 +20,21 @@ from pycrorm_async.plan import (
     NavigateAction,
     NavigateActionPerformable,
     ObjectDesignatorDescription,
+    ObjectPart,
+    OpenAction,
+    OpenActionPerformable,
     ParkArmsAction,
     ParkArmsActionPerformable,
     PickUpAction,
     PickUpActionPerformable,
     PlaceAction,
     PlaceActionPerformable,
+    ReleaseAction,
+    ReleaseActionPerformable,
     SetGripperAction,
     SetGripperActionPerformable,
+    TransportAction,
+    TransportActionPerformable,
 )
 from pycrorm_async.plan.failures import IllPosedGoalFailure, ObjectNotFound
 from pycrorm_async.plan.objects import designator_of
@@ -38,6 +53,27 @@ def test_resolving_takes_the_first_of_each() -> None:
     assert SetGripperAction(grippers=[Arms.LEFT], motions=[GripperState.OPEN]).resolve() == SetGripperActionPerformable(
         Arms.LEFT, GripperState.OPEN
     )
+
+
+def test_what_hands_and_eyes_do_takes_objects_and_handles(scene: Scene) -> None:
+    milk = ObjectDesignatorDescription(names=["milk"])
+    meant = designator_of(scene.milk)
+    handles = [ObjectPart(f"{name}_handle", scene.kitchen) for name in ("fridge_door", "sink_area_drawer")]
+    both = [Arms.RIGHT, Arms.LEFT]
+    assert GripAction(both, milk, [20.0, 5]).resolve() == GripActionPerformable(Arms.RIGHT, meant, 20.0)
+    assert ReleaseAction(both, object_designator_description=scene.milk).resolve() == ReleaseActionPerformable(
+        Arms.RIGHT, scene.milk
+    )
+    assert GraspingAction(arms=both, object_description=handles).resolve() == GraspingActionPerformable(
+        Arms.RIGHT, handles[0]
+    )
+    assert OpenAction(handles, arms=both).resolve() == OpenActionPerformable(handles[0], Arms.RIGHT)
+    assert CloseAction(handles[1], both).resolve() == CloseActionPerformable(handles[1], Arms.RIGHT)
+    assert DetectAction(object_designator_description=milk).resolve() == DetectActionPerformable(meant)
+    assert TransportAction(milk, both, target_locations=[THERE, HERE]).resolve() == TransportActionPerformable(
+        meant, Arms.RIGHT, THERE
+    )
+    assert list(OpenAction(handles, both)) == [OpenActionPerformable(handle, arm) for handle in handles for arm in both]
 
 
 def test_iterating_gives_every_combination_the_last_property_fastest() -> None:

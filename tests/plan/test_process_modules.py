@@ -8,8 +8,11 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import (
+    AccessingMotion,
     ChosenRobot,
+    ClosingMotion,
     CostmapLocation,
+    DetectingMotion,
     IKError,
     LookingMotion,
     MoveArmJointsMotion,
@@ -20,13 +23,16 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     NoRobotChosen,
     NoRobotHere,
+    ObjectPart,
+    OpeningMotion,
     PlanFailure,
     TaskStatus,
+    WorldStateDetectingMotion,
     collected_tree,
     simulated_robot,
     simulated_robot_within,
 )
-from pycrorm_async.plan.failures import GripperGoalNotReached, ReachabilityFailure
+from pycrorm_async.plan.failures import CapabilityAbsenceFailure, GripperGoalNotReached, ReachabilityFailure
 from pycrorm_async.world import Arms, BulletWorld, GripperState, Limits, Object, ObjectType, Pose, WorldMode
 from pycrorm_async.world.errors import NoWorld
 from tests.plan.conftest import Scene
@@ -120,6 +126,27 @@ async def test_a_choice_nests_and_ends_with_its_block_also_by_an_exception(scene
         await NavigateActionPerformable(THERE).perform()
     assert (outer.asked, inner.asked) == (["navigate"], ["move_gripper"])
     assert scene.robot.pose == THERE
+
+
+async def test_a_robot_written_before_a_motion_existed_cannot_do_it_and_says_so(scene: Scene) -> None:
+    part, noting = ObjectPart("fridge_door_handle", scene.kitchen), Noting()
+    motions = {
+        "open": OpeningMotion(part, Arms.LEFT),
+        "close": ClosingMotion(part, Arms.LEFT),
+        "accessing": AccessingMotion(scene.kitchen, Arms.LEFT, "gripper", "joint", "handle", 0.1),
+        "detecting": DetectingMotion(ObjectType.MILK),
+        "world_state_detecting": WorldStateDetectingMotion(ObjectType.MILK),
+    }
+    before = scene.world.save_state()
+    with ChosenRobot("old", noting):
+        for module, motion in motions.items():
+            name = type(motion).__name__
+            with collected_tree() as tree, pytest.raises(CapabilityAbsenceFailure) as caught:
+                await motion.perform()
+            assert caught.value.message == f"the old robot cannot do {name}: Noting has no method {module!r}"
+            assert caught.value.data == ("old", name)
+            assert [node.status for node in tree] == [TaskStatus.FAILED]
+    assert (scene.world.save_state(), noting.asked) == (before, [])
 
 
 async def test_a_choice_belongs_to_its_context() -> None:
