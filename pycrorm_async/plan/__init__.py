@@ -38,8 +38,9 @@ from pycrorm_async.plan.descriptions import (
 )
 from pycrorm_async.plan.designator import ActionAbstract, BaseMotion, Designator
 from pycrorm_async.plan.errors import NoRobotChosen, NoRobotHere, PerformNotAsync, ResolutionError
-from pycrorm_async.plan.failures import IKError, PlanFailure
+from pycrorm_async.plan.failures import IKError, PlanFailure, PlanFailures
 from pycrorm_async.plan.fetching import DetectActionPerformable, TransportActionPerformable
+from pycrorm_async.plan.language import Code, Parallel, Repeat, Sequential, TryAll, TryInOrder
 from pycrorm_async.plan.locations import (
     AccessingLocation,
     CostmapLocation,
@@ -55,6 +56,7 @@ from pycrorm_async.plan.manipulation import (
     OpenActionPerformable,
     ReleaseActionPerformable,
 )
+from pycrorm_async.plan.monitoring import Monitor
 from pycrorm_async.plan.motions import (
     AccessingMotion,
     ClosingMotion,
@@ -76,6 +78,7 @@ from pycrorm_async.plan.objects import (
     ObjectDesignatorDescription,
     ObjectPart,
 )
+from pycrorm_async.plan.outcome import Outcome
 from pycrorm_async.plan.process_modules import (
     ChosenRobot,
     MovingModules,
@@ -84,6 +87,8 @@ from pycrorm_async.plan.process_modules import (
     simulated_robot_within,
 )
 from pycrorm_async.plan.remembered_places import DatabaseCostmapLocation
+from pycrorm_async.plan.resources import Resource
+from pycrorm_async.plan.retrying import Retry
 from pycrorm_async.plan.task_tree import CollectedTree, TaskStatus, TaskTreeNode, collected_tree
 from pycrorm_async.plan.thinking import SimulatedTaskTree
 
@@ -92,7 +97,18 @@ __all__ = [
     "ActionAbstract",
     "BaseMotion",
     "PlanFailure",
+    "PlanFailures",
     "IKError",
+    "Resource",
+    "Sequential",
+    "TryInOrder",
+    "Parallel",
+    "TryAll",
+    "Repeat",
+    "Monitor",
+    "Code",
+    "Retry",
+    "Outcome",
     "simulated_robot",
     "simulated_robot_within",
     "ProcessModules",

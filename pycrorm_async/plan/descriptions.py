@@ -21,6 +21,7 @@ from pycrorm_async.plan.actions import (
     PlaceActionPerformable,
     SetGripperActionPerformable,
 )
+from pycrorm_async.plan.composing import Composable
 from pycrorm_async.plan.failures import IllPosedGoalFailure
 from pycrorm_async.plan.fetching import DetectActionPerformable, TransportActionPerformable
 from pycrorm_async.plan.manipulation import (
@@ -57,7 +58,7 @@ P = TypeVar("P")
 Objects: TypeAlias = ObjectDesignatorDescription | ObjectLike | Sequence[ObjectLike]
 
 
-class ActionDescription(Generic[P]):
+class ActionDescription(Composable, Generic[P]):
     """What every description does; alternatives are given by name, in the order of the performable's fields.
 
     Objects that are described are looked for in the world each time it is asked.

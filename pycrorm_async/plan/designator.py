@@ -17,6 +17,7 @@ import inspect
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
+from pycrorm_async.plan.composing import Composable
 from pycrorm_async.plan.errors import PerformNotAsync, ResourcesNotAMethod
 from pycrorm_async.plan.performing import as_node, is_node
 from pycrorm_async.plan.properties import check_properties
@@ -26,7 +27,7 @@ from pycrorm_async.plan.task_tree import NodeKind
 __all__ = ["Designator", "ActionAbstract", "BaseMotion"]
 
 
-class Designator(ABC):
+class Designator(Composable, ABC):
     """The root of everything performable. Descend from `ActionAbstract` or `BaseMotion`.
 
     Class attributes:

@@ -10,13 +10,20 @@ pycrorm_async.plan.failures.ObjectUnreachable: cereal is out of reach
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Self
+
+from pycrorm_async.plan.resources import Resource
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
 
 __all__ = [
     "PlanFailure",
+    "PlanFailures",
     "is_plan_failure",
+    "in_words",
     "IKError",
+    "ResourceDeadlock",
     "NotALanguageExpression",
     "FailureDiagnosis",
     "LowLevelFailure",
@@ -95,6 +102,49 @@ class PlanFailure(Exception):
         return self.message
 
 
+class PlanFailures(PlanFailure, ExceptionGroup[Exception]):
+    """Several plan failures that happened in one expression: `except PlanFailure` and `except* IKError` both work.
+
+    Args:
+        message: for people; names each.
+        failures: plan failures, or groups of nothing else.
+    """
+
+    def __new__(cls, message: str, failures: Sequence[Exception]) -> Self:
+        return super().__new__(cls, message, failures)
+
+    def __init__(self, message: str, failures: Sequence[Exception]) -> None:
+        # Not that of `PlanFailure`: a group has its message already.
+        Exception.__init__(self, message, failures)
+
+    @property
+    def data(self) -> tuple[object, ...]:
+        """The failures."""
+        return self.exceptions
+
+    def derive(self, failures: Sequence[Exception], /) -> PlanFailures:  # type: ignore[override]  # as documented
+        return PlanFailures(self.message, failures)
+
+
+def in_words(error: BaseException) -> str:
+    """Class and message in one short line. Never raises.
+
+    >>> in_words(ObjectLost("the gripper is empty"))
+    'ObjectLost: the gripper is empty'
+    """
+    name = type(error).__name__
+    try:
+        message = " ".join(str(error).split())
+    except Exception:  # noqa: BLE001  a user's __str__ may raise anything
+        return name
+    if len(message) > _WORDS_LENGTH_MAX:
+        message = f"{message[: _WORDS_LENGTH_MAX - 1]}…"
+    return f"{name}: {message}" if message else name
+
+
+_WORDS_LENGTH_MAX = 200
+
+
 def is_plan_failure(error: BaseException) -> bool:
     """Whether it says that a plan failed: a plan failure, or a group of nothing else (what a `TaskGroup` raises)."""
     if isinstance(error, ExceptionGroup):
@@ -121,6 +171,27 @@ class IKError(PlanFailure):
         self.arm = arm
         self.tip_frame = tip_frame
         self.reason = reason
+
+
+class ResourceDeadlock(PlanFailure):
+    """A part of the robot can never be had: who holds it waits, in the end, for the one that wants it.
+
+    Attributes:
+        resource: the part.
+        held_by, wanted_by: the designators' types.
+        waits_for: the type of the one around `wanted_by` that cannot end before.
+    """
+
+    def __init__(self, resource: Resource, held_by: str, wanted_by: str, waits_for: str) -> None:
+        super().__init__(
+            f"{wanted_by} would wait for {resource.name} for ever: {held_by} holds it and waits, in the end, for"
+            f" {waits_for}, which {wanted_by} is part of"
+        )
+        self.args = (resource, held_by, wanted_by, waits_for)
+        self.resource = resource
+        self.held_by = held_by
+        self.wanted_by = wanted_by
+        self.waits_for = waits_for
 
 
 # --- diagnoses: what the plan can be told went wrong --------------------------------------------------------

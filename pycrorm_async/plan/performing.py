@@ -1,9 +1,10 @@
 """What happens around a `perform`: a node starts before it, ends after it, and whoever records is told both.
 
-The order is always the same: give the loop a turn if one is due, wait for room if the recorder asks for it,
-tell it that the node starts (it may refuse; then nothing has happened), perform, set status, failure, result
-and end, make the parent current again, tell the recorder that it met at the start. This runs for every node
-of every plan: it costs a few µs.
+The order is always the same: give the loop a turn if one is due, ask monitors and wait for parts of the robot
+(`plan.surroundings`), wait for room if the recorder asks for it, tell it that the node starts (it may refuse;
+then nothing has happened), perform, set status, failure, result and end, make the parent current again, tell
+the recorder that it met at the start, give free what was claimed. This runs for every node of every plan: it
+costs a few µs.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from pycrorm_async.clock import monotonic_ns
 from pycrorm_async.plan.failures import is_plan_failure
 from pycrorm_async.plan.ports import recorder
+from pycrorm_async.plan.surroundings import Surroundings, surroundings
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collecting, current_node
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ TURN_NS_MAX = 20_000_000
 
 _last_turn_ns: ContextVar[int] = ContextVar("_last_turn_ns", default=0)
 _MARK = "__makes_node__"
+_RUNNING, _SUCCEEDED = TaskStatus.RUNNING, TaskStatus.SUCCEEDED  # asking the enum costs more
 
 
 def is_node(perform: Any) -> bool:
@@ -46,41 +49,61 @@ def as_node(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable[[Any
             return await perform(self)
         now_ns = monotonic_ns()
         if now_ns - _last_turn_ns.get() > TURN_NS_MAX:
-            await asyncio.sleep(0)
+            now_ns = await _turn()
+        around, claim = surroundings.get(), None
+        if around is not None:
+            claim = await around.entered(self)
             now_ns = monotonic_ns()
-            _last_turn_ns.set(now_ns)
-        observer = recorder.get()
-        if observer is not None and (admission := observer.admit()) is not None:
-            await admission
-            now_ns = monotonic_ns()
-
-        node = TaskTreeNode(self, self.kind, parent, now_ns)
-        if observer is not None:
-            observer.node_started(node)
-        for tree in collecting.get():
-            tree.add(node)
-        token = current_node.set(node)
         try:
-            node.result = result = await perform(self)
-            node.status = TaskStatus.SUCCEEDED
-        except asyncio.CancelledError as cancelled:
-            node.status, node.failure = TaskStatus.CANCELLED, cancelled
-            raise
-        except BaseException as error:
-            node.status, node.failure = TaskStatus.FAILED if is_plan_failure(error) else TaskStatus.ERROR, error
-            raise
-        finally:
-            node.ended_ns = monotonic_ns()
-            _leave(token)
+            observer = recorder.get()
+            if observer is not None and (admission := observer.admit()) is not None:
+                await admission
+                now_ns = monotonic_ns()
+
+            node = TaskTreeNode(self, self.kind, parent, now_ns)
             if observer is not None:
-                observer.node_ended(node)
-            # The traceback of a failure holds this frame, and the node holds the failure: no cycle for the
-            # collector.
-            del node, parent, token
+                observer.node_started(node)
+            for tree in collecting.get():
+                tree.add(node)
+            token = current_node.set(node)
+            try:
+                node.result = result = await perform(self)
+                if node.status is _RUNNING:  # a monitor may say otherwise
+                    node.status = _SUCCEEDED
+            except BaseException as error:
+                node.status, node.failure = _status(error, around), error
+                raise
+            finally:
+                node.ended_ns = monotonic_ns()
+                _leave(token)
+                if observer is not None:
+                    observer.node_ended(node)
+                # The traceback of a failure holds this frame, and the node holds the failure: no cycle for the
+                # collector.
+                del node, parent, token
+        finally:
+            if claim is not None:
+                claim.release()
         return result
 
     setattr(performed, _MARK, True)
     return performed
+
+
+async def _turn() -> int:
+    """Let the loop turn; the time after that, ns."""
+    await asyncio.sleep(0)
+    now_ns = monotonic_ns()
+    _last_turn_ns.set(now_ns)
+    return now_ns
+
+
+def _status(error: BaseException, around: Surroundings | None) -> TaskStatus:
+    """What it means for a node that this was raised in it."""
+    if isinstance(error, asyncio.CancelledError):
+        interrupted = around is not None and around.interrupted
+        return TaskStatus.INTERRUPTED if interrupted else TaskStatus.CANCELLED
+    return TaskStatus.FAILED if is_plan_failure(error) else TaskStatus.ERROR
 
 
 def _leave(token: Token[TaskTreeNode | None]) -> None:

@@ -8,12 +8,23 @@ import pytest
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.plan import failures
-from pycrorm_async.plan.failures import IKError, PlanFailure
+from pycrorm_async.plan.failures import (
+    IKError,
+    ObjectLost,
+    PlanFailure,
+    PlanFailures,
+    ResourceDeadlock,
+    in_words,
+    is_plan_failure,
+)
+from pycrorm_async.plan.resources import Resource
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
 
 TREE = """
 PlanFailure
+  PlanFailures
+  ResourceDeadlock
   NotALanguageExpression
   FailureDiagnosis
     LowLevelFailure
@@ -92,10 +103,10 @@ def test_the_tree_is_the_one_that_plans_know() -> None:
         if isinstance(kind, type) and issubclass(kind, PlanFailure)
     }
     assert found == parents()
-    assert sorted(failures.__all__) == sorted([*found, "is_plan_failure"])
+    assert sorted(failures.__all__) == sorted([*found, "is_plan_failure", "in_words"])
 
 
-@pytest.mark.parametrize("name", sorted(set(parents()) - {"IKError"}))
+@pytest.mark.parametrize("name", sorted(set(parents()) - {"IKError", "PlanFailures", "ResourceDeadlock"}))
 def test_every_failure_takes_a_message_and_data(name: str) -> None:
     kind: type[PlanFailure] = getattr(failures, name)
     failure = kind("the drawer is stuck", "drawer", 0.3)
@@ -123,3 +134,48 @@ def test_an_ik_error_says_who_should_have_got_where() -> None:
 def test_a_plan_failure_is_an_outcome_and_no_fault_of_the_package() -> None:
     assert not issubclass(PlanFailure, PycrormError)
     assert issubclass(PlanFailure, Exception)
+
+
+def test_several_failures_are_a_plan_failure_and_a_group() -> None:
+    one, two = ObjectLost("gone", "milk"), IKError(Pose([1, 2, 3]), Arms.LEFT, "tool")
+    both = PlanFailures("2 of 2 branches failed", [one, two])
+    assert is_plan_failure(both)
+    assert (str(both), both.message, both.data) == ("2 of 2 branches failed",) * 2 + ((one, two),)
+    again = pickle.loads(pickle.dumps(both))
+    assert (type(again), str(again), [type(each) for each in again.exceptions]) == (
+        PlanFailures,
+        str(both),
+        [ObjectLost, IKError],
+    )
+    caught: list[BaseException] = []
+    try:
+        raise both
+    except* IKError as unreachable:
+        caught.append(unreachable)
+    except* PlanFailure as rest:
+        caught.append(rest)
+    assert [(type(each), each.exceptions) for each in caught if isinstance(each, PlanFailures)] == [
+        (PlanFailures, (two,)),
+        (PlanFailures, (one,)),
+    ]
+
+
+def test_a_wait_without_end_names_the_part_and_the_three_concerned() -> None:
+    failure = ResourceDeadlock(Resource.BASE, "PickUpAction", "NavigateAction", "Tidying")
+    assert str(failure) == (
+        "NavigateAction would wait for BASE for ever: PickUpAction holds it and waits, in the end, for Tidying,"
+        " which NavigateAction is part of"
+    )
+    again = pickle.loads(pickle.dumps(failure))
+    assert (again.args, str(again)) == (failure.args, str(failure))
+
+
+def test_an_exception_is_put_in_a_short_line_whatever_it_is() -> None:
+    class Broken(Exception):
+        def __str__(self) -> str:
+            raise ValueError
+
+    assert in_words(ObjectLost("the gripper\nis empty")) == "ObjectLost: the gripper is empty"
+    assert in_words(ObjectLost()) == "ObjectLost"
+    assert in_words(Broken()) == "Broken"
+    assert in_words(ObjectLost("x" * 300)) == f"ObjectLost: {'x' * 199}…"
