@@ -22,7 +22,7 @@ from pycrorm_async.plan.here import RobotHere, robot_here
 from pycrorm_async.plan.motions import ClosingMotion, MoveGripperMotion, MoveTCPMotion, OpeningMotion
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart, in_world
 from pycrorm_async.plan.resources import Resource, reaching
-from pycrorm_async.world.enums import Arms, GripperState
+from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 from pycrorm_async.world.objects import Object
 
 __all__ = [
@@ -41,11 +41,12 @@ class GripActionPerformable(CheckedAction):
     The arm does not move. An object that hung on something else is taken over.
 
     Raises:
-        GripperClosedCompletely: it would, for the tool frame is farther from the object's bounding box than
-            `HOLD_DISTANCE_M_MAX`.
+        GripperClosedCompletely: it would, for the tool frame is farther than `HOLD_DISTANCE_M_MAX` from the bounding
+            boxes of all the object's links.
         EndEffectorFailure: the gripper holds something else.
         PerceptionObjectNotInWorld: there is no such object.
-        IllPosedGoalFailure, CapabilityAbsenceFailure: not one arm, or an effort below zero; no such arm.
+        IllPosedGoalFailure: not one arm, an effort below zero, or furniture or a robot is to be held.
+        CapabilityAbsenceFailure: the robot has no such arm.
     """
 
     concept: ClassVar[str | None] = "Holding"
@@ -63,8 +64,11 @@ class GripActionPerformable(CheckedAction):
         wanted = in_world(self.object_designator)
         if not self.effort >= 0:
             raise IllPosedGoalFailure(f"an effort of {self.effort} N holds nothing", self.effort)
+        if wanted.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
+            raise IllPosedGoalFailure(f"{wanted.name} is nothing that a gripper can hold", wanted.name)
         _check_free(robot, self.gripper, wanted)
-        apart = between(robot.body.link_pose(tool_frame), wanted.bounding_box())
+        tool = robot.body.link_pose(tool_frame)
+        apart = min(between(tool, wanted.bounding_box(link)) for link in wanted.links)
         if apart > HOLD_DISTANCE_M_MAX:
             message = f"the {self.gripper.name} gripper would close on nothing: {wanted.name} is {apart:.3f} m from it"
             raise GripperClosedCompletely(message, wanted.name, apart)

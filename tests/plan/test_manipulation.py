@@ -44,7 +44,7 @@ from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
 from tests.plan.test_actions import shape
-from tests.world.witness import Matrix, Witness, X, Y, Z, matrix, shifted, turned
+from tests.world.witness import CRANE, Matrix, Witness, X, Y, Z, matrix, shifted, turned
 
 LEFT_TOOL, RIGHT_TOOL = "l_gripper_tool_frame", "r_gripper_tool_frame"
 
@@ -270,6 +270,26 @@ async def test_what_is_not_in_the_world_is_neither_held_nor_grasped_nor_brought(
         ):
             with pytest.raises(PerceptionObjectNotInWorld, match=f"{meant.name} is not an object of the world"):
                 await action.perform()
+    assert scene.world.save_state() == before
+
+
+async def test_a_thing_of_several_links_is_held_only_where_it_is(scene: Scene) -> None:
+    """The crane's whole box reaches up to its flag, its lowest link is 0.2 m high."""
+    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([1.3, 1, 0.6]))
+    await reached(scene, 1.2)
+    assert crane.bounding_box().min.z < 0.9 < crane.bounding_box().max.z
+    with pytest.raises(GripperClosedCompletely, match=r"crane is 0\.100 m from it"):
+        await GripActionPerformable(Arms.LEFT, crane, 1.0).perform()
+    crane.set_pose(Pose([1.3, 1, 0.8]))
+    await GripActionPerformable(Arms.LEFT, crane, 1.0).perform()
+    assert scene.robot.attachments == {crane: LEFT_TOOL}
+
+
+async def test_neither_furniture_nor_the_robot_is_held(scene: Scene) -> None:
+    before = scene.world.save_state()
+    for thing in (scene.kitchen, scene.robot):
+        with pytest.raises(IllPosedGoalFailure, match=f"{thing.name} is nothing that a gripper can hold"):
+            await GripActionPerformable(Arms.LEFT, thing, 1.0).perform()
     assert scene.world.save_state() == before
 
 
