@@ -31,7 +31,7 @@ from pycrorm_async.plan.manipulation import (
     OpenActionPerformable,
     ReleaseActionPerformable,
 )
-from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike
+from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike, ObjectPart
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.pose import Pose
 
@@ -56,6 +56,7 @@ __all__ = [
 P = TypeVar("P")
 
 Objects: TypeAlias = ObjectDesignatorDescription | ObjectLike | Sequence[ObjectLike]
+Handles: TypeAlias = ObjectPart | Sequence[ObjectPart]
 
 
 class ActionDescription(Composable, Generic[P]):
@@ -192,14 +193,14 @@ class GraspingAction(ActionDescription[GraspingActionPerformable]):
 class OpenAction(ActionDescription[OpenActionPerformable]):
     """Open a drawer or a door by one of these handles."""
 
-    def __init__(self, object_designator_description: Objects, arms: Iterable[Arms]) -> None:
+    def __init__(self, object_designator_description: Handles, arms: Iterable[Arms]) -> None:
         super().__init__(OpenActionPerformable, object_designator=_objects(object_designator_description), arm=arms)
 
 
 class CloseAction(ActionDescription[CloseActionPerformable]):
     """Close a drawer or a door by one of these handles."""
 
-    def __init__(self, object_designator_description: Objects, arms: Iterable[Arms]) -> None:
+    def __init__(self, object_designator_description: Handles, arms: Iterable[Arms]) -> None:
         super().__init__(CloseActionPerformable, object_designator=_objects(object_designator_description), arm=arms)
 
 
