@@ -1,0 +1,71 @@
+"""The scene and the plan that the tests of PyCRAM share, with our names: robot, kitchen, milk and cereal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import Select
+
+from pycrorm_async import Memory
+from pycrorm_async.plan import MoveTorsoAction, NavigateAction, ObjectDesignatorDescription, PickUpAction, PlaceAction
+from pycrorm_async.plan import simulated_robot as simulated
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from tests.plan.conftest import Scene
+from tests.promises.remembering import asked, url_of
+
+DESCRIPTION = "the common plan"
+
+
+@contextmanager
+def kitchen() -> Iterator[Scene]:
+    """The scene; motions are simulated."""
+    with BulletWorld() as world, simulated:
+        yield Scene(
+            world,
+            Object("pr2", ObjectType.ROBOT),
+            Object("kitchen", ObjectType.ENVIRONMENT),
+            Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9])),
+            Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95])),
+        )
+
+
+@pytest.fixture
+def scene() -> Iterator[Scene]:
+    with kitchen() as there:
+        yield there
+
+
+async def common_plan() -> None:
+    """Drive, lift the torso, pick the milk up and put it back: 4 actions and 10 motions."""
+    milk = ObjectDesignatorDescription(names=["milk"])
+    await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
+    await MoveTorsoAction([0.3]).resolve().perform()
+    await PickUpAction(milk, [Arms.LEFT], [Grasp.FRONT]).resolve().perform()
+    await PlaceAction(milk, [Pose([1.3, 1, 0.9])], [Arms.LEFT]).resolve().perform()
+
+
+class Remembered:
+    """A memory that is closed, and asked."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    async def all(self, statement: Select[Any]) -> list[Any]:
+        return await asked(self.folder, statement)
+
+    async def one(self, statement: Select[Any]) -> Any:
+        (found,) = await self.all(statement)
+        return found
+
+
+@pytest.fixture
+async def planned(tmp_path: Path) -> Remembered:
+    """The common plan was performed in an episode of a new memory."""
+    async with Memory.open(url_of(tmp_path)) as memory, memory.episode(description=DESCRIPTION):
+        with kitchen():
+            await common_plan()
+    return Remembered(tmp_path)

@@ -1,0 +1,294 @@
+"""PyCRAM's tests of its ORM (July 2024), by name; what each was to assert is asserted here of our tables.
+
+Names and the common plan are facts of that system, the bodies are ours. Where ours differs by design, our own number is
+asserted, reckoned beside it.
+"""
+# ruff: noqa: N802  the names are theirs
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from sqlalchemy import func, select
+
+from pycrorm_async import Memory
+from pycrorm_async.orm import (
+    Action,
+    CloseAction,
+    DetectAction,
+    LookAtAction,
+    Motion,
+    MoveTorsoAction,
+    NavigateAction,
+    Object,
+    ObjectPart,
+    OpenAction,
+    ParkArmsAction,
+    PickUpAction,
+    PickUpWithContextView,
+    PlaceAction,
+    Position,
+    ProcessMetaData,
+    Quaternion,
+    RobotState,
+    SetGripperAction,
+    TaskTreeNode,
+    TransportAction,
+)
+from pycrorm_async.orm import Pose as PoseRow
+from pycrorm_async.plan import CloseAction as Close
+from pycrorm_async.plan import (
+    DetectActionPerformable,
+    LookAtActionPerformable,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    OpenActionPerformable,
+    ParkArmsActionPerformable,
+    SetGripperActionPerformable,
+    TransportActionPerformable,
+    collected_tree,
+)
+from pycrorm_async.plan import ObjectPart as Part
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.promises.remembering import at, url_of
+from tests.upstream.conftest import DESCRIPTION, Remembered, common_plan, kitchen
+
+
+async def test_schema_creation(tmp_path: Path) -> None:
+    """All tables are there before anything was performed, under their lower-case names."""
+    async with Memory.open(url_of(tmp_path)):
+        pass
+    with sqlite3.connect(tmp_path / "memory.db") as file:
+        present = {name for (name,) in file.execute("SELECT name FROM sqlite_schema WHERE type IN ('table', 'view')")}
+    file.close()
+    assert {
+        "position",
+        "quaternion",
+        "task_tree_node",
+        "action",
+        "park_arms_action",
+        "navigate_action",
+        "move_torso_action",
+        "set_gripper_action",
+        "release_action",
+        "grip_action",
+        "pick_up_action",
+        "place_action",
+        "transport_action",
+        "look_at_action",
+        "detect_action",
+        "open_action",
+        "close_action",
+    } <= present
+
+
+async def test_node(planned: Remembered) -> None:
+    # the root, 4 actions; 1 motion of the drive, 1 of the torso, 5 of the pick-up, 3 of the placing
+    assert len(await planned.all(select(TaskTreeNode))) == 1 + 4 + 10
+    # 4 objects when they were added; the robot's at each of 14 designators; targets: of 2 actions, of 1 drive, of
+    # 3 + 2 motions of the hand; moved: the robot once, the milk when it was lifted and when it was brought down
+    poses = 4 + 14 + 2 + 1 + 5 + 1 + 2
+    assert len(await planned.all(select(PoseRow))) == poses
+    assert len(await planned.all(select(Position))) == poses
+    assert len(await planned.all(select(Quaternion))) == poses
+    assert await planned.all(select(ParkArmsAction)) == []
+    assert len(await planned.all(select(NavigateAction))) == 1
+    assert len(await planned.all(select(Action))) == 4
+    assert {type(each) for each in await planned.all(select(Action))} == {
+        NavigateAction,
+        MoveTorsoAction,
+        PickUpAction,
+        PlaceAction,
+    }
+
+
+async def test_metadata_existence(planned: Remembered) -> None:
+    poses = await planned.all(select(PoseRow))
+    assert poses
+    assert {each.process_metadata.description for each in poses} == {DESCRIPTION}
+
+
+async def test_task_tree_node_parents(planned: Remembered) -> None:
+    nodes = {each.id: each for each in await planned.all(select(TaskTreeNode))}
+    roots = [each for each in nodes.values() if each.parent is None]
+    assert [each.parent_id for each in roots] == [None]
+    for each in nodes.values():
+        if each.parent is not None:
+            assert each.parent is nodes[each.parent_id]
+    # every action is below the root, every motion below its action
+    assert {each.parent.kind for each in nodes.values() if each.kind == "action"} == {"root"}
+    below = [(each.dtype, each.parent.dtype) for each in nodes.values() if each.kind == "motion"]
+    assert [parent for _, parent in below] == [
+        "NavigateAction",
+        "MoveTorsoAction",
+        *["PickUpAction"] * 5,
+        *["PlaceAction"] * 3,
+    ]
+
+
+async def test_meta_data(planned: Remembered) -> None:
+    metadata = await planned.one(select(ProcessMetaData))
+    assert metadata.status == "SUCCEEDED"
+    for mapped in (Action, Motion, Object, RobotState, TaskTreeNode):
+        rows = await planned.all(select(mapped))
+        assert rows
+        assert {each.process_metadata_id for each in rows} == {metadata.id}
+    assert await planned.all(select(ParkArmsAction)) == []
+
+
+async def test_meta_data_alternation(tmp_path: Path) -> None:
+    """The description one gives is stored, and belongs to that episode alone."""
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with kitchen():
+            for description in ("meta_data_alternation_test", "and another"):
+                async with memory.episode(description=description):
+                    await ParkArmsActionPerformable(Arms.LEFT).perform()
+    parked = await Remembered(tmp_path).all(select(ParkArmsAction).order_by(ParkArmsAction.id))
+    assert [each.process_metadata.description for each in parked] == ["meta_data_alternation_test", "and another"]
+
+
+async def test_pose(planned: Remembered) -> None:
+    for pose in await planned.all(select(PoseRow)):
+        assert (pose.position.x, pose.position.y, pose.position.z) == (pose.x, pose.y, pose.z)
+        turn = pose.orientation
+        assert (turn.x, turn.y, turn.z, turn.w) == (pose.qx, pose.qy, pose.qz, pose.qw)
+        assert math.hypot(turn.x, turn.y, turn.z, turn.w) == pytest.approx(1)
+
+
+async def test_pose_mixin(planned: Remembered) -> None:
+    states = await planned.all(select(RobotState))
+    assert len(states) == 14
+    for state in states:
+        assert state.pose_id == state.pose.id
+    assert [(at(each.pose), each.torso_height) for each in states] == [
+        *[((0, 0, 0), 0.0)] * 2,  # the drive begins where the robot was put
+        *[((0.6, 0.4, 0), 0.0)] * 2,  # so does the torso
+        *[((0.6, 0.4, 0), 0.3)] * 10,
+    ]
+
+
+async def test_plan_serialization(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
+        with kitchen(), collected_tree() as tree:
+            await common_plan()
+    remembered = Remembered(tmp_path)
+    performed = len(await remembered.all(select(Action))) + len(await remembered.all(select(Motion)))
+    assert len(tree) == performed == 14
+
+
+async def test_code_designator_type(planned: Remembered) -> None:
+    first, second, *_ = await planned.all(
+        select(TaskTreeNode).where(TaskTreeNode.action_id.is_not(None)).order_by(TaskTreeNode.start_ns)
+    )
+    assert [each.action.dtype for each in (first, second)] == ["NavigateAction", "MoveMotion"]
+    assert first.start_time <= datetime.now(UTC)
+    assert (datetime.now(UTC) - first.start_time) < timedelta(minutes=10)
+    assert second.status is TaskStatus.SUCCEEDED
+
+
+async def test_parkArmsAction(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
+        with kitchen():
+            await ParkArmsActionPerformable(Arms.BOTH).perform()
+    park = await Remembered(tmp_path).one(select(ParkArmsAction))
+    assert (park.dtype, park.arm) == ("ParkArmsAction", Arms.BOTH)
+
+
+async def test_transportAction(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
+        with kitchen() as scene:
+            await MoveTorsoActionPerformable(0.3).perform()
+            island = Pose([-1.35, 0.78, 0.95], yaw_quaternion(math.pi))
+            await TransportActionPerformable(scene.milk, Arms.LEFT, island).perform()
+            resting = scene.milk.pose
+    remembered = Remembered(tmp_path)
+    transport = await remembered.one(select(TransportAction))
+    milk = await remembered.all(select(Object).where(Object.name == "milk").order_by(Object.id))
+    assert transport.object.id == milk[0].id
+    assert at(transport.object.pose) == at(milk[0].pose) == (1.3, 1, 0.9)
+    assert at(transport.pose) == (-1.35, 0.78, 0.95)
+    assert at(milk[-1].pose) == resting.position
+
+
+async def test_lookAt_and_detectAction(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
+        with kitchen() as scene:
+            await ParkArmsActionPerformable(Arms.BOTH).perform()
+            await NavigateActionPerformable(Pose([0, 1, 0])).perform()
+            await LookAtActionPerformable(scene.milk.pose).perform()
+            found = await DetectActionPerformable(scene.milk).perform()
+            assert found.world_object is scene.milk
+    remembered = Remembered(tmp_path)
+    assert at((await remembered.one(select(LookAtAction))).pose) == (1.3, 1, 0.9)
+    detect = await remembered.one(select(DetectAction))
+    assert (detect.object.name, detect.object.obj_type) == ("milk", ObjectType.MILK)
+
+
+async def test_setGripperAction(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
+        with kitchen():
+            await SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
+    gripper = await Remembered(tmp_path).one(select(SetGripperAction))
+    assert (gripper.gripper, gripper.motion) == (Arms.LEFT, GripperState.OPEN)
+
+
+async def test_open_and_closeAction(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
+        with kitchen() as scene:
+            handle = Part("sink_area_drawer_handle", scene.kitchen)
+            await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
+            await MoveTorsoActionPerformable(0.1).perform()
+            await OpenActionPerformable(handle, Arms.LEFT).perform()
+            await Close(handle, [Arms.LEFT]).resolve().perform()
+    remembered = Remembered(tmp_path)
+    opened, closed = await remembered.one(select(OpenAction)), await remembered.one(select(CloseAction))
+    for action in (opened, closed):
+        assert isinstance(action.object, ObjectPart)
+        assert action.object.name == "sink_area_drawer_handle"
+        assert action.object.part_of is not None
+        assert action.object.part_of.name == "kitchen"
+        assert action.arm is Arms.LEFT
+    # The drawer slides along -x: its handle was 0.3 m further out when it was to be closed.
+    assert opened.object.pose.x - closed.object.pose.x == pytest.approx(0.3)
+
+
+async def test_view_creation(planned: Remembered) -> None:
+    with sqlite3.connect(planned.folder / "memory.db") as file:
+        kinds = file.execute("SELECT type FROM sqlite_schema WHERE name = 'PickUpWithContextView'").fetchall()
+        columns = [name for _, name, *_ in file.execute("PRAGMA table_info('PickUpWithContextView')")]
+    file.close()
+    assert kinds == [("view",)]
+    assert columns[:12] == [
+        "id",
+        "arm",
+        "grasp",
+        "torso_height",
+        "relative_x",
+        "relative_y",
+        "quaternion_x",
+        "quaternion_y",
+        "quaternion_z",
+        "quaternion_w",
+        "obj_type",
+        "status",
+    ]
+
+
+async def test_pickUpWithContextView(planned: Remembered) -> None:
+    row = await planned.one(select(PickUpWithContextView))
+    assert (row.arm, row.grasp, row.torso_height) == (Arms.LEFT, Grasp.FRONT, 0.3)
+    assert (row.relative_x, row.relative_y) == (pytest.approx(-0.7, abs=1e-6), pytest.approx(-0.6, abs=1e-6))
+    assert (row.quaternion_x, row.quaternion_y, row.quaternion_z, row.quaternion_w) == (0, 0, 0, 1)
+    assert (row.obj_type, row.status) == (ObjectType.MILK, TaskStatus.SUCCEEDED)
+
+
+async def test_pickUpWithContextView_conditions(planned: Remembered) -> None:
+    assert await planned.all(select(PickUpWithContextView).where(PickUpWithContextView.arm == Arms.RIGHT)) == []
+    left = select(func.count()).where(PickUpWithContextView.arm == Arms.LEFT)
+    assert await planned.all(left) == [1]
