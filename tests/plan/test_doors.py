@@ -19,9 +19,12 @@ from pycrorm_async.plan import (
     MoveTCPMotion,
     MoveTorsoActionPerformable,
     ObjectPart,
+    OpenAction,
     OpenActionPerformable,
     OpeningMotion,
     ResolutionError,
+    Retry,
+    SimulatedTaskTree,
     collected_tree,
 )
 from pycrorm_async.plan.failures import (
@@ -274,3 +277,29 @@ async def test_an_arm_that_the_robot_lacks_opens_nothing(scene: Scene, one_armed
     assert scene.world.save_state() == before
     await OpenActionPerformable(part, Arms.LEFT).perform()
     check(scene, SINK, SINK.goal)
+
+
+async def test_a_plan_goes_on_to_the_next_arm(scene: Scene, one_armed: None) -> None:
+    part = await SINK.stood_before_by(scene)
+    right, left = OpenAction(part, [Arms.RIGHT]), OpenAction(part, [Arms.LEFT])
+    with collected_tree() as tree:
+        await (right - left).perform()
+    check(scene, SINK, SINK.goal)
+    tried = [node.failure for node in tree if isinstance(node.designator, OpenActionPerformable)]
+    assert [type(each) for each in tried] == [CapabilityAbsenceFailure, type(None)]
+    scene.kitchen.set_joint_position("sink_area_drawer_joint", 0.0)
+    with collected_tree() as tree:
+        await Retry(OpenAction(part, [Arms.BOTH, Arms.RIGHT, Arms.LEFT]), max_tries=3).perform()
+    check(scene, SINK, SINK.goal)
+    tried = [node.failure for node in tree if isinstance(node.designator, OpenActionPerformable)]
+    assert [type(each) for each in tried] == [IllPosedGoalFailure, CapabilityAbsenceFailure, type(None)]
+
+
+async def test_opening_in_thought_opens_nothing(scene: Scene) -> None:
+    part = await SINK.stood_before_by(scene)
+    before = scene.world.save_state()
+    with SimulatedTaskTree():
+        await OpenActionPerformable(part, SINK.arm).perform()
+        assert part.pose.position == pytest.approx((0.7, 1.3, 0.665), abs=1e-9)
+    assert scene.world.save_state() == before
+    assert part.pose.position == pytest.approx((1.0, 1.3, 0.665), abs=1e-9)
