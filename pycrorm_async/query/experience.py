@@ -74,7 +74,13 @@ class PickUpExperience:
 def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, ...]]:
     view, node = PickUpWithContextView, TaskTreeNode
     # First which, then what: the columns that are reckoned are reckoned for these only, and nothing wide is sorted.
-    latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(ATTEMPTS_MAX)
+    latest = (
+        select(view.id)
+        .join(node, node.id == view.node_id)
+        .where(view.obj_type == object_type, ~node.simulated)
+        .order_by(view.id.desc())
+        .limit(ATTEMPTS_MAX)
+    )
     if arm is not None:
         latest = latest.where(view.arm == arm)
     return (
@@ -82,8 +88,7 @@ def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, .
             view.arm, view.grasp, view.torso_height, view.status, view.object_x, view.object_y, view.object_z,
             view.object_qx, view.object_qy, view.object_qz, view.object_qw,
         )
-        .join(node, node.id == view.node_id)
-        .where(view.id.in_(latest), view.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]), ~node.simulated)
+        .where(view.id.in_(latest), view.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]))
         .order_by(view.id.desc())
     )  # fmt: skip
 
