@@ -1,0 +1,180 @@
+"""PyCRAM's tests of its action designators (July 2024), by name: what a description resolves to, its SOMA concept, and
+what it does in the world.
+
+Where theirs ends with resolving (gripping, releasing: not implemented there) ours is performed as well.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from pycrorm_async.plan import (
+    CloseAction,
+    DetectAction,
+    FaceAtPerformable,
+    GraspingAction,
+    GripAction,
+    LookAtAction,
+    MoveTorsoAction,
+    MoveTorsoActionPerformable,
+    NavigateAction,
+    NavigateActionPerformable,
+    ObjectDesignatorDescription,
+    ObjectPart,
+    OpenAction,
+    ParkArmsAction,
+    PickUpAction,
+    PlaceAction,
+    ReleaseAction,
+    SetGripperAction,
+    TransportAction,
+)
+from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
+from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.robot import PR2
+from tests.plan.conftest import Scene
+
+LEFT_TOOL = "l_gripper_tool_frame"
+MILK = ObjectDesignatorDescription(["milk"])
+
+
+async def test_move_torso(scene: Scene) -> None:
+    action = MoveTorsoAction([0.3]).resolve()
+    assert (action.position, action.concept) == (0.3, "MoveTorso")
+    await action.perform()
+    assert scene.robot.joint_position("torso_lift_joint") == 0.3
+
+
+async def test_set_gripper(scene: Scene) -> None:
+    description = SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])
+    action = description.resolve()
+    assert (action.gripper, action.motion, action.concept) == (Arms.LEFT, GripperState.OPEN, "SettingGripper")
+    assert len(list(description)) == 2
+    await action.perform()
+    for joint, position in PR2.arms[Arms.LEFT].gripper_joints[GripperState.OPEN].items():
+        assert scene.robot.joint_position(joint) == position == 0.548
+
+
+async def test_release(scene: Scene) -> None:
+    action = ReleaseAction([Arms.LEFT], MILK).resolve()
+    assert (action.gripper, action.object_designator.name, action.concept) == (Arms.LEFT, "milk", "Releasing")
+    scene.robot.attach(scene.milk, LEFT_TOOL)
+    await action.perform()
+    assert scene.robot.attachments == {}
+
+
+async def test_grip(scene: Scene) -> None:
+    action = GripAction([Arms.LEFT], MILK, [0.5]).resolve()
+    assert (action.gripper, action.object_designator.name, action.effort) == (Arms.LEFT, "milk", 0.5)
+    assert action.concept == "Holding"
+    scene.milk.set_pose(scene.robot.link_pose(LEFT_TOOL))
+    await action.perform()
+    assert scene.robot.attachments == {scene.milk: LEFT_TOOL}
+
+
+async def test_park_arms(scene: Scene) -> None:
+    action = ParkArmsAction([Arms.BOTH]).resolve()
+    assert (action.arm, action.concept) == (Arms.BOTH, "ParkingArms")
+    await action.perform()
+    for arm in (Arms.LEFT, Arms.RIGHT):
+        for joint, position in PR2.arms[arm].park.items():
+            assert scene.robot.joint_position(joint) == position
+
+
+async def test_navigate(scene: Scene) -> None:
+    action = NavigateAction([Pose([0.3, 0, 0])]).resolve()
+    assert (action.target_location, action.concept) == (Pose([0.3, 0, 0]), "Navigating")
+    await action.perform()
+    assert scene.robot.pose == Pose([0.3, 0, 0])
+
+
+async def test_pick_up(scene: Scene) -> None:
+    action = PickUpAction(MILK, [Arms.LEFT], [Grasp.FRONT]).resolve()
+    assert (action.object_designator.name, action.concept) == ("milk", "PickingUp")
+    await NavigateActionPerformable(Pose([0.6, 0.4, 0])).perform()
+    await MoveTorsoActionPerformable(0.3).perform()
+    await action.perform()
+    assert scene.milk in scene.robot.attachments
+
+
+async def test_place(scene: Scene) -> None:
+    action = PlaceAction(MILK, [Pose([1.3, 1, 0.9])], [Arms.LEFT]).resolve()
+    assert (action.object_designator.name, action.concept) == ("milk", "Placing")
+    await NavigateActionPerformable(Pose([0.6, 0.4, 0])).perform()
+    await MoveTorsoActionPerformable(0.3).perform()
+    await PickUpAction(MILK, [Arms.LEFT], [Grasp.FRONT]).resolve().perform()
+    await action.perform()
+    assert scene.milk not in scene.robot.attachments
+    assert scene.milk.pose.distance(Pose([1.3, 1, 0.9])) < 1e-6
+
+
+async def test_look_at(scene: Scene) -> None:
+    action = LookAtAction([Pose([1, 0, 1])]).resolve()
+    assert (action.target, action.concept) == (Pose([1, 0, 1]), "LookingAt")
+    await action.perform()
+    # The tilt axis is where the head's description has it; the point is straight ahead of it, and lower.
+    at = scene.robot.link_pose("head_tilt_link")
+    seen = Pose([1, 0, 1]).relative_to(at).position
+    assert [seen.y, seen.z] == pytest.approx([0, 0], abs=1e-6)
+    assert seen.x > 0
+
+
+async def test_detect(scene: Scene) -> None:
+    scene.kitchen.remove()
+    scene.cereal.remove()
+    scene.milk.set_pose(Pose([1.5, 0, 1.2]))
+    action = DetectAction(MILK).resolve()
+    assert (action.object_designator.name, action.concept) == ("milk", "LookingFor")
+    found = await action.perform()
+    assert (found.name, found.object_type, found.pose) == ("milk", ObjectType.MILK, Pose([1.5, 0, 1.2]))
+
+
+async def test_open(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    action = OpenAction(handle, [Arms.LEFT]).resolve()
+    assert (action.object_designator.name, action.arm, action.concept) == (handle.name, Arms.LEFT, "Opening")
+    await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
+    await MoveTorsoActionPerformable(0.1).perform()
+    await action.perform()
+    # the drawer's limit is 0.35 m, and 0.05 m are left
+    assert scene.kitchen.joint_limits("sink_area_drawer_joint") == (0.0, 0.35)
+    assert scene.kitchen.joint_position("sink_area_drawer_joint") == pytest.approx(0.3)
+
+
+async def test_close(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    action = CloseAction(handle, [Arms.LEFT]).resolve()
+    assert (action.object_designator.name, action.arm, action.concept) == (handle.name, Arms.LEFT, "Closing")
+    scene.kitchen.set_joint_position("sink_area_drawer_joint", 0.3)
+    await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
+    await MoveTorsoActionPerformable(0.1).perform()
+    await action.perform()
+    assert scene.kitchen.joint_position("sink_area_drawer_joint") == 0.0
+
+
+async def test_transport(scene: Scene) -> None:
+    goal = Pose([-1.35, 0.78, 0.95], yaw_quaternion(math.pi))
+    action = TransportAction(MILK, [Arms.LEFT], [goal]).resolve()
+    assert (action.object_designator.name, action.target_location, action.concept) == ("milk", goal, "Transporting")
+    await MoveTorsoActionPerformable(0.2).perform()
+    await action.perform()
+    assert scene.milk.pose.distance(goal) < 0.01
+    assert scene.robot.attachments == {}
+
+
+async def test_grasping(scene: Scene) -> None:
+    action = GraspingAction([Arms.RIGHT], MILK).resolve()
+    assert (action.object_desig.name, action.arm, action.concept) == ("milk", Arms.RIGHT, "Grasping")
+    await NavigateActionPerformable(Pose([0.6, 1.1, 0])).perform()
+    await action.perform()
+    assert scene.robot.link_pose("r_gripper_tool_frame").distance(scene.milk.pose) < 0.01
+    assert scene.robot.attachments == {}
+
+
+async def test_facing(scene: Scene) -> None:
+    await FaceAtPerformable(scene.milk.pose).perform()
+    seen = scene.milk.pose.relative_to(scene.robot.pose).position
+    assert seen.y == pytest.approx(0, abs=1e-9)
+    assert seen.x == pytest.approx(math.hypot(1.3, 1))

@@ -1,0 +1,21 @@
+"""PyCRAM's tests of object designators (July 2024), by name."""
+
+from __future__ import annotations
+
+from pycrorm_async.plan import ObjectDesignatorDescription
+from pycrorm_async.world import ObjectType, Pose
+from tests.plan.conftest import Scene
+
+
+def test_object_grounding(scene: Scene) -> None:
+    found = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
+    assert (found.name, found.object_type) == ("milk", ObjectType.MILK)
+    assert found.world_object is scene.milk
+
+
+def test_frozen_copy(scene: Scene) -> None:
+    found = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
+    frozen = found.frozen_copy()
+    assert frozen.pose == found.pose == Pose([1.3, 1, 0.9])
+    scene.milk.set_pose(Pose([2, 2, 2]))
+    assert (frozen.pose, found.pose) == (Pose([1.3, 1, 0.9]), Pose([2, 2, 2]))
