@@ -24,13 +24,18 @@ from pycrorm_async.orm import (
     Action,
     Attachment,
     BelieveObject,
+    ClosingMotion,
     Designator,
+    Detection,
+    JointChange,
     LocationCandidate,
     LocationResolution,
     MoveAndPickUpAction,
     MoveArmJointsMotion,
     MoveJointsMotion,
     Object,
+    ObjectPart,
+    OpeningMotion,
     PickUpAction,
     ProcessMetaData,
     TaskTreeNode,
@@ -38,20 +43,26 @@ from pycrorm_async.orm import (
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import (
     ActionAbstract,
+    CloseActionPerformable,
     CostmapLocation,
+    DetectingMotion,
     IKError,
+    LookAtActionPerformable,
     MoveAndPickUpPerformable,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     ObjectDesignator,
+    OpenActionPerformable,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
     PlanFailure,
 )
 from pycrorm_async.plan import BelieveObject as Believed
+from pycrorm_async.plan import ObjectPart as Part
 from pycrorm_async.plan.failures import CollisionError, PerceptionObjectNotInWorld, ReasoningError
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
+from pycrorm_async.world import Object as WorldObject
 from tests.memory.notes import NoteActionPerformable
 from tests.promises.remembering import (
     MILK_AT,
@@ -76,8 +87,9 @@ DEFECTS = {
     "1.7-8": "test_concurrent_plans_never_nest_into_each_other",
     "1.7-11": "test_a_node_is_running_until_it_ends_and_the_root_ends_too",
     "1.7-12": "test_all_times_are_moments_in_utc_whatever_the_local_time_is",
-    "1.7-13": "test_joint_targets_places_and_attachments_are_recorded",
+    "1.7-13": "test_joint_targets_places_detections_and_attachments_are_recorded",
     "1.7-14": "test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_tree",
+    "1.7-15": "test_opening_and_closing_keep_their_object",
     "1.7-16": "test_every_failure_there_is_can_be_raised_and_is_recorded",
 }
 
@@ -316,7 +328,7 @@ async def test_all_times_are_moments_in_utc_whatever_the_local_time_is(
     assert begun - millisecond <= min(moments) <= max(moments) <= ended + millisecond
 
 
-async def test_joint_targets_places_and_attachments_are_recorded(tmp_path: Path) -> None:
+async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_path: Path) -> None:
     async with remembered(tmp_path):
         with lab() as scene:
             await ParkArmsActionPerformable(Arms.LEFT).perform()
@@ -324,6 +336,8 @@ async def test_joint_targets_places_and_attachments_are_recorded(tmp_path: Path)
             stand = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.LEFT).resolve()
             await MoveAndPickUpPerformable(stand.pose, scene.milk, Arms.LEFT, Grasp.FRONT).perform()
             scene.robot.detach(scene.milk)
+            await LookAtActionPerformable(scene.cereal.pose).perform()
+            await DetectingMotion(ObjectType.BREAKFAST_CEREAL).perform()
             parked = {name: scene.robot.robot_description.arms[Arms.LEFT].park[name] for name in LEFT_ARM}  # type: ignore[union-attr]  # it is a PR2
     rows = {row.dtype: row for row in await asked(tmp_path, select(Designator).order_by(Designator.id))}
     arm = rows["MoveArmJointsMotion"]
@@ -345,6 +359,9 @@ async def test_joint_targets_places_and_attachments_are_recorded(tmp_path: Path)
     assert resolved.considered >= 1
     (candidate,) = await asked(tmp_path, select(LocationCandidate))
     assert ((candidate.x, candidate.y, candidate.z), candidate.arms) == (stand.pose.position, "LEFT")
+    (seen,) = await asked(tmp_path, select(Detection))
+    assert (seen.source, seen.looked_for, seen.name) == ("camera", ObjectType.BREAKFAST_CEREAL, "cereal")
+    assert ((seen.x, seen.y, seen.z), seen.visible, seen.node.dtype) == ((1.3, 0.7, 0.95), 1.0, "DetectingMotion")
     held = await asked(tmp_path, select(Attachment).order_by(Attachment.id))
     assert [(each.kind, each.parent.name, each.child.name, each.link) for each in held] == [
         ("attached", "pr2", "milk", "l_gripper_tool_frame"),
@@ -387,3 +404,23 @@ async def test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_t
         (nothing,) = await every(reading, select(reading.mapped("NoteAction")))
         assert nothing.text == "no class of the ORM knows of this"
         assert isinstance(nothing, Action)
+
+
+async def test_opening_and_closing_keep_their_object(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        with lab():
+            handle = Part("sink_area_drawer_handle", WorldObject("kitchen", ObjectType.ENVIRONMENT))
+            await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
+            await MoveTorsoActionPerformable(0.1).perform()
+            await OpenActionPerformable(handle, Arms.LEFT).perform()
+            await CloseActionPerformable(handle, Arms.LEFT).perform()
+    for mapped, x in ((OpeningMotion, 1.0), (ClosingMotion, 0.7)):
+        (motion,) = await asked(tmp_path, select(mapped))
+        assert isinstance(motion.object, ObjectPart)
+        assert motion.object.part_of is not None
+        assert (motion.object.name, motion.object.part_of.name) == ("sink_area_drawer_handle", "kitchen")
+        assert motion.object.pose is not None
+        assert motion.object.pose.x == pytest.approx(x)  # the kitchen's drawing; 0.3 m further out when open
+        assert motion.arm is Arms.LEFT
+    turns = await asked(tmp_path, select(JointChange).where(JointChange.joint == "sink_area_drawer_joint"))
+    assert [each.position for each in turns] == [pytest.approx(0.3), 0.0]
