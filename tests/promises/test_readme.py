@@ -1,7 +1,9 @@
 """What README.md shows does what it says: its plan runs, its questions are answered, its commands exist."""
 
 import asyncio
+import contextlib
 import re
+import sqlite3
 import textwrap
 from pathlib import Path
 
@@ -10,7 +12,7 @@ import pytest
 from tests.commands import answer, pycrorm
 
 README = (Path(__file__).parent.parent.parent / "README.md").read_text()
-PLAN, QUESTIONS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+PLAN, QUESTIONS, TIDY = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
@@ -28,6 +30,21 @@ def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
         ("MoveMotion", "SUCCEEDED"),
         ("GreetAction", "SUCCEEDED"),
     ]
+
+
+def test_the_plan_that_says_all_a_plan_can_say_runs_and_the_milk_is_where_it_shall_be(tmp_path: Path) -> None:
+    (tmp_path / "tidy.py").write_text(TIDY)
+    done = pycrorm("run", "tidy.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "no milk to be seen" not in done.stdout
+    tree = answer("show", "1", cwd=tmp_path)["tree"]
+    top = [node["dtype"] for node in tree if node["depth"] == 1]
+    assert top == ["Parallel", "Sequential", "Sequential", "TransportAction"]
+    assert {node["status"] for node in tree} == {"SUCCEEDED"}
+    with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
+        question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'milk' ORDER BY object.id"
+        *_, resting = plain.execute(question).fetchall()
+    assert resting == pytest.approx((1.3, 0.45, 0.95), abs=1e-6)
 
 
 async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
