@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Literal, get_args
 
@@ -15,6 +16,8 @@ __all__ = ["Settings", "OnFull", "OnUnrecordable"]
 
 OnFull = Literal["wait", "fail"]
 OnUnrecordable = Literal["refuse", "record_missing"]
+_MAY_BE_NONE = frozenset({"sample_interval_ms"})
+_MAY_BE_ZERO = frozenset({"sample_change_min"})
 _CHOICES = {"on_full": get_args(OnFull), "on_unrecordable": get_args(OnUnrecordable)}
 
 
@@ -32,6 +35,10 @@ class Settings:
         idle_ms: a plan that has emitted nothing for so long is idle: its tables are brought up to date.
         flush_timeout_s: `flush` and closing give up after this long; nothing is lost by it.
         connect_timeout_s: how long a database may take to answer at the first connection.
+        sample_interval_ms: how often the robot's state is sampled while a motion runs; None: never. Each motion is then
+            sampled at its start and end as well.
+        sample_change_min: between those, only joints (rad or m) and numbers of the base's pose that changed by more
+            than this since they were last written.
         on_full: what a node does that starts while the spool is full: wait for room, or fail with `SpoolFull`.
         on_unrecordable: refuse a perform whose parameters cannot be recorded, or record them as missing.
     """
@@ -47,14 +54,27 @@ class Settings:
     idle_ms: int = 200
     flush_timeout_s: float = 300.0
     connect_timeout_s: float = 10.0
+    sample_interval_ms: int | None = None
+    sample_change_min: float = 0.0
     on_full: OnFull = "wait"
     on_unrecordable: OnUnrecordable = "refuse"
 
     def __post_init__(self) -> None:
         for each in fields(self):
             value = getattr(self, each.name)
-            choices = _CHOICES.get(each.name)
-            if choices is not None and value not in choices:
-                raise CallerError(f"Settings.{each.name} is {value!r}: use {' or '.join(map(repr, choices))}")
-            if choices is None and not (isinstance(value, int | float) and value > 0):
-                raise CallerError(f"Settings.{each.name} is {value!r}: it must be a number above zero")
+            fault = _fault(each.name, value)
+            if fault is not None:
+                raise CallerError(f"Settings.{each.name} is {value!r}: {fault}")
+
+
+def _fault(name: str, value: object) -> str | None:
+    """What a setting must be and is not."""
+    choices = _CHOICES.get(name)
+    if choices is not None:
+        return None if value in choices else f"use {' or '.join(map(repr, choices))}"
+    if name in _MAY_BE_NONE and value is None:
+        return None
+    number = value if isinstance(value, int | float) else math.nan
+    if name in _MAY_BE_ZERO:
+        return None if 0 <= number < math.inf else "it must be a number, zero or above"
+    return None if number > 0 else "it must be a number above zero"

@@ -63,6 +63,7 @@ class MemoryStatus(NamedTuple):
             the database.
         bytes_spooled: what the queue holds on disk.
         faults: what the hooks failed to record.
+        samples_left_out: samples of the robot's state that the spool had no room for.
         writer: what the writer does.
         unadopted: folders of dead recorders that could not be recovered, and why.
     """
@@ -72,6 +73,7 @@ class MemoryStatus(NamedTuple):
     stored: int
     bytes_spooled: int
     faults: Faults
+    samples_left_out: int
     writer: WriterState
     unadopted: Mapping[str, PycrormError]
 
@@ -191,6 +193,7 @@ class Memory:
         for episode in told.open_episodes:
             told.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
         self._parts.emitter.over = self._parts.experience.over = True
+        told.close()
         await self._stack.__aexit__(kind, error, traceback)
 
     async def _drain(
@@ -292,6 +295,7 @@ class Memory:
             stored=parts.queue.stored,
             bytes_spooled=parts.queue.bytes_spooled,
             faults=parts.emitter.faults,
+            samples_left_out=parts.recorder.samples_left_out,
             writer=parts.writer.state,
             unadopted=dict(self._unadopted),
         )

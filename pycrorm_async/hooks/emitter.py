@@ -65,6 +65,12 @@ class Emitter:
                     raise
                 self.sink.block_until_room(_BLOCK_S)
 
+    def offer(self, episode: EpisodeId, event: Happening) -> int:
+        """As `put`, only if there is ordinary room for it: raises `SpoolFull` otherwise, and never waits."""
+        kind = type(event)
+        payload = encode(event, bytes_max=self.settings.record_bytes_max)
+        return self.sink.put_nowait(Heading(episode, kind.__name__, kind.version), payload)
+
     def note_fault(self, where: str, error: BaseException) -> None:
         """A fault of ours: counted, kept, logged once in a while, never raised into the plan."""
         self._fault_count += 1

@@ -20,6 +20,7 @@ from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode, EpisodeOpening, NodeRecord, current_task
+from pycrorm_async.hooks.sampler import Sampler
 from pycrorm_async.plan.ports import Candidate, Seen, Thought, thinking
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
@@ -50,6 +51,7 @@ class Recorder:
         self._software = software
         self._randomness = randomness
         self._declarations = Declarations()
+        self._sampler = _sampler_of(emitter)
         self._open: dict[EpisodeId, Episode] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
         self.opened_count = 0
@@ -99,9 +101,21 @@ class Recorder:
             return
         self._open.pop(episode.id, None)
         try:
+            if self._sampler is not None:
+                self._sampler.drop(episode)
             episode.end(failure)
         except Exception as error:  # noqa: BLE001  the plan's own outcome matters more
             self._emitter.note_fault("EpisodeEnded", error)
+
+    @property
+    def samples_left_out(self) -> int:
+        """How many samples of the robot's state the spool had no room for."""
+        return self._sampler.left_out if self._sampler is not None else 0
+
+    def close(self) -> None:
+        """The memory is over, and so is the sampling."""
+        if self._sampler is not None:
+            self._sampler.close()
 
     @property
     def open_episodes(self) -> tuple[Episode, ...]:
@@ -154,11 +168,15 @@ class Recorder:
             node.record = NodeRecord(episode, sequence, implicit is not None, before)
             if implicit is not None:
                 current_episode.set(implicit)
+            if self._sampler is not None and node.kind == "motion":
+                self._sample(self._sampler.begin, node.record)
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
         if record is None or self._emitter.over:
             return
+        if self._sampler is not None and node.kind == "motion":
+            self._sample(self._sampler.end, record)
         try:
             record.episode.end_node(node)
         except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
@@ -213,6 +231,12 @@ class Recorder:
         if current_episode.get() is record.episode:  # a dropped plan is closed in whatever context drops it
             current_episode.set(record.before)
 
+    def _sample(self, do: Callable[[Episode, int], None], record: NodeRecord) -> None:
+        try:
+            do(record.episode, record.sequence)
+        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            self._emitter.note_fault("StateSampled", error)
+
     def _declare(self, declared: DeclaredType) -> None:
         kind = type(declared.declaration)
         self._emitter.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
@@ -228,6 +252,13 @@ class Recorder:
         episode = self._open_here()
         if episode is not None:
             episode.leave_world(world, emptied=True)
+
+
+def _sampler_of(emitter: Emitter) -> Sampler | None:
+    settings = emitter.settings
+    if settings.sample_interval_ms is None:
+        return None
+    return Sampler(emitter, interval_ms=settings.sample_interval_ms, change_min=settings.sample_change_min)
 
 
 class _ThoughtRecord:

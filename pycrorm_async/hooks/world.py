@@ -33,10 +33,15 @@ __all__ = ["WorldRecorder"]
 
 
 class WorldRecorder:
-    """The observer of one world for one episode; begins with `ObjectAdded` for all that is there."""
+    """The observer of one world for one episode; begins with `ObjectAdded` for all that is there.
+
+    Attributes:
+        sampled: by robot, what the episode's samples of its state said last, channel by channel.
+    """
 
     def __init__(self, emitter: Emitter, episode: EpisodeId, world: BulletWorld) -> None:
         self.world = world
+        self.sampled: dict[Object, dict[str, float]] = {}
         self._emitter = emitter
         self._episode = episode
         self._references: dict[Object, ObjectReference] = {}

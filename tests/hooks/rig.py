@@ -1,6 +1,7 @@
 """A recorder on a queue that is a list: what was told, in order, and what is wrong with it."""
 
 import asyncio
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,8 +36,13 @@ class ListSink:
         self.broken = False
         self.broken_starts = 0
         self.space = asyncio.Event()
+        self.lock = threading.RLock()
 
     def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+        with self.lock:
+            return self._put(heading, payload, reserved)
+
+    def _put(self, heading: Heading, payload: bytes, reserved: bool) -> int:
         if heading.type == "NodeStarted" and self.broken_starts and b'"action"' in payload:
             self.broken_starts -= 1
             raise RuntimeError("the disk is on fire")
@@ -95,6 +101,7 @@ def rigged(settings: Settings | None = None) -> Iterator[Rig]:
     finally:
         recorder.reset(tokens[0])
         watcher.reset(tokens[1])
+        rig.recorder.close()
 
 
 def findings(events: list[tuple[int, Happening]]) -> list[Any]:

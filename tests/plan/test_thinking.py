@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -265,7 +265,7 @@ async def test_a_thought_that_is_cancelled_leaves_the_world_as_before(scene: Sce
 class Suspended:
     """An await that nobody ends."""
 
-    def __await__(self) -> Iterator[None]:
+    def __await__(self) -> Generator[None, None, None]:
         yield
 
 

@@ -1,0 +1,420 @@
+"""While a motion runs the robot's state is sampled: when, what, and what never comes of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+
+import pytest
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.happenings import Happening, NodeEnded, NodeStarted, StateSampled
+from pycrorm_async.plan import (
+    ActionAbstract,
+    ChosenRobot,
+    LookAtActionPerformable,
+    MoveMotion,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    SimulatedTaskTree,
+    simulated_robot,
+)
+from pycrorm_async.plan.here import robot_here
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.hooks.rig import Rig, findings, rigged
+
+SAMPLED = Settings(sample_interval_ms=1)
+BASE = {"base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw"}
+TURNED = yaw_quaternion(1.0)
+
+
+class Robot:
+    """A robot of one's own: its base goes where the test sends it."""
+
+    def __init__(self, drive: Callable[[Object, Pose], object]) -> None:
+        self.drive = drive
+
+    async def navigate(self, motion: MoveMotion) -> None:
+        going = self.drive(robot_here().body, motion.target)
+        if asyncio.iscoroutine(going):
+            await going
+
+    async def move_tcp(self, motion: object) -> None: ...
+    async def looking(self, motion: object) -> None: ...
+    async def move_gripper(self, motion: object) -> None: ...
+    async def move_arm_joints(self, motion: object) -> None: ...
+    async def move_joints(self, motion: object) -> None: ...
+
+
+def samples(rig: Rig) -> list[StateSampled]:
+    """All of them, in the order they were written, which is checked: each inside its motion."""
+    found = []
+    for name in rig.sink.sequences:
+        events = rig.sink.of(name)
+        assert findings(events) == []
+        started = {sequence: event for sequence, event in events if isinstance(event, NodeStarted)}
+        ended = {event.node: sequence for sequence, event in events if isinstance(event, NodeEnded)}
+        for sequence, event in events:
+            if isinstance(event, StateSampled):
+                assert event.node is not None
+                assert started[event.node].kind == "motion"
+                assert event.node < sequence < ended.get(event.node, sequence + 1)
+                found.append(event)
+    return found
+
+
+def values(rig: Rig, channel: str) -> list[float]:
+    return [each.channels[channel] for each in samples(rig) if channel in each.channels]
+
+
+def written(rig: Rig, channel: str, value: float) -> bool:
+    """Whether a sample with this value is there; asked while others write."""
+    with rig.sink.lock:
+        events: list[Happening] = [event for _, _, event in rig.sink.records]
+    return any(isinstance(each, StateSampled) and each.channels.get(channel) == value for each in events)
+
+
+async def seen(rig: Rig, channel: str, value: float) -> None:
+    async with asyncio.timeout(10):
+        while not written(rig, channel, value):  # noqa: ASYNC110  the sampler sets no event of ours
+            await asyncio.sleep(0.001)
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    with rigged(SAMPLED) as made, BulletWorld(), simulated_robot:
+        Object("pr2", ObjectType.ROBOT)
+        yield made
+
+
+async def test_the_first_sample_of_an_episode_has_every_channel_and_the_next_what_differs(rig: Rig) -> None:
+    with rig.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        await MoveTorsoActionPerformable(0.25).perform()
+        await NavigateActionPerformable(Pose([0.5, 0.25, 0], TURNED)).perform()
+    robot = robot_here().body
+    first, *others = samples(rig)
+    assert set(first.channels) == BASE | set(robot.joints)
+    assert (first.channels["base.x"], first.channels["base.qw"], first.channels["torso_lift_joint"]) == (0.0, 1.0, 0.0)
+    assert [each.channels for each in others] == [
+        {"base.x": 0.5},
+        {"torso_lift_joint": 0.25},
+        {"base.y": 0.25, "base.qz": TURNED.z, "base.qw": TURNED.w},
+    ]
+
+
+async def test_a_motion_that_changes_nothing_has_no_sample(rig: Rig) -> None:
+    with rig.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        count = len(samples(rig))
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        await LookAtActionPerformable(Pose([9, 0, 1.2])).perform()
+        looked = samples(rig)[count:]
+    assert len(looked) == 1
+    assert set(looked[0].channels) <= {"head_pan_joint", "head_tilt_joint"}
+
+
+async def test_what_changed_between_motions_is_in_the_first_sample_of_the_next(rig: Rig) -> None:
+    with rig.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        robot_here().body.set_pose(Pose([2, 3, 0]))
+        await NavigateActionPerformable(Pose([4, 3, 0])).perform()
+    assert [each.channels for each in samples(rig)[2:]] == [{"base.x": 2.0, "base.y": 3.0}, {"base.x": 4.0}]
+
+
+async def test_every_episode_begins_anew(rig: Rig) -> None:
+    for _ in range(2):
+        with rig.episode():
+            await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+    whole = [each for each in samples(rig) if len(each.channels) > len(BASE)]
+    assert [each.channels["base.x"] for each in whole] == [0.0, 0.5]
+
+
+async def test_a_motion_that_takes_its_time_is_sampled_on_the_way(rig: Rig) -> None:
+    steps = [step / 20 for step in range(1, 21)]
+
+    async def drive(body: Object, target: Pose) -> None:
+        for share in steps:
+            body.set_pose(Pose([target.position.x * share, 0, 0]))
+            await seen(rig, "base.x", share)
+
+    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    assert values(rig, "base.x") == [0.0, *steps]
+    assert {tuple(each.channels) for each in samples(rig)[1:]} == {("base.x",)}
+
+
+async def test_a_plan_that_never_suspends_is_sampled_too(rig: Rig) -> None:
+    def drive(body: Object, target: Pose) -> None:
+        for x in (0.5, target.position.x):
+            body.set_pose(Pose([x, 0, 0]))
+            end_s = time.monotonic() + 10
+            while not written(rig, "base.x", x) and time.monotonic() < end_s:
+                pass
+
+    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    assert values(rig, "base.x") == [0.0, 0.5, 1.0]
+
+
+async def test_between_start_and_end_only_what_changed_by_more_than_the_margin_is_written() -> None:
+    settings = Settings(sample_interval_ms=1, sample_change_min=0.1)
+    with rigged(settings) as rig, BulletWorld():
+
+        async def drive(body: Object, target: Pose) -> None:
+            body.set_pose(Pose([0.5, 0.0, 0]))
+            await seen(rig, "base.x", 0.5)
+            body.set_pose(Pose([0.59, 0.09, 0]))
+            await asyncio.sleep(0.03)
+            body.set_pose(Pose([0.62, 0.09, 0]))
+            await seen(rig, "base.x", 0.62)
+            body.set_pose(target)
+
+        Object("pr2", ObjectType.ROBOT)
+        with rig.episode(), ChosenRobot("mine", Robot(drive)):
+            await NavigateActionPerformable(Pose([0.625, 0.095, 0])).perform()
+        assert [each.channels for each in samples(rig)[1:]] == [
+            {"base.x": 0.5},
+            {"base.x": 0.62},
+            {"base.x": 0.625, "base.y": 0.095},  # where it ended, to the last bit
+        ]
+
+
+async def test_a_motion_that_is_cancelled_ends_with_the_state_it_was_left_in(rig: Rig) -> None:
+    arrived = asyncio.Event()
+
+    async def drive(body: Object, _target: Pose) -> None:
+        body.set_pose(Pose([0.25, 0, 0]))
+        await seen(rig, "base.x", 0.25)
+        body.set_pose(Pose([0.375, 0, 0]))
+        arrived.set()
+        await asyncio.sleep(60)
+
+    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+        task = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
+        await arrived.wait()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        count = len(samples(rig))
+        robot_here().body.set_pose(Pose([7, 0, 0]))
+        await asyncio.sleep(0.02)
+        assert len(samples(rig)) == count
+    assert values(rig, "base.x") == [0.0, 0.25, 0.375]
+
+
+async def test_motions_at_the_same_time_each_have_the_state_they_ended_in(rig: Rig) -> None:
+    first_ended = asyncio.Event()
+
+    async def drive(body: Object, target: Pose) -> None:
+        await seen(rig, "base.z", 0.0)
+        if target.position.x:
+            body.set_pose(Pose([target.position.x, body.pose.position.y, 0]))
+            await seen(rig, "base.x", 1.0)
+        else:
+            await first_ended.wait()
+            body.set_pose(Pose([body.pose.position.x, target.position.y, 0]))
+
+    async def first() -> None:
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+        first_ended.set()
+
+    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+        await asyncio.gather(first(), NavigateActionPerformable(Pose([0, 2, 0])).perform())
+    ends: dict[int, dict[str, float]] = {}
+    for each in samples(rig):
+        assert each.node is not None
+        ends.setdefault(each.node, {}).update(each.channels)
+    one, two = (ends[node] for node in sorted(ends))
+    assert one["base.x"] == 1.0
+    assert (two["base.x"], two["base.y"]) == (1.0, 2.0)
+
+
+async def test_a_sample_without_room_is_left_out_and_the_next_has_what_changed_since_the_last_written(rig: Rig) -> None:
+    with rig.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        count = len(samples(rig))
+        rig.sink.full = True
+        target = MoveMotion(Pose([1, 0, 0]))
+        rig.sink.space.set()
+        await target.perform()
+        assert len(samples(rig)) == count
+        assert rig.recorder.samples_left_out == 1
+        rig.sink.full = False
+        await NavigateActionPerformable(Pose([1, 2, 0])).perform()
+    assert [each.channels for each in samples(rig)[count:]] == [{"base.x": 1.0}, {"base.y": 2.0}]
+    assert rig.recorder.samples_left_out == 1
+    assert rig.emitter.faults.total == 0
+
+
+async def test_a_fault_of_ours_is_counted_and_the_motion_goes_on(rig: Rig) -> None:
+    with rig.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        before = rig.emitter.faults.total
+
+        def broken(*_arguments: object) -> None:
+            raise RuntimeError("the sampler is on fire")
+
+        rig.emitter.offer = broken  # type: ignore[method-assign,assignment]
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    assert robot_here().body.pose == Pose([1, 0, 0])
+    assert rig.emitter.faults.total == before + 1
+    assert rig.emitter.faults.last == "StateSampled: RuntimeError: the sampler is on fire"
+
+
+async def test_another_robot_begins_with_every_channel(rig: Rig) -> None:
+    async def drive(body: Object, target: Pose) -> None:
+        body.set_pose(target)
+        await seen(rig, "base.x", target.position.x)
+        body.remove()
+        other = Object("pr2", ObjectType.ROBOT, pose=Pose([8, 8, 0]))
+        await seen(rig, "base.x", 8.0)
+        other.set_pose(Pose([9, 8, 0]))
+
+    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    found = samples(rig)
+    objects = [each.object.object for each in found]
+    assert [len(each.channels) > len(BASE) for each in found] == [True, False, True, False]
+    assert objects[0] == objects[1] != objects[2] == objects[3]
+    assert found[3].channels == {"base.x": 9.0}
+
+
+@dataclass
+class ThinkActionPerformable(ActionAbstract):
+    async def perform(self) -> None:
+        with SimulatedTaskTree():
+            await NavigateActionPerformable(Pose([3, 0, 0])).perform()
+
+
+async def test_the_robot_of_a_thought_is_sampled_in_the_thought(rig: Rig) -> None:
+    with rig.episode() as episode:
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+        await ThinkActionPerformable().perform()
+        await NavigateActionPerformable(Pose([2, 0, 0])).perform()
+    (thought,) = (name for name in rig.sink.sequences if name != episode.id)
+    real = [event for _, event in rig.sink.of(episode) if isinstance(event, StateSampled)]
+    only_thought = [event for _, event in rig.sink.of(thought) if isinstance(event, StateSampled)]
+    assert [each.channels["base.x"] for each in real] == [0.0, 1.0, 2.0]
+    assert [each.channels["base.x"] for each in only_thought] == [1.0, 3.0]
+    assert len(samples(rig)) == 5
+
+
+async def test_a_motion_that_outlives_its_episode_is_not_sampled_afterwards(rig: Rig) -> None:
+    going = asyncio.Event()
+
+    async def drive(body: Object, _target: Pose) -> None:
+        body.set_pose(Pose([0.25, 0, 0]))
+        await going.wait()
+        body.set_pose(Pose([0.5, 0, 0]))
+
+    with ChosenRobot("mine", Robot(drive)):
+        with rig.episode():
+            task = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
+            await seen(rig, "base.x", 0.25)
+        going.set()
+        await task
+        await asyncio.sleep(0.01)
+    assert values(rig, "base.x") == [0.0, 0.25]
+
+
+async def test_without_a_robot_or_a_world_nothing_is_sampled_and_no_thread_runs() -> None:
+    async def drive(*_: object) -> None: ...
+
+    class Bodiless(Robot):
+        async def navigate(self, motion: MoveMotion) -> None: ...
+
+    with rigged(SAMPLED) as rig, ChosenRobot("mine", Bodiless(drive)):
+        with rig.episode():
+            await MoveMotion(Pose()).perform()
+        with rig.episode(), BulletWorld():
+            await MoveMotion(Pose()).perform()
+        assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
+        assert samples(rig) == []
+
+
+async def test_a_thread_samples_only_where_it_is_asked_for_and_ends_with_the_memory() -> None:
+    def threads() -> list[str]:
+        return [each.name for each in threading.enumerate() if each.name == "pycrorm sampler"]
+
+    for settings, running in ((Settings(), []), (SAMPLED, ["pycrorm sampler"])):
+        with rigged(settings) as rig, BulletWorld(), simulated_robot:
+            Object("pr2", ObjectType.ROBOT)
+            await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+            await NavigateActionPerformable(Pose([2, 0, 0])).perform()
+            assert threads() == running
+            assert bool(samples(rig)) is bool(running)
+        assert threads() == []
+
+
+class Interrupting(Object):
+    """Its first reading in the sampler's thread is when the collector closes the plan that moves it."""
+
+    def __init__(self) -> None:
+        self.close: Callable[[], None] | None = None
+        self.closed = asyncio.Event()
+        super().__init__("pr2", ObjectType.ROBOT)
+
+    def joint_positions(self) -> dict[str, float]:
+        if self.close is not None and threading.current_thread().name == "pycrorm sampler":
+            close, self.close = self.close, None
+            close()
+        return super().joint_positions()
+
+
+async def test_a_motion_that_ends_in_the_midst_of_its_own_sample_has_none_after_its_end() -> None:
+    """As when the collector, which may run in any thread, closes a plan that nobody awaits."""
+    with rigged(SAMPLED) as rig, BulletWorld():
+        robot = Interrupting()
+        with rig.episode() as episode:
+            driving, ended = threading.Event(), threading.Event()
+
+            async def drive(_body: Object, _target: Pose) -> None:
+                driving.set()
+                await Suspended()
+
+            with ChosenRobot("mine", Robot(drive)):
+                dropped = MoveMotion(Pose([1, 0, 0])).perform()
+                context = contextvars.copy_context()
+                while not driving.is_set():  # the hook may give the loop a turn first
+                    context.run(dropped.send, None)
+            robot.set_pose(Pose([0.5, 0, 0]))
+
+            def close() -> None:
+                robot.set_pose(Pose([0.75, 0, 0]))
+                dropped.close()
+                ended.set()
+
+            robot.close = close
+            assert await asyncio.to_thread(ended.wait, 10)
+            await asyncio.sleep(0.01)
+            events = [type(event).__name__ for _, event in rig.sink.of(episode)]
+        last_end = len(events) - 1 - events[::-1].index("NodeEnded")
+        assert "StateSampled" not in events[last_end:]
+        assert values(rig, "base.x")[-1] == 0.75
+        assert rig.emitter.faults.total == 0
+
+
+class Suspended:
+    """An await that nobody ends."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
+
+
+@pytest.mark.parametrize("interval", [0, -1, "5", float("nan")])
+def test_an_interval_that_is_no_time_is_refused(interval: object) -> None:
+    with pytest.raises(CallerError, match=r"sample_interval_ms is .*: it must be a number above zero"):
+        Settings(sample_interval_ms=interval)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("margin", [-0.1, float("nan"), float("inf"), None, "1"])
+def test_a_margin_that_is_no_distance_is_refused(margin: object) -> None:
+    with pytest.raises(CallerError, match=r"sample_change_min is .*: it must be a number, zero or above"):
+        Settings(sample_change_min=margin)  # type: ignore[arg-type]
