@@ -1,6 +1,6 @@
 """The simulated robot: motions as exact jumps of the robot in the world. No time, no noise, no collisions.
 
-A motion either has its whole effect, which the world tells as one motion, or fails and has none.
+A motion either has its whole effect, which the world tells once for each thing that moved, or fails and has none.
 """
 
 from __future__ import annotations
