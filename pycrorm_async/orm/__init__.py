@@ -23,7 +23,8 @@ from pycrorm_async.orm.actions import (
     TransportAction,
 )
 from pycrorm_async.orm.base import Base, Pose, Position, ProcessMetaData, Quaternion, RobotState
-from pycrorm_async.orm.designators import Action, Designator, DesignatorType, Motion, ParameterItem
+from pycrorm_async.orm.designators import Action, Designator, DesignatorType, Language, Motion, ParameterItem
+from pycrorm_async.orm.language import Code, Monitor, Parallel, Repeat, Retry, Sequential, TryAll, TryInOrder
 from pycrorm_async.orm.motions import (
     AccessingMotion,
     ClosingMotion,
@@ -101,5 +102,14 @@ __all__ = [
     "ClosingMotion",
     "WorldStateDetectingMotion",
     "AccessingMotion",
+    "Language",
+    "Sequential",
+    "TryInOrder",
+    "Parallel",
+    "TryAll",
+    "Repeat",
+    "Monitor",
+    "Code",
+    "Retry",
     "PickUpWithContextView",
 ]

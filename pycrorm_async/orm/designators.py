@@ -26,7 +26,7 @@ from pycrorm_async.orm.types import ClassOfRow, JsonText
 if TYPE_CHECKING:
     from pycrorm_async.orm.tree import TaskTreeNode
 
-__all__ = ["DesignatorType", "ParameterItem", "Designator", "Action", "Motion"]
+__all__ = ["DesignatorType", "ParameterItem", "Designator", "Action", "Motion", "Language"]
 
 
 class DesignatorType(Base):
@@ -160,5 +160,13 @@ class Motion(Designator):
     """A motion: something a robot's controllers did at once."""
 
     __tablename__ = "motion"
+
+    id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
+
+
+class Language(Designator):
+    """An expression of the plan language: how actions and motions were put together. Its node has theirs below it."""
+
+    __tablename__ = "language"
 
     id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)

@@ -24,13 +24,13 @@ from sqlalchemy.types import TypeEngine
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared, FieldType
 from pycrorm_async.orm.base import Base, Pose
-from pycrorm_async.orm.designators import Action, Designator, Motion
+from pycrorm_async.orm.designators import Action, Designator, Language, Motion
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import Moment, known_classes
 
 __all__ = ["DynamicClasses"]
 
-_ROOTS: dict[str, type[Designator]] = {"action": Action, "motion": Motion, "language": Designator}
+_ROOTS: dict[str, type[Designator]] = {"action": Action, "motion": Motion, "language": Language}
 _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "integer": BigInteger(),
     "real": Double(),
@@ -212,7 +212,7 @@ def _entries(field: FieldDeclared) -> property:
 
 def _root(made: type[Designator]) -> type[Designator]:
     """Which of the classes that are there always it is, or descends from."""
-    for root in (Action, Motion):
+    for root in (Action, Motion, Language):
         if issubclass(made, root):
             return root
     return Designator

@@ -115,9 +115,9 @@ class KnownClasses:
 
 
 def _root(mapper: Mapper[Any]) -> str:
-    """Action, Motion or Designator, whichever is nearest."""
+    """Action, Motion, Language or Designator, whichever is nearest."""
     identities = (str(each.polymorphic_identity) for each in mapper.iterate_to_root())
-    return next(each for each in identities if each in ("Action", "Motion", "Designator"))
+    return next(each for each in identities if each in ("Action", "Motion", "Language", "Designator"))
 
 
 def known_classes(dialect: Dialect) -> KnownClasses:

@@ -11,14 +11,15 @@ from collections.abc import Iterator
 from sqlalchemy import Boolean, Column, Double, Float, Integer, Table
 from sqlalchemy.orm import Mapper
 
-from pycrorm_async.orm import Action, Designator, Motion
+from pycrorm_async.orm import Action, Designator, Language, Motion
 from pycrorm_async.orm.types import Moment
 from pycrorm_async.projections.layout import Leaf
 from pycrorm_async.projections.tables import Storage
 
 __all__ = ["mapped_leaves"]
 
-_ROOTS = (Designator, Action, Motion)
+_KINDS = {Action: "action", Motion: "motion", Language: "language"}
+_ROOTS = (Designator, *_KINDS)
 
 
 def mapped_leaves() -> list[Leaf]:
@@ -35,7 +36,7 @@ def _leaves(root: Mapper[Designator]) -> Iterator[Leaf]:
             continue
         columns = {str(each.name): _storage(each) for each in table.columns if each.name != "id"}
         built_in = mapper.class_.__module__.startswith("pycrorm_async.orm.")
-        kind = "action" if issubclass(mapper.class_, Action) else "motion"
+        kind = next((kind for root, kind in _KINDS.items() if issubclass(mapper.class_, root)), None)
         yield Leaf(str(table.name), columns, mapper.class_.__name__ if built_in else None, kind if built_in else None)
 
 

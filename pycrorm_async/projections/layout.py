@@ -30,7 +30,7 @@ STORED_AS: dict[FieldType, Storage] = {
 }
 """A field's column; lists and dicts have none."""
 
-_BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Designator"}
+_BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Language"}
 
 
 class Contradictory(ValueError):

@@ -1,7 +1,7 @@
 """The views in front of a generation's tables: what people and the mapped classes read under a table's own name.
 
-Most show their table as it is. `designator`, `action`, `motion` and `robot_state` are cut from `task_tree_node`,
-`position` and `quaternion` from `pose`; a leaf's view unites the tables of its descendants.
+Most show their table as it is. `designator`, `action`, `motion`, `language` and `robot_state` are cut from
+`task_tree_node`, `position` and `quaternion` from `pose`; a leaf's view unites the tables of its descendants.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _designator(core: dict[str, Table], layout: Layout) -> View:
 
 def _lineage(nodes: Table, layout: Layout) -> ColumnElement[str]:
     """Only types that descend from recorded ones, or have a table of another name, need an entry of their own."""
-    kind = case((nodes.c.kind == "action", " Action"), (nodes.c.kind == "motion", " Motion"), else_=" Designator")
+    kind = case({"action": " Action", "motion": " Motion", "language": " Language"}, value=nodes.c.kind)
     ordinary: ColumnElement[str] = nodes.c.dtype.concat(kind)
     special = {
         dtype: layout.lineage(dtype)
@@ -177,6 +177,7 @@ _CUT: dict[str, Callable[[dict[str, Table], Layout], View]] = {
     "designator": _designator,
     "action": _of_kind("action"),
     "motion": _of_kind("motion"),
+    "language": _of_kind("language"),
     "robot_state": _robot_state,
     "pose": _pose,
     "position": _position,

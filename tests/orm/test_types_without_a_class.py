@@ -42,7 +42,7 @@ CAREFUL = declared(
     bases=("PickUpAction",),
 )
 DANCE = declared("DanceMotion", "dance_motion", field("beats", "integer", 2), kind="motion")
-REPEAT = declared("Repeat", "repeat", field("times", "integer", 2), kind="language")
+LOOP = declared("Loop", "loop", field("times", "integer", 2), kind="language")
 STATE = RobotValue(pose(0.5), "ROBOT", 0.25)
 
 
@@ -60,11 +60,11 @@ def all_kinds() -> Script:
     script.put(NodeStarted("action", None, name_of(CAREFUL), grasp | {"speed": 0.5, "via": pose(7)}, STATE))  # 2
     script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}, STATE))  # 3
     script.put(NodeStarted("motion", None, name_of(DANCE), {"beats": 4}, STATE))  # 4
-    script.put(NodeStarted("language", None, name_of(REPEAT), {"times": 3}, STATE))  # 5
+    script.put(NodeStarted("language", None, name_of(LOOP), {"times": 3}, STATE))  # 5
     return script
 
 
-KINDS = declarations(CAREFUL, SAYING, DANCE, REPEAT)
+KINDS = declarations(CAREFUL, SAYING, DANCE, LOOP)
 
 
 async def every(log: EventLog, question: Any) -> list[Any]:
@@ -97,14 +97,14 @@ async def test_a_type_without_a_class_is_there_as_the_nearest_class_there_is(log
     assert names(await every(log, select(PickUpAction))) == ["PickUpAction"]
     assert names(await every(log, select(Motion))) == ["Motion"]
     everything = await every(log, select(Designator).order_by(Designator.id))
-    assert names(everything) == ["PickUpAction", "Action", "Motion", "Designator"]
-    assert [each.dtype for each in everything] == ["CarefulPickUpAction", "SayingAction", "DanceMotion", "Repeat"]
+    assert names(everything) == ["PickUpAction", "Action", "Motion", "Language"]
+    assert [each.dtype for each in everything] == ["CarefulPickUpAction", "SayingAction", "DanceMotion", "Loop"]
     assert everything[0].arm is Arms.LEFT
     assert everything[0].object.pose.position.z == 3.0
     assert everything[1].robot_state.pose.position.x == 0.5
     nodes = await every(log, select(TaskTreeNode).order_by(TaskTreeNode.id))
     assert [each.action for each in nodes] != []
-    assert names([each.action for each in nodes]) == ["PickUpAction", "Action", "Motion", "Designator"]
+    assert names([each.action for each in nodes]) == ["PickUpAction", "Action", "Motion", "Language"]
 
 
 async def test_its_fields_are_among_its_parameters(log: EventLog) -> None:
@@ -127,7 +127,7 @@ async def test_a_class_is_made_for_it_with_its_fields(log: EventLog) -> None:
         mapped: Any = classes.of("SayingAction")
         assert [each.id for each in await every(log, select(mapped).where(mapped.text == "hi"))] == [row(3)]
         assert names(await every(log, select(Designator).order_by(Designator.id))) == [
-            "CarefulPickUpAction", "SayingAction", "DanceMotion", "Repeat",
+            "CarefulPickUpAction", "SayingAction", "DanceMotion", "Loop",
         ]  # fmt: skip
         nodes = await every(log, select(TaskTreeNode).order_by(TaskTreeNode.id))
         assert nodes[0].action.via.position.x == 7.0
@@ -233,7 +233,7 @@ async def test_disposed_classes_leave_nothing_behind(log: EventLog) -> None:
         await every(log, select(Action))
         await every(log, select(TaskTreeNode))
         await every(log, select(classes.of("SayingAction")))
-        made += [weakref.ref(classes.of(name)) for name in ("SayingAction", "CarefulPickUpAction", "Repeat")]
+        made += [weakref.ref(classes.of(name)) for name in ("SayingAction", "CarefulPickUpAction", "Loop")]
     assert dict(Designator.__mapper__.polymorphic_map) == identities
     del classes
     gc.collect()
