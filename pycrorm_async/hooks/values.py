@@ -25,6 +25,7 @@ from pycrorm_async.events.happenings import (
     PoseValue,
 )
 from pycrorm_async.plan.objects import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
+from pycrorm_async.plan.outcome import Outcome
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
@@ -49,6 +50,7 @@ ObjectDtype: TypeAlias = Literal["Object", "ObjectPart", "BelieveObject", "Locat
 _TEXT_MAX = 2_000
 _REPR_MAX = 200
 _DEPTH_MAX = 8
+_GROUP_MAX = 100
 
 
 class Unwritable(ValueError):
@@ -104,8 +106,25 @@ def failure_value(failure: BaseException, references: References) -> FailureValu
     return FailureValue(
         type=f"{kind.__module__}.{kind.__qualname__}",
         message=clean(message_of(failure))[:_TEXT_MAX],
-        arguments=[written_or_missing(each, references) for each in failure.args],
+        arguments=_arguments(failure, references, 0),
     )
+
+
+def _arguments(failure: BaseException, references: References, depth: int) -> list[Any]:
+    """What it was raised with; of a group its message, and class, message and arguments of each that is in it."""
+    if not isinstance(failure, BaseExceptionGroup):
+        return [written_or_missing(each, references) for each in failure.args]
+    if depth > _DEPTH_MAX:
+        return [MissingValue(f"it is nested more than {_DEPTH_MAX} deep", clean_repr(failure))]
+    inside = [
+        {
+            "type": type(each).__name__,
+            "message": clean(message_of(each))[:_REPR_MAX],
+            "arguments": _arguments(each, references, depth + 1),
+        }
+        for each in failure.exceptions[:_GROUP_MAX]
+    ]
+    return [clean(str(failure.message))[:_TEXT_MAX], inside]
 
 
 def message_of(failure: BaseException) -> str:
@@ -283,6 +302,8 @@ def _any(value: Any, references: References, depth: int) -> Any:
     for kind, writer in ((Pose, _pose), (datetime, _datetime), (OBJECT_TYPES, _object)):
         if isinstance(value, kind):
             return writer(value, None, references)
+    if isinstance(value, Outcome):
+        value = value.in_brief()
     if isinstance(value, Mapping):
         return {_key(key): _any(each, references, depth + 1) for key, each in value.items()}
     if isinstance(value, list | tuple | np.ndarray):

@@ -16,8 +16,10 @@ from pycrorm_async.events.happenings import (
     ObjectValue,
     PoseValue,
 )
-from pycrorm_async.hooks.values import Unwritable, failure_value, written, written_or_missing
+from pycrorm_async.hooks.values import Unwritable, clean_repr, failure_value, written, written_or_missing
+from pycrorm_async.plan.failures import ObjectLost, PlanFailure, PlanFailures
 from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator
+from pycrorm_async.plan.outcome import Outcome
 from pycrorm_async.world.enums import Arms, ObjectType
 from pycrorm_async.world.pose import Pose
 
@@ -157,6 +159,52 @@ def test_a_failure_whose_message_cannot_be_made_is_kept_all_the_same() -> None:
             raise RuntimeError
 
     assert failure_value(Mute(), NOBODY).message == "<its message could not be made: RuntimeError>"
+
+
+def test_of_a_group_each_failure_is_kept_with_class_message_and_arguments() -> None:
+    inner = ExceptionGroup("inner", [PlanFailure("late", {1})])
+    failure = failure_value(PlanFailures("2 of 2 branches failed", [ObjectLost("gone \ud800", "milk"), inner]), NOBODY)
+    assert failure.type == "pycrorm_async.plan.failures.PlanFailures"
+    assert failure.message == "2 of 2 branches failed"
+    lost = {
+        "type": "ObjectLost",
+        "message": "gone \\ud800",
+        "arguments": [MissingValue("the text holds a lone surrogate", "'gone \\ud800'"), "milk"],
+    }
+    late = {
+        "type": "PlanFailure",
+        "message": "late",
+        "arguments": ["late", MissingValue("a set has no form in JSON", "{1}")],
+    }
+    group = {"type": "ExceptionGroup", "message": "inner (1 sub-exception)", "arguments": ["inner", [late]]}
+    assert failure.arguments == ["2 of 2 branches failed", [lost, group]]
+
+
+def test_a_group_deeper_than_the_limit_is_cut() -> None:
+    group: ExceptionGroup[Exception] = ExceptionGroup("0", [PlanFailure("x")])
+    for depth in range(1, 12):
+        group = ExceptionGroup(str(depth), [group])
+    arguments: Any = failure_value(group, NOBODY).arguments
+    for depth in range(11, 2, -1):
+        assert arguments[0] == str(depth)
+        arguments = arguments[1][0]["arguments"]
+    assert arguments == [MissingValue("it is nested more than 8 deep", clean_repr(group_at(group, 9)))]
+
+
+def group_at(group: ExceptionGroup[Exception], depth: int) -> BaseException:
+    found: Any = group
+    for _ in range(depth):
+        found = found.exceptions[0]
+    assert isinstance(found, BaseException)
+    return found
+
+
+def test_an_outcome_of_the_plan_language_is_a_small_dict() -> None:
+    outcome = Outcome(results=(None, object()), succeeded=(1,), failures=(ObjectLost("gone"),))
+    brief = {"succeeded": [1], "failures": ["ObjectLost: gone"]}
+    assert written_or_missing(outcome, NOBODY) == brief
+    assert written_or_missing([outcome, Outcome(rounds=3)], NOBODY) == [brief, {"rounds": 3}]
+    assert written_or_missing(Outcome(interrupted=True), NOBODY) == {"interrupted": True}
 
 
 def test_a_text_that_is_also_an_enum_is_written_as_its_text() -> None:
