@@ -1,0 +1,155 @@
+"""A plan put together wrongly, or out of what cannot be done, is remembered as such, and what is around it goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async.plan import (
+    ActionAbstract,
+    BelieveObject,
+    Code,
+    DetectAction,
+    Monitor,
+    NavigateAction,
+    NavigateActionPerformable,
+    ParkArmsAction,
+    PickUpAction,
+    PlanFailure,
+    PlanFailures,
+    Repeat,
+    Retry,
+)
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
+from tests.memory.notes import NoteActionPerformable
+from tests.promises.remembering import lab, nodes_of, remembered, statuses
+
+well: Any = NoteActionPerformable("well")
+nothing: Any = 7
+"""Any, for what is written with them here a type checker would refuse."""
+
+
+@dataclass
+class PlanningActionPerformable(ActionAbstract):
+    """Puts a plan together while it runs, and performs it."""
+
+    _made: Callable[[], Any]
+
+    async def perform(self) -> None:
+        await self._made().perform()
+
+
+WRONG: dict[str, tuple[Callable[[], Any], str]] = {
+    "a number on the right": (lambda: well + 7, "Sequential performs designators and descriptions of actions, not 7"),
+    "a text on the left": (
+        lambda: "milk" - well,
+        "TryInOrder performs designators and descriptions of actions, not 'milk'",
+    ),
+    "a class and no instance": (lambda: well | NavigateActionPerformable, "make an instance"),
+    "a function": (lambda: well | print, "wrap it in Code"),
+    "half a repetition": (lambda: well * 1.5, "a whole number of times"),
+    "repeated less than never": (lambda: Repeat(well, -1), "a whole number of times"),
+    "a monitor that asks nobody": (lambda: well >> Monitor(nothing), "a callable or an asyncio.Event"),
+    "a monitor of nothing": (lambda: well + Monitor(lambda: True), "watches nothing"),
+    "watched by an action": (lambda: well >> well, "only a Monitor"),
+    "a call of nothing": (lambda: Code(nothing), "calls a function"),
+    "tried less than once": (lambda: Retry(well, max_tries=0), "whole number of times from 1"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+async def test_a_plan_put_together_wrongly_is_a_failure_that_says_why(tmp_path: Path, name: str) -> None:
+    made, why = WRONG[name]
+    async with remembered(tmp_path):
+        await (PlanningActionPerformable(made) - NoteActionPerformable("went on")).perform()
+    _, expression, planning, note = await nodes_of(tmp_path)
+    assert statuses([expression, planning, note]) == [
+        ("TryInOrder", "SUCCEEDED"),
+        ("PlanningAction", "FAILED"),
+        ("NoteAction", "SUCCEEDED"),
+    ]
+    assert planning.reason == "NotALanguageExpression"
+    assert planning.failure_message is not None
+    assert why in planning.failure_message
+    assert "\n" not in planning.failure_message
+    assert planning.failure_arguments is not None
+    assert planning.failure_arguments[0] == planning.failure_message
+
+
+async def test_an_empty_alternative_among_others_is_passed_over_and_remembered(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        with lab():
+            await (NavigateAction([]) - ParkArmsAction([Arms.LEFT])).perform()
+    _, expression, park, motion = await nodes_of(tmp_path)
+    assert statuses([expression, park, motion]) == [
+        ("TryInOrder", "SUCCEEDED"),
+        ("ParkArmsAction", "SUCCEEDED"),
+        ("MoveArmJointsMotion", "SUCCEEDED"),
+    ]
+    # It was never performed, so it has no node; the expression says what it was.
+    message = "IllPosedGoalFailure: NavigateAction has no alternative for target_location"
+    assert expression.result == {"succeeded": [1], "failures": [message]}
+
+
+async def test_a_retry_without_any_alternative_fails_with_the_description_named(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        with pytest.raises(PlanFailure):
+            await Retry(ParkArmsAction([]), max_tries=3).perform()
+    _, retry = await nodes_of(tmp_path)
+    assert (retry.dtype, retry.status, retry.reason) == ("Retry", TaskStatus.FAILED, "IllPosedGoalFailure")
+    assert retry.failure_message == "ParkArmsAction has no alternative for arm"
+    assert retry.failure_arguments == ["ParkArmsAction has no alternative for arm", "arm"]
+
+
+async def test_a_retry_goes_on_where_a_pose_is_out_of_reach(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        with lab() as scene:
+            scene.robot.set_pose(Pose([0.6, 0.4, 0]))
+            await Retry(PickUpAction(scene.milk, [Arms.RIGHT, Arms.LEFT], [Grasp.FRONT]), max_tries=2).perform()
+    nodes = await nodes_of(tmp_path)
+    assert statuses(nodes)[1:5] == [
+        ("Retry", "SUCCEEDED"),
+        ("PickUpAction", "FAILED"),
+        ("MoveTCPMotion", "FAILED"),
+        ("PickUpAction", "SUCCEEDED"),
+    ]
+    for node in nodes[2:4]:
+        assert node.reason == "IKError"
+        assert node.failure_arguments is not None
+        assert node.failure_arguments[1:3] == ["RIGHT", "r_gripper_tool_frame"]
+
+
+async def test_several_failures_at_once_are_remembered_with_each_of_them(tmp_path: Path) -> None:
+    bowl = BelieveObject("bowl", ObjectType.BOWL, Pose([1, 0, 1]))
+    async with remembered(tmp_path):
+        with lab() as scene:
+            scene.milk.remove()
+            gone = PickUpAction(scene.milk, [Arms.LEFT], [Grasp.FRONT])
+            plan = (gone | DetectAction(bowl) | NoteActionPerformable("well")) - NoteActionPerformable("went on")
+            await plan.perform()
+            with pytest.raises(PlanFailures) as caught:
+                await (gone | DetectAction(bowl)).perform()
+            assert sorted(type(each).__name__ for each in caught.value.exceptions) == [
+                "PerceptionObjectNotFound",
+                "PerceptionObjectNotInWorld",
+            ]
+    _, *nodes = await nodes_of(tmp_path)
+    assert sorted(statuses(nodes[:6])) == [
+        ("DetectAction", "FAILED"),
+        ("DetectingMotion", "FAILED"),
+        ("NoteAction", "SUCCEEDED"),
+        ("Parallel", "FAILED"),
+        ("PickUpAction", "FAILED"),
+        ("TryInOrder", "SUCCEEDED"),
+    ]
+    assert statuses(nodes[6:7]) == [("NoteAction", "SUCCEEDED")]
+    parallel = next(node for node in nodes if node.dtype == "Parallel")
+    assert parallel.reason == "PlanFailures"
+    assert parallel.failure_message is not None
+    assert "milk is not an object of the world" in parallel.failure_message
+    assert "no BOWL is seen" in parallel.failure_message

@@ -1,0 +1,130 @@
+"""Measured defects of the plan language of the thesis' time, each beside what ours keeps true, in the memory as well.
+
+Numbers are those of the table in the README.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.plan import Code, Designator, NavigateAction, ParkArmsAction, PlanFailure, Repeat
+from pycrorm_async.plan.failures import ObjectLost
+from pycrorm_async.world import Arms, Pose
+from tests.memory.notes import NoteActionPerformable
+from tests.promises.remembering import FailingActionPerformable, asked, lab, nodes_of, remembered, statuses
+
+DEFECTS = {
+    "2.7-a": "test_a_failure_deep_inside_an_expression_fails_all_of_it",
+    "2.7-b": "test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested",
+    "2.7-c": "test_a_repetition_says_how_it_went",
+    "2.7-d": "test_every_branch_performs_its_own_operand",
+    "2.7-e": "test_expressions_are_nodes_of_the_tree_that_is_remembered",
+}
+
+
+def well(text: str = "well") -> NoteActionPerformable:
+    return NoteActionPerformable(text)
+
+
+def badly() -> FailingActionPerformable:
+    return FailingActionPerformable(ObjectLost("the milk slipped", "milk"))
+
+
+async def test_a_failure_deep_inside_an_expression_fails_all_of_it(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        for plan in ((well() + badly()) | well(), (badly() | well()) + well("never")):
+            with pytest.raises(ObjectLost, match="the milk slipped"):
+                await plan.perform()
+    nodes = await nodes_of(tmp_path)
+    # The branches took turns in whatever order; what they are and how they went is always the same.
+    assert sorted(statuses(nodes)[1:]) == sorted(
+        [
+            *[("Parallel", "FAILED"), ("Sequential", "FAILED"), ("FailingAction", "FAILED")] * 2,
+            *[("NoteAction", "SUCCEEDED")] * 3,
+        ]
+    )
+    for node in nodes:
+        if node.status.name == "FAILED":
+            assert (node.reason, node.failure_message) == ("ObjectLost", "the milk slipped")
+            assert node.failure_arguments == ["the milk slipped", "milk"]
+
+
+async def test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested(tmp_path: Path) -> None:
+    async with remembered(tmp_path) as memory:
+        await (well("1") + (well("2") + well("3"))).perform()
+        await ((well("4") + well("5")) + (well("6") + (well("7") + well("8")))).perform()
+        await memory.flush()
+        notes = memory.mapped(NoteActionPerformable)
+        assert list(await asked(tmp_path, select(notes.text).order_by(notes.id))) == list("12345678")
+    assert [dtype for dtype, _ in statuses(await nodes_of(tmp_path)) if dtype != "NoteAction"] == [
+        None,
+        "Sequential",
+        "Sequential",
+    ]
+
+
+async def test_a_repetition_says_how_it_went(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        outcome = await (well() * 3).perform()
+        assert (outcome.rounds, outcome.results, outcome.succeeded) == (3, (None, None, None), (0, 1, 2))
+        with pytest.raises(PlanFailure) as caught:
+            await Repeat(badly(), 2).perform()
+        assert [type(each) for each in caught.value.data] == [ObjectLost, ObjectLost]
+    nodes = await nodes_of(tmp_path)
+    assert statuses(nodes)[1:] == [
+        ("Repeat", "SUCCEEDED"),
+        *[("NoteAction", "SUCCEEDED")] * 3,
+        ("Repeat", "FAILED"),
+        *[("FailingAction", "FAILED")] * 2,
+    ]
+    assert nodes[1].result == {"rounds": 3}
+    assert nodes[5].failure_message is not None
+    assert "2 of 2 rounds failed (1, 2)" in nodes[5].failure_message
+
+
+async def test_every_branch_performs_its_own_operand(tmp_path: Path) -> None:
+    async def said(number: int) -> int:
+        await asyncio.sleep(0)
+        return number
+
+    branches: list[Designator] = [Code(said, number=number) for number in range(40)]
+    plan = branches[0] | branches[1]
+    for each in branches[2:]:
+        plan = plan | each
+    async with remembered(tmp_path):
+        outcome = await plan.perform()
+    assert outcome.results == tuple(range(40))
+    calls = select(TaskTreeNode).where(TaskTreeNode.dtype == "Code").order_by(TaskTreeNode.id)
+    assert sorted(node.result for node in await asked(tmp_path, calls)) == list(range(40))
+
+
+async def test_expressions_are_nodes_of_the_tree_that_is_remembered(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        with lab():
+            plan = NavigateAction([Pose([1, 0, 0])]) + (badly() - ParkArmsAction([Arms.LEFT]))
+            await plan.perform()
+    nodes = await nodes_of(tmp_path)
+    found = {node.id: node for node in nodes}
+
+    def depth(node: TaskTreeNode) -> int:
+        return 0 if node.parent_id is None else 1 + depth(found[node.parent_id])
+
+    assert [(depth(node), node.kind, node.dtype, node.status.name) for node in nodes] == [
+        (0, "root", None, "SUCCEEDED"),
+        (1, "language", "Sequential", "SUCCEEDED"),
+        (2, "action", "NavigateAction", "SUCCEEDED"),
+        (3, "motion", "MoveMotion", "SUCCEEDED"),
+        (2, "language", "TryInOrder", "SUCCEEDED"),
+        (3, "action", "FailingAction", "FAILED"),
+        (3, "action", "ParkArmsAction", "SUCCEEDED"),
+        (4, "motion", "MoveArmJointsMotion", "SUCCEEDED"),
+    ]
+    assert nodes[4].result == {"succeeded": [1], "failures": ["ObjectLost: the milk slipped"]}
+    for node in nodes:
+        assert node.end_time is not None
+        assert node.end_time >= node.start_time
