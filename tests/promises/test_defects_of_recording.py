@@ -80,17 +80,17 @@ from tests.promises.remembering import (
 )
 
 DEFECTS = {
-    "1.7-1": "test_an_object_is_stored_where_it_was_when_the_action_started",
-    "1.7-4": "test_an_action_on_a_believed_object_is_stored_with_where_it_was_believed",
-    "1.7-6": "test_a_crash_in_an_action_differs_from_a_plan_failure_and_from_what_never_ran",
-    "1.7-7": "test_a_failure_keeps_its_message_and_its_arguments",
-    "1.7-8": "test_concurrent_plans_never_nest_into_each_other",
-    "1.7-11": "test_a_node_is_running_until_it_ends_and_the_root_ends_too",
-    "1.7-12": "test_all_times_are_moments_in_utc_whatever_the_local_time_is",
-    "1.7-13": "test_joint_targets_places_detections_and_attachments_are_recorded",
-    "1.7-14": "test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_tree",
-    "1.7-15": "test_opening_and_closing_keep_their_object",
-    "1.7-16": "test_every_failure_there_is_can_be_raised_and_is_recorded",
+    "1": "test_an_object_is_stored_where_it_was_when_the_action_started",
+    "4": "test_an_action_on_a_believed_object_is_stored_with_where_it_was_believed",
+    "6": "test_a_crash_in_an_action_differs_from_a_plan_failure_and_from_what_never_ran",
+    "7": "test_a_failure_keeps_its_message_and_its_arguments",
+    "8": "test_concurrent_plans_never_nest_into_each_other",
+    "11": "test_a_node_is_running_until_it_ends_and_the_root_ends_too",
+    "12": "test_all_times_are_moments_in_utc_whatever_the_local_time_is",
+    "13": "test_joint_targets_places_detections_and_attachments_are_recorded",
+    "14": "test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_tree",
+    "15": "test_opening_and_closing_keep_their_object",
+    "16": "test_every_failure_there_is_can_be_raised_and_is_recorded",
 }
 
 

@@ -51,14 +51,14 @@ from tests.promises.remembering import (
 )
 
 DEFECTS = {
-    "6.3-1": "test_every_node_of_a_sequence_has_its_own_status_and_times",
-    "6.3-2": "test_the_state_after_an_action_is_not_the_state_before_it",
-    "6.3-3": "test_whoever_listens_to_a_plan_is_told_of_every_start_and_end",
-    "6.3-4": "test_what_is_stored_can_be_played_again",
-    "6.3-5": "test_every_stored_node_can_be_read_back_as_what_it_was",
-    "6.3-6": "test_alternatives_that_all_fail_are_a_failure",
-    "6.3-7": "test_expressions_have_times",
-    "6.3-8": "test_what_is_imported_is_declared_and_nothing_is_generated",
+    "s1": "test_every_node_of_a_sequence_has_its_own_status_and_times",
+    "s2": "test_the_state_after_an_action_is_not_the_state_before_it",
+    "s3": "test_whoever_listens_to_a_plan_is_told_of_every_start_and_end",
+    "s4": "test_what_is_stored_can_be_played_again",
+    "s5": "test_every_stored_node_can_be_read_back_as_what_it_was",
+    "s6": "test_alternatives_that_all_fail_are_a_failure",
+    "s7": "test_expressions_have_times",
+    "s8": "test_what_is_imported_is_declared_and_nothing_is_generated",
 }
 
 

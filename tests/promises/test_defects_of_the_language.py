@@ -19,11 +19,11 @@ from tests.memory.notes import NoteActionPerformable
 from tests.promises.remembering import FailingActionPerformable, asked, lab, nodes_of, remembered, statuses
 
 DEFECTS = {
-    "2.7-a": "test_a_failure_deep_inside_an_expression_fails_all_of_it",
-    "2.7-b": "test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested",
-    "2.7-c": "test_a_repetition_says_how_it_went",
-    "2.7-d": "test_every_branch_performs_its_own_operand",
-    "2.7-e": "test_expressions_are_nodes_of_the_tree_that_is_remembered",
+    "a": "test_a_failure_deep_inside_an_expression_fails_all_of_it",
+    "b": "test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested",
+    "c": "test_a_repetition_says_how_it_went",
+    "d": "test_every_branch_performs_its_own_operand",
+    "e": "test_expressions_are_nodes_of_the_tree_that_is_remembered",
 }
 
 
