@@ -8,6 +8,7 @@ True
 from __future__ import annotations
 
 import asyncio
+import copy
 import math
 from dataclasses import dataclass
 from numbers import Real
@@ -106,6 +107,6 @@ def watched(operand: Composable, monitor: Composable) -> Monitor:
         )
     if monitor.operands:
         raise NotALanguageExpression("this Monitor watches something already: make one of its own for this plan")
-    made = Monitor(monitor._condition, monitor.interval_s)  # noqa: SLF001  of the same class
+    made = copy.copy(monitor)
     made.hold([operand])
     return made

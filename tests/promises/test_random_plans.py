@@ -1,0 +1,227 @@
+"""A thousand random plans: what the memory holds of each is what its parts say of themselves."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import random
+import sqlite3
+from collections import defaultdict
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory
+from pycrorm_async.plan import ActionAbstract
+from tests.promises.generated import AT_ONCE, Entry, Generator, Journal, Thing, built
+
+PLANS = 1_000
+PARTS = 4
+
+Row = tuple[str, int | None, str, str | None, str | None]
+"""dtype, which row is the parent, status, class and message of the failure."""
+
+SQL = """
+SELECT description, node.id, parent_id, dtype, node.status, reason, node.failure_message
+FROM task_tree_node AS node JOIN process_metadata AS episode ON episode.id = node.process_metadata_id
+ORDER BY node.id
+"""
+
+
+def plan_of(seed: int) -> Thing:
+    return Generator(seed, wild=seed % 5 > 2, greedy=seed % 5 == 2).plan()
+
+
+async def play(seed: int, memory: Memory) -> Journal:
+    """Perform the plan of this seed in an episode of its own; every second wild one is cancelled from outside."""
+    thing = plan_of(seed)
+    journal = Journal(thing)
+    async with memory.episode(description=str(seed)):
+        plan = asyncio.create_task(built(thing, journal).perform())
+        if seed % 5 == 4:
+            for _ in range(random.Random(-seed).randrange(60)):
+                await asyncio.sleep(0)
+            plan.cancel("from outside")
+        await asyncio.wait([plan])
+        if journal.tasks:
+            await asyncio.wait(journal.tasks)
+    for task in (plan, *journal.tasks):
+        if not task.cancelled():
+            task.exception()
+    return journal
+
+
+def remembered(file: Path) -> dict[int, list[Row]]:
+    """The trees in the database, by seed, in the order their nodes started, without the roots of the episodes."""
+    with closing(sqlite3.connect(file)) as database:
+        rows = database.execute(SQL).fetchall()
+    places: dict[int, int] = {}
+    trees: dict[int, list[Row]] = defaultdict(list)
+    for description, node, parent, dtype, status, reason, message in rows:
+        if dtype is not None:
+            tree = trees[int(description)]
+            places[node] = len(tree)
+            tree.append((dtype, places.get(parent), status, reason, message))
+    return trees
+
+
+def told(journal: Journal) -> list[Row]:
+    return [(each.dtype, each.parent, each.status, each.reason, each.message) for each in journal.entries]
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+async def test_what_is_remembered_of_a_random_plan_is_what_its_parts_say(tmp_path: Path, part: int) -> None:
+    journals: dict[int, Journal] = {}
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        for seed in range(part, PLANS, PARTS):
+            async with asyncio.timeout(60):
+                journals[seed] = await play(seed, memory)
+        await memory.flush()
+        assert memory.status.faults.total == 0
+    trees = remembered(tmp_path / "memory.db")
+    assert set(trees) == {seed for seed, journal in journals.items() if journal.entries}
+    for seed, journal in journals.items():
+        assert trees.get(seed, []) == told(journal), f"seed {seed}: {plan_of(seed)}"
+        assert journal.collisions == [], f"seed {seed}: two branches held the same part of the robot"
+        assert all(each.status != "RUNNING" for each in journal.entries), f"seed {seed}"
+
+
+async def test_random_plans_of_each_status_and_depth_were_among_them() -> None:
+    # Else the test above would prove little. Without a memory: the journals are the same.
+    seen: dict[str, int] = defaultdict(int)
+    async with Memory.open("sqlite://") as memory:
+        for seed in range(300):
+            for each in (await play(seed, memory)).entries:
+                seen[each.status] += 1
+                seen[each.dtype] += 1
+                seen[f"reason {each.reason}"] += 1
+    for status in ("SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED"):
+        assert seen[status] > 20, (status, seen)
+    for name in "Sequential TryInOrder Parallel TryAll Repeat Retry Monitor Action".split():
+        assert seen[f"Told{name}"] > 50, (name, seen)
+    for name in "PlanFailures ExceptionGroup ResourceDeadlock ValueError Timeout".split():
+        assert seen[f"reason {name}"] > 0, (name, seen)
+
+
+# --- what the plan language means, said a second time ---------------------------------------------------------------
+
+Tree = tuple[tuple[int, ...], bool, list["Tree"]]
+"""Path, whether it succeeded, what it performed."""
+
+
+class Meaning:
+    """Goes through a plan without bugs, cancellations, monitors and turns as the language says it goes."""
+
+    def __init__(self) -> None:
+        self.runs: dict[tuple[int, ...], int] = defaultdict(int)
+
+    def of(self, thing: Thing) -> Tree:
+        if thing.kind == "leaf":
+            run = self.runs[thing.path]
+            self.runs[thing.path] += 1
+            return thing.path, thing.does[run % len(thing.does)] == "ok", []
+        done: list[Tree] = []
+        for each in self.turns(thing):
+            done.append(self.of(each))
+            if self.is_over(thing.kind, succeeded=done[-1][1]):
+                break
+        return thing.path, self.succeeded(thing.kind, [success for _, success, _ in done]), done
+
+    def turns(self, thing: Thing) -> list[Thing]:
+        if thing.kind in ("repeat", "retry"):
+            return thing.children * thing.times
+        return thing.children[: thing.times] if thing.kind == "alternatives" else thing.children
+
+    def is_over(self, kind: str, *, succeeded: bool) -> bool:
+        if kind in ("in_order", "retry", "alternatives"):
+            return succeeded
+        return kind in ("sequential", "then") and not succeeded
+
+    def succeeded(self, kind: str, successes: list[bool]) -> bool:
+        if kind == "anyway":
+            return True
+        return any(successes) if kind in ("in_order", "retry", "alternatives", "all") else all(successes)
+
+
+def tree_of(entries: list[Entry], root: int = 0) -> Tree:
+    """What the journal says, as a tree; what ran at once in the order it was written."""
+    entry = entries[root]
+    inside = [tree_of(entries, number) for number, each in enumerate(entries) if each.parent == root]
+    if entry.thing.kind in AT_ONCE:
+        inside.sort(key=lambda each: each[0])
+    return entry.thing.path, entry.status == "SUCCEEDED", inside
+
+
+async def test_an_ordinary_random_plan_does_what_the_language_means() -> None:
+    async with Memory.open("sqlite://") as memory:
+        for seed in range(0, PLANS, 5):
+            for each in (seed, seed + 1):
+                journal = await play(each, memory)
+                assert tree_of(journal.entries) == Meaning().of(plan_of(each)), f"seed {each}: {plan_of(each)}"
+
+
+# --- at once ----------------------------------------------------------------------------------------------------------
+
+
+async def test_plans_in_tasks_of_their_own_never_share_a_parent(tmp_path: Path) -> None:
+    journals: dict[int, Journal] = {}
+
+    async def some(first: int) -> None:
+        for seed in range(first, 90, 3):
+            journals[seed] = await play(seed, memory)
+
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        async with asyncio.TaskGroup() as group:
+            for first in range(3):
+                group.create_task(some(first))
+        await memory.flush()
+    trees = remembered(tmp_path / "memory.db")
+    for seed, journal in journals.items():
+        assert trees.get(seed, []) == told(journal), f"seed {seed}: {plan_of(seed)}"
+
+
+class Threads(ActionAbstract):
+    """Performs three plans, each in a thread of its own with a copy of the context."""
+
+    def __init__(self, journals: list[Journal]) -> None:
+        self.journals = journals
+
+    async def perform(self) -> None:
+        await asyncio.gather(*(asyncio.to_thread(self._run, journal) for journal in self.journals))
+
+    def _run(self, journal: Journal) -> None:
+        contextvars.copy_context().run(asyncio.run, self._plan(journal))
+
+    async def _plan(self, journal: Journal) -> None:
+        task = asyncio.create_task(built(journal.plan, journal).perform())
+        await asyncio.wait([task, *journal.tasks])
+        if not task.cancelled():
+            task.exception()
+
+
+async def test_plans_in_threads_of_their_own_never_share_a_parent(tmp_path: Path) -> None:
+    seeds = [seed for seed in range(60) if seed % 5 < 2]
+    rounds = [[Journal(plan_of(seed)) for seed in seeds[number : number + 3]] for number in range(0, len(seeds), 3)]
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        for number, journals in enumerate(rounds):
+            async with memory.episode(description=str(number)):
+                await Threads(journals).perform()
+        await memory.flush()
+    trees = remembered(tmp_path / "memory.db")
+    for number, journals in enumerate(rounds):
+        assert sorted(shapes(trees[number])) == sorted(shape for each in journals for shape in shapes(told(each)))
+
+
+def shapes(rows: list[Row]) -> list[str]:
+    """What is below each root (or below `Threads`), as text, in order."""
+    texts = [f"{dtype} {status} {reason} {message}" for dtype, _, status, reason, message in rows]
+    children: dict[int | None, list[int]] = defaultdict(list)
+    for number, (_, parent, *_) in enumerate(rows):
+        children[parent].append(number)
+
+    def shape(number: int) -> str:
+        return f"{texts[number]} [{', '.join(map(shape, children[number]))}]"
+
+    top = children[0] if rows[0][0] == "ThreadsAction" else children[None]
+    return [shape(each) for each in top]
