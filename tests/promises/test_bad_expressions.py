@@ -153,3 +153,19 @@ async def test_several_failures_at_once_are_remembered_with_each_of_them(tmp_pat
     assert parallel.failure_message is not None
     assert "milk is not an object of the world" in parallel.failure_message
     assert "no BOWL is seen" in parallel.failure_message
+    gone_message, unseen = "milk is not an object of the world", "no BOWL is seen; there is none in the world"
+    assert parallel.failure_arguments == [
+        parallel.failure_message,
+        [
+            {
+                "type": "PerceptionObjectNotInWorld",
+                "message": gone_message,
+                "arguments": [gone_message, "milk"],
+            },
+            {
+                "type": "PerceptionObjectNotFound",
+                "message": unseen,
+                "arguments": [unseen, "BOWL", {}],
+            },
+        ],
+    ]
