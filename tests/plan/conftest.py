@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,8 +22,8 @@ class Scene(NamedTuple):
     cereal: Object
 
 
-@pytest.fixture
-def scene() -> Iterator[Scene]:
+@contextmanager
+def kitchen() -> Iterator[Scene]:
     """Robot at the origin, kitchen, milk and cereal on its counter; the simulated robot carries motions out."""
     with BulletWorld(mode=WorldMode.DIRECT) as world, simulated_robot:
         yield Scene(
@@ -32,6 +33,13 @@ def scene() -> Iterator[Scene]:
             Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9])),
             Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95])),
         )
+
+
+@pytest.fixture
+def scene() -> Iterator[Scene]:
+    """The kitchen, for a test's whole length."""
+    with kitchen() as there:
+        yield there
 
 
 @pytest.fixture
