@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +11,11 @@ from sqlalchemy import Select
 
 from pycrorm_async import Memory
 from pycrorm_async.plan import MoveTorsoAction, NavigateAction, ObjectDesignatorDescription, PickUpAction, PlaceAction
-from pycrorm_async.plan import simulated_robot as simulated
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from tests.plan.conftest import Scene
+from pycrorm_async.world import Arms, Grasp, Pose
+from tests.plan.conftest import Scene, kitchen
 from tests.promises.remembering import asked, url_of
 
 DESCRIPTION = "the common plan"
-
-
-@contextmanager
-def kitchen() -> Iterator[Scene]:
-    """The scene; motions are simulated."""
-    with BulletWorld() as world, simulated:
-        yield Scene(
-            world,
-            Object("pr2", ObjectType.ROBOT),
-            Object("kitchen", ObjectType.ENVIRONMENT),
-            Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9])),
-            Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95])),
-        )
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import IKError, ParkArmsAction, PickUpAction, PlanFailure, Retry, TaskStatus, collected_tree
 from pycrorm_async.plan.failures import GripperClosedCompletely
 from pycrorm_async.world import Arms, Grasp, Pose
-from tests.plan.conftest import Scene
+from tests.plan.conftest import Scene, kitchen
 from tests.promises.remembering import statuses, url_of
-from tests.upstream.conftest import Remembered, kitchen
+from tests.upstream.conftest import Remembered
 
 
 async def test_retry_with_success(tmp_path: Path) -> None:

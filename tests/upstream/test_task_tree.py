@@ -13,9 +13,9 @@ from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure, SimulatedTaskTree, TaskStatus, collected_tree
 from pycrorm_async.plan.task_tree import CollectedTree
 from pycrorm_async.world import Pose
-from tests.plan.conftest import Scene
+from tests.plan.conftest import Scene, kitchen
 from tests.promises.remembering import url_of
-from tests.upstream.conftest import Remembered, common_plan, kitchen
+from tests.upstream.conftest import Remembered, common_plan
 
 
 @dataclass
