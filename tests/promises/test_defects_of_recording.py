@@ -109,20 +109,22 @@ class MoveAsideActionPerformable(ActionAbstract):
 async def test_an_object_is_stored_where_it_was_when_the_action_started(tmp_path: Path) -> None:
     async with remembered(tmp_path) as memory:
         with lab() as scene:
+            scene.milk.set_pose(Pose([1.3, 0.95, 0.9]))
             await NavigateActionPerformable(WITHIN_REACH).perform()
             await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+            scene.cereal.set_pose(Pose([4, 4, 0.9]))
             meant = ObjectDesignator("cereal", ObjectType.BREAKFAST_CEREAL, scene.cereal)
             await MoveAsideActionPerformable(meant, Pose([5, 5, 0.9])).perform()
             scene.robot.detach(scene.milk)
             scene.milk.set_pose(Pose([5, 5, 1]))
         await memory.flush()
         (pick,) = await every(memory, select(PickUpAction))
-        assert at(pick.object.pose) == MILK_AT
+        assert at(pick.object.pose) == (1.3, 0.95, 0.9)
         (aside,) = await every(memory, select(memory.mapped("MoveAsideAction")))
-        assert at(aside.what.pose) == (1.3, 0.7, 0.95)
+        assert at(aside.what.pose) == (4, 4, 0.9)
         assert at(aside.where) == (5, 5, 0.9)
         milk = await every(memory, select(Object).where(Object.name == "milk").order_by(Object.id))
-        assert at(milk[0].pose) == MILK_AT
+        assert [at(each.pose) for each in milk[:2]] == [MILK_AT, (1.3, 0.95, 0.9)]
         assert at(milk[-1].pose) == (5, 5, 1)
         assert {row.identity_id for row in milk} == {milk[0].id}
 
