@@ -16,25 +16,29 @@ __all__ = ["ended", "raise_what_broke"]
 async def ended(tasks: Sequence[asyncio.Task[Any]]) -> asyncio.CancelledError | None:
     """All have ended; as soon as one was cancelled or raised, the others are cancelled.
 
+    They are cancelled as often as this is, and at least once if one broke: a branch that cleans up is left alone.
+
     Returns:
         The cancellation that came from outside meanwhile and was passed on to them, if one did. Raise it again.
     """
     outside: asyncio.CancelledError | None = None
-    broken = False
+    asked = told = 0
     pending = set(tasks)
     while pending:
         try:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError as cancelled:
             outside = cancelled
-            _cancel(pending)
+            asked += 1
         except BaseException:  # a dropped plan is closed: nothing can be awaited any more
             _cancel(pending)
             raise
         else:
-            if not broken and any(each.cancelled() or each.exception() is not None for each in done):
-                broken = True
-                _cancel(pending)
+            if any(each.cancelled() or each.exception() is not None for each in done):
+                asked = max(asked, 1)
+        if asked > told:
+            told = asked
+            _cancel(pending)
     try:
         return outside
     finally:
