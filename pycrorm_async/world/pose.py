@@ -9,13 +9,25 @@ Pose(position=[1.0, 1.0, 0.0], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import CallerError
 
-__all__ = ["Vector", "Quaternion", "IDENTITY", "COORDINATE_MAX", "Pose", "rotated", "product", "yaw_quaternion"]
+__all__ = [
+    "Vector",
+    "Quaternion",
+    "IDENTITY",
+    "COORDINATE_MAX",
+    "MalformedPose",
+    "Pose",
+    "rotated",
+    "product",
+    "yaw_quaternion",
+]
 
 
 class Vector(NamedTuple):
@@ -70,6 +82,10 @@ def yaw_quaternion(angle: float) -> Quaternion:
     return Quaternion(0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
 
 
+class MalformedPose(CallerError, ValueError):
+    """A pose was made of something else than numbers, a frame's name and whole nanoseconds."""
+
+
 @dataclass(frozen=True, slots=True, init=False, repr=False)
 class Pose:
     """Where something is and how it is turned. Equality leaves the time out.
@@ -81,7 +97,8 @@ class Pose:
         time_ns: UTC in ns since 1970; now, if left out.
 
     Raises:
-        ValueError: a wrong number of components, or a quaternion of length zero.
+        MalformedPose: a wrong number of components, or no numbers; a quaternion of length zero; a frame that is no
+            str; a time that is no whole number of 64 bits. It is a ValueError too.
     """
 
     position: Vector
@@ -96,22 +113,30 @@ class Pose:
         frame: str = "map",
         time_ns: int | None = None,
     ) -> None:
-        x, y, z = position
-        qx, qy, qz, qw = orientation
-        length = math.hypot(qx, qy, qz, qw)
+        put = object.__setattr__
+        try:
+            x, y, z = position
+            put(self, "position", Vector(float(x), float(y), float(z)))
+        except (TypeError, ValueError, OverflowError):
+            raise MalformedPose(f"a position is three numbers x, y, z in metres, not {position!r}") from None
+        try:
+            qx, qy, qz, qw = orientation
+            length = math.hypot(qx, qy, qz, qw)
+        except (TypeError, ValueError, OverflowError):
+            raise MalformedPose(f"an orientation is four numbers x, y, z, w, not {orientation!r}") from None
         if length == 0:
-            raise ValueError("an orientation needs a quaternion of length other than zero")
+            raise MalformedPose("an orientation needs a quaternion of length other than zero")
         unit = abs(length - 1.0) < 1e-15
         scale = 1.0 if unit else 1.0 / length
-        put = object.__setattr__
-        put(self, "position", Vector(float(x), float(y), float(z)))
         put(
             self,
             "orientation",
             Quaternion(float(qx * scale), float(qy * scale), float(qz * scale), float(qw * scale)),
         )
+        if not isinstance(frame, str):
+            raise MalformedPose(f"a pose's frame is a name, not {frame!r}")
         put(self, "frame", frame)
-        put(self, "time_ns", SYSTEM_CLOCK.wall_ns() if time_ns is None else time_ns)
+        put(self, "time_ns", SYSTEM_CLOCK.wall_ns() if time_ns is None else _nanoseconds(time_ns))
 
     def __repr__(self) -> str:
         return f"Pose(position={list(self.position)}, orientation={list(self.orientation)}, frame={self.frame!r})"
@@ -142,3 +167,17 @@ class Pose:
         """Heading in the plane, rad in (-π, π]."""
         x, y, z, w = self.orientation
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+
+
+def _nanoseconds(time: object) -> int:
+    """A whole number that the log can hold; what it could not, it would refuse with the whole episode."""
+    try:
+        whole = operator.index(time)  # type: ignore[arg-type]  # asking is the check
+    except TypeError:
+        whole = _NS_END
+    if not -_NS_END <= whole < _NS_END:
+        raise MalformedPose(f"a pose's time is a whole number of ns since 1970, not {time!r}")
+    return whole
+
+
+_NS_END = 2**63

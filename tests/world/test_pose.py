@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
 import pytest
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.world import Pose
+from pycrorm_async.world.pose import MalformedPose
 
 
 @pytest.mark.parametrize("length", [1e-300, 0.5, 1.0, 3.0, 1e300])
@@ -19,3 +23,33 @@ def test_an_orientation_of_any_length_is_the_same_rotation(length: float) -> Non
 def test_no_quaternion_at_all_is_refused() -> None:
     with pytest.raises(ValueError, match="length other than zero"):
         Pose([0, 0, 0], [0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"position": [0, 0]}, r"three numbers x, y, z in metres, not \[0, 0\]"),
+        ({"position": None}, "three numbers x, y, z in metres, not None"),
+        ({"position": ["a", "b", "c"]}, "three numbers x, y, z in metres"),
+        ({"position": [0, 0, 10**400]}, "three numbers x, y, z in metres"),
+        ({"position": Pose()}, "three numbers x, y, z in metres, not Pose"),
+        ({"orientation": [0, 0, 1]}, r"four numbers x, y, z, w, not \[0, 0, 1\]"),
+        ({"orientation": "none"}, "four numbers x, y, z, w, not 'none'"),
+        ({"frame": None}, "a pose's frame is a name, not None"),
+        ({"frame": 3}, "a pose's frame is a name, not 3"),
+        ({"time_ns": 1.5e18}, "whole number of ns since 1970"),
+        ({"time_ns": "now"}, "whole number of ns since 1970, not 'now'"),
+        ({"time_ns": 2**63}, "whole number of ns since 1970, not 9223372036854775808"),
+    ],
+)
+def test_what_is_no_pose_is_refused_in_a_line_that_says_what_is_wrong(arguments: dict[str, Any], said: str) -> None:
+    with pytest.raises(MalformedPose, match=said) as caught:
+        Pose(**arguments)
+    assert isinstance(caught.value, CallerError)
+
+
+def test_numbers_of_numpy_become_plain_ones() -> None:
+    pose = Pose(np.array([1, 2, 3]), np.array([0.0, 0.0, 1.0, 0.0], np.float32), time_ns=np.int64(5))  # type: ignore[arg-type]
+    assert (pose.position, pose.orientation, pose.time_ns) == ((1.0, 2.0, 3.0), (0.0, 0.0, 1.0, 0.0), 5)
+    assert {type(each) for each in (*pose.position, *pose.orientation)} == {float}
+    assert type(pose.time_ns) is int
