@@ -1,6 +1,7 @@
 """A description of an action holds alternatives for each property; `resolve()` takes the first of each.
 
-Iterating it gives every combination, the last property varying fastest:
+A property with one value needs no list: `ParkArmsAction(Arms.LEFT)`. Iterating a description gives every
+combination, the last property varying fastest:
 
 >>> [each.motion.name for each in SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])]
 ['OPEN', 'CLOSE']
@@ -9,7 +10,7 @@ Iterating it gives every combination, the last property varying fastest:
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Generic, TypeAlias, TypeVar
 
 from pycrorm_async.plan.actions import (
@@ -54,9 +55,10 @@ __all__ = [
 ]
 
 P = TypeVar("P")
+T = TypeVar("T")
 
-Objects: TypeAlias = ObjectDesignatorDescription | ObjectLike | Sequence[ObjectLike]
-Handles: TypeAlias = ObjectPart | Sequence[ObjectPart]
+OneOrMore: TypeAlias = T | Iterable[T]
+Objects: TypeAlias = ObjectDesignatorDescription | OneOrMore[ObjectLike]
 
 
 class ActionDescription(Composable, Generic[P]):
@@ -65,12 +67,9 @@ class ActionDescription(Composable, Generic[P]):
     Objects that are described are looked for in the world each time it is asked.
     """
 
-    def __init__(self, performable: Callable[..., P], **alternatives: Iterable[Any]) -> None:
+    def __init__(self, performable: Callable[..., P], **alternatives: Any) -> None:
         self._performable = performable
-        self._alternatives = {
-            name: each if isinstance(each, ObjectDesignatorDescription) else tuple(each)
-            for name, each in alternatives.items()
-        }
+        self._alternatives = {name: _among(each) for name, each in alternatives.items()}
 
     def resolve(self) -> P:
         """The performable with the first alternative of each property.
@@ -95,52 +94,61 @@ class ActionDescription(Composable, Generic[P]):
         return among
 
 
-def _objects(meant: Objects) -> Iterable[ObjectLike]:
-    return meant if isinstance(meant, ObjectDesignatorDescription | Sequence) else (meant,)
+def _among(given: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
+    """The alternatives that are given; what holds none is the only one, and so is a word, whose letters are none."""
+    if isinstance(given, ObjectDesignatorDescription):
+        return given
+    if isinstance(given, str):
+        return (given,)
+    try:
+        each = iter(given)
+    except TypeError:
+        return (given,)
+    return tuple(each)
 
 
 class MoveTorsoAction(ActionDescription[MoveTorsoActionPerformable]):
     """Lift or lower the torso to one of these positions (m)."""
 
-    def __init__(self, positions: Iterable[float]) -> None:
+    def __init__(self, positions: OneOrMore[float]) -> None:
         super().__init__(MoveTorsoActionPerformable, position=positions)
 
 
 class SetGripperAction(ActionDescription[SetGripperActionPerformable]):
     """Open or close a gripper."""
 
-    def __init__(self, grippers: Iterable[Arms], motions: Iterable[GripperState]) -> None:
+    def __init__(self, grippers: OneOrMore[Arms], motions: OneOrMore[GripperState]) -> None:
         super().__init__(SetGripperActionPerformable, gripper=grippers, motion=motions)
 
 
 class ParkArmsAction(ActionDescription[ParkArmsActionPerformable]):
     """Fold one of these arms, or both, out of the way."""
 
-    def __init__(self, arms: Iterable[Arms]) -> None:
+    def __init__(self, arms: OneOrMore[Arms]) -> None:
         super().__init__(ParkArmsActionPerformable, arm=arms)
 
 
 class NavigateAction(ActionDescription[NavigateActionPerformable]):
     """Drive to one of these places."""
 
-    def __init__(self, target_locations: Iterable[Pose]) -> None:
+    def __init__(self, target_locations: OneOrMore[Pose]) -> None:
         super().__init__(NavigateActionPerformable, target_location=target_locations)
 
 
 class LookAtAction(ActionDescription[LookAtActionPerformable]):
     """Turn the head to one of these points."""
 
-    def __init__(self, targets: Iterable[Pose]) -> None:
+    def __init__(self, targets: OneOrMore[Pose]) -> None:
         super().__init__(LookAtActionPerformable, target=targets)
 
 
 class PickUpAction(ActionDescription[PickUpActionPerformable]):
     """Take an object: one, some, or whatever is as described."""
 
-    def __init__(self, object_designator_description: Objects, arms: Iterable[Arms], grasps: Iterable[Grasp]) -> None:
+    def __init__(self, object_designator_description: Objects, arms: OneOrMore[Arms], grasps: OneOrMore[Grasp]) -> None:
         super().__init__(
             PickUpActionPerformable,
-            object_designator=_objects(object_designator_description),
+            object_designator=object_designator_description,
             arm=arms,
             grasp=grasps,
         )
@@ -150,11 +158,11 @@ class PlaceAction(ActionDescription[PlaceActionPerformable]):
     """Put the held object down at one of these poses."""
 
     def __init__(
-        self, object_designator_description: Objects, target_locations: Iterable[Pose], arms: Iterable[Arms]
+        self, object_designator_description: Objects, target_locations: OneOrMore[Pose], arms: OneOrMore[Arms]
     ) -> None:
         super().__init__(
             PlaceActionPerformable,
-            object_designator=_objects(object_designator_description),
+            object_designator=object_designator_description,
             arm=arms,
             target_location=target_locations,
         )
@@ -164,12 +172,12 @@ class GripAction(ActionDescription[GripActionPerformable]):
     """Hold an object that is in the gripper, with one of these efforts (N)."""
 
     def __init__(
-        self, grippers: Iterable[Arms], object_designator_description: Objects, efforts: Iterable[float]
+        self, grippers: OneOrMore[Arms], object_designator_description: Objects, efforts: OneOrMore[float]
     ) -> None:
         super().__init__(
             GripActionPerformable,
             gripper=grippers,
-            object_designator=_objects(object_designator_description),
+            object_designator=object_designator_description,
             effort=efforts,
         )
 
@@ -177,49 +185,47 @@ class GripAction(ActionDescription[GripActionPerformable]):
 class ReleaseAction(ActionDescription[ReleaseActionPerformable]):
     """Let go of an object."""
 
-    def __init__(self, grippers: Iterable[Arms], object_designator_description: Objects) -> None:
-        super().__init__(
-            ReleaseActionPerformable, gripper=grippers, object_designator=_objects(object_designator_description)
-        )
+    def __init__(self, grippers: OneOrMore[Arms], object_designator_description: Objects) -> None:
+        super().__init__(ReleaseActionPerformable, gripper=grippers, object_designator=object_designator_description)
 
 
 class GraspingAction(ActionDescription[GraspingActionPerformable]):
     """Close a gripper around an object or a handle."""
 
-    def __init__(self, arms: Iterable[Arms], object_description: Objects) -> None:
-        super().__init__(GraspingActionPerformable, arm=arms, object_desig=_objects(object_description))
+    def __init__(self, arms: OneOrMore[Arms], object_description: Objects) -> None:
+        super().__init__(GraspingActionPerformable, arm=arms, object_desig=object_description)
 
 
 class OpenAction(ActionDescription[OpenActionPerformable]):
     """Open a drawer or a door by one of these handles."""
 
-    def __init__(self, object_designator_description: Handles, arms: Iterable[Arms]) -> None:
-        super().__init__(OpenActionPerformable, object_designator=_objects(object_designator_description), arm=arms)
+    def __init__(self, object_designator_description: OneOrMore[ObjectPart], arms: OneOrMore[Arms]) -> None:
+        super().__init__(OpenActionPerformable, object_designator=object_designator_description, arm=arms)
 
 
 class CloseAction(ActionDescription[CloseActionPerformable]):
     """Close a drawer or a door by one of these handles."""
 
-    def __init__(self, object_designator_description: Handles, arms: Iterable[Arms]) -> None:
-        super().__init__(CloseActionPerformable, object_designator=_objects(object_designator_description), arm=arms)
+    def __init__(self, object_designator_description: OneOrMore[ObjectPart], arms: OneOrMore[Arms]) -> None:
+        super().__init__(CloseActionPerformable, object_designator=object_designator_description, arm=arms)
 
 
 class DetectAction(ActionDescription[DetectActionPerformable]):
     """Look for an object like one of these."""
 
     def __init__(self, object_designator_description: Objects) -> None:
-        super().__init__(DetectActionPerformable, object_designator=_objects(object_designator_description))
+        super().__init__(DetectActionPerformable, object_designator=object_designator_description)
 
 
 class TransportAction(ActionDescription[TransportActionPerformable]):
     """Fetch an object and put it down at one of these poses."""
 
     def __init__(
-        self, object_designator_description: Objects, arms: Iterable[Arms], target_locations: Iterable[Pose]
+        self, object_designator_description: Objects, arms: OneOrMore[Arms], target_locations: OneOrMore[Pose]
     ) -> None:
         super().__init__(
             TransportActionPerformable,
-            object_designator=_objects(object_designator_description),
+            object_designator=object_designator_description,
             arm=arms,
             target_location=target_locations,
         )

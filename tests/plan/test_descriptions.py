@@ -31,6 +31,7 @@ from pycrorm_async.plan import (
     PlaceActionPerformable,
     ReleaseAction,
     ReleaseActionPerformable,
+    ResolutionError,
     SetGripperAction,
     SetGripperActionPerformable,
     TransportAction,
@@ -53,6 +54,28 @@ def test_resolving_takes_the_first_of_each() -> None:
     assert SetGripperAction(grippers=[Arms.LEFT], motions=[GripperState.OPEN]).resolve() == SetGripperActionPerformable(
         Arms.LEFT, GripperState.OPEN
     )
+
+
+def test_one_value_needs_no_list(scene: Scene) -> None:
+    assert ParkArmsAction(Arms.LEFT).resolve() == ParkArmsActionPerformable(Arms.LEFT)
+    assert MoveTorsoAction(0.2).resolve() == MoveTorsoActionPerformable(0.2)
+    assert NavigateAction(THERE).resolve() == NavigateActionPerformable(THERE)
+    opening = SetGripperAction([Arms.LEFT, Arms.RIGHT], GripperState.OPEN)
+    assert [each.gripper for each in opening] == [Arms.LEFT, Arms.RIGHT]
+    assert TransportAction(scene.milk, Arms.LEFT, THERE).resolve() == TransportActionPerformable(
+        scene.milk, Arms.LEFT, THERE
+    )
+    two = PickUpAction((each for each in (scene.milk, scene.cereal)), Arms.LEFT, Grasp.TOP)
+    assert [each.object_designator for each in two] == [scene.milk, scene.cereal]
+
+
+def test_what_is_no_alternative_at_all_is_refused_whole_and_by_name(scene: Scene) -> None:
+    with pytest.raises(ResolutionError, match="wrong: arm: expected Arms, got str 'LEFT'"):
+        ParkArmsAction("LEFT").resolve()  # type: ignore[arg-type]
+    with pytest.raises(ResolutionError, match=r"missing: arm$"):
+        ParkArmsAction(None).resolve()  # type: ignore[arg-type]
+    with pytest.raises(ResolutionError, match=r"object_designator: .*, got str 'milk'"):
+        PickUpAction("milk", [Arms.LEFT], [Grasp.FRONT]).resolve()  # type: ignore[arg-type]
 
 
 def test_what_hands_and_eyes_do_takes_objects_and_handles(scene: Scene) -> None:
