@@ -17,6 +17,7 @@ from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.plan.grasping import pick_up_poses, place_pose, retracted
 from pycrorm_async.plan.here import robot_here
+from pycrorm_async.plan.holding import check_takable, take
 from pycrorm_async.plan.motions import (
     LookingMotion,
     MoveArmJointsMotion,
@@ -138,7 +139,10 @@ class PickUpActionPerformable(CheckedAction):
 
     Raises:
         IKError: one of the three goals of the arm is out of reach.
+        EndEffectorFailure: the gripper holds something else.
         PerceptionObjectNotInWorld: there is no such object.
+        IllPosedGoalFailure: not one arm, or furniture or a robot is to be held.
+        CapabilityAbsenceFailure: the robot has no such arm.
     """
 
     concept: ClassVar[str | None] = "PickingUp"
@@ -153,15 +157,14 @@ class PickUpActionPerformable(CheckedAction):
     async def perform(self) -> None:
         robot = robot_here()
         wanted = in_world(self.object_designator)
+        check_takable(robot, self.arm, wanted)
         tool_frame = robot.one_arm(self.arm).tool_frame
         before, at, above = pick_up_poses(wanted.pose, self.grasp, robot.body.link_pose(tool_frame))
         await MoveTCPMotion(before, self.arm, allow_gripper_collision=True).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(at, self.arm, allow_gripper_collision=True).perform()
         await MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
-        if wanted.attached_to is not None:
-            wanted.attached_to.detach(wanted)
-        robot.body.attach(wanted, tool_frame)
+        take(robot, self.arm, wanted)
         await MoveTCPMotion(above, self.arm, allow_gripper_collision=True).perform()
 
 
@@ -170,7 +173,7 @@ class PlaceActionPerformable(CheckedAction):
     """Put the held object down: it ends at `target_location`, the gripper 7 cm behind.
 
     Raises:
-        IKError: the arm does not reach.
+        IKError: the arm does not reach; then it holds the object, unless it is the way back that it does not reach.
         ObjectLost: the arm does not hold it.
         PerceptionObjectNotInWorld: there is no such object.
     """

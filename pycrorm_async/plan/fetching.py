@@ -18,6 +18,7 @@ from pycrorm_async.plan.actions import (
 )
 from pycrorm_async.plan.failures import ObjectUnfetchable, ObjectUnreachable
 from pycrorm_async.plan.here import robot_here
+from pycrorm_async.plan.holding import check_takable
 from pycrorm_async.plan.locations import CostmapLocation
 from pycrorm_async.plan.motions import DetectingMotion
 from pycrorm_async.plan.objects import ObjectDesignator, in_world
@@ -57,8 +58,9 @@ class TransportActionPerformable(CheckedAction):
     Raises:
         ObjectUnfetchable: there is no place to stand and pick it up.
         ReachabilityFailure: there is none to put it down from; the arm holds it then.
+        EndEffectorFailure: the arm holds something else.
         PerceptionObjectNotInWorld: there is no such object.
-        IllPosedGoalFailure, CapabilityAbsenceFailure: not one arm; no such arm.
+        IllPosedGoalFailure, CapabilityAbsenceFailure: not one arm, or nothing that can be held; no such arm.
     """
 
     concept: ClassVar[str | None] = "Transporting"
@@ -74,6 +76,7 @@ class TransportActionPerformable(CheckedAction):
         robot = robot_here()
         tool_frame = robot.one_arm(self.arm).tool_frame
         wanted = in_world(self.object_designator)
+        check_takable(robot, self.arm, wanted)
         await self._park_arms()
         if robot.body.attachments.get(wanted) != tool_frame:
             await NavigateActionPerformable(self._stand_to_fetch(robot.body)).perform()

@@ -11,18 +11,14 @@ from typing import ClassVar
 
 from pycrorm_async.plan.accessing import grasp_pose, handle_of
 from pycrorm_async.plan.actions import CheckedAction
-from pycrorm_async.plan.failures import (
-    EndEffectorFailure,
-    GripperClosedCompletely,
-    IllPosedGoalFailure,
-    ObjectLost,
-)
+from pycrorm_async.plan.failures import GripperClosedCompletely, IllPosedGoalFailure, ObjectLost
 from pycrorm_async.plan.grasping import HOLD_DISTANCE_M_MAX, approached, between
-from pycrorm_async.plan.here import RobotHere, robot_here
+from pycrorm_async.plan.here import robot_here
+from pycrorm_async.plan.holding import check_free, check_takable, take
 from pycrorm_async.plan.motions import ClosingMotion, MoveGripperMotion, MoveTCPMotion, OpeningMotion
 from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart, in_world
 from pycrorm_async.plan.resources import Resource, reaching
-from pycrorm_async.world.enums import Arms, GripperState, ObjectType
+from pycrorm_async.world.enums import Arms, GripperState
 from pycrorm_async.world.objects import Object
 
 __all__ = [
@@ -64,20 +60,14 @@ class GripActionPerformable(CheckedAction):
         wanted = in_world(self.object_designator)
         if not self.effort >= 0:
             raise IllPosedGoalFailure(f"an effort of {self.effort} N holds nothing", self.effort)
-        if wanted.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
-            raise IllPosedGoalFailure(f"{wanted.name} is nothing that a gripper can hold", wanted.name)
-        _check_free(robot, self.gripper, wanted)
+        check_takable(robot, self.gripper, wanted)
         tool = robot.body.link_pose(tool_frame)
         apart = min(between(tool, wanted.bounding_box(link)) for link in wanted.links)
         if apart > HOLD_DISTANCE_M_MAX:
             message = f"the {self.gripper.name} gripper would close on nothing: {wanted.name} is {apart:.3f} m from it"
             raise GripperClosedCompletely(message, wanted.name, apart)
         await MoveGripperMotion(GripperState.CLOSE, self.gripper).perform()
-        if robot.body.attachments.get(wanted) == tool_frame:
-            return
-        if wanted.attached_to is not None:
-            wanted.attached_to.detach(wanted)
-        robot.body.attach(wanted, tool_frame)
+        take(robot, self.gripper, wanted)
 
 
 @dataclass
@@ -133,7 +123,7 @@ class GraspingActionPerformable(CheckedAction):
     async def perform(self) -> None:
         robot = robot_here()
         goal = grasp_pose(self.object_desig)
-        _check_free(robot, self.arm)
+        check_free(robot, self.arm)
         await MoveTCPMotion(approached(goal), self.arm).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(goal, self.arm, allow_gripper_collision=True).perform()
@@ -184,11 +174,3 @@ class CloseActionPerformable(CheckedAction):
         await GraspingActionPerformable(self.arm, self.object_designator).perform()
         await ClosingMotion(self.object_designator, self.arm).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm, allow_gripper_collision=True).perform()
-
-
-def _check_free(robot: RobotHere, arm: Arms, *but: Object) -> None:
-    """Raise `EndEffectorFailure` if the gripper holds something else than this."""
-    tool_frame = robot.one_arm(arm).tool_frame
-    for thing, link in robot.body.attachments.items():
-        if link == tool_frame and thing not in but:
-            raise EndEffectorFailure(f"the {arm.name} gripper holds {thing.name}: place or release it", thing.name)

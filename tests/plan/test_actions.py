@@ -34,6 +34,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import (
+    EndEffectorFailure,
     IllPosedGoalFailure,
     ObjectLost,
     PerceptionObjectNotInWorld,
@@ -167,6 +168,35 @@ async def test_what_is_not_in_the_world_cannot_be_picked_up(scene: Scene) -> Non
         with collected_tree() as tree, pytest.raises(PerceptionObjectNotInWorld, match=meant.name):
             await PickUpActionPerformable(meant, Arms.LEFT, Grasp.FRONT).perform()
         assert len(tree) == 1
+
+
+async def test_a_full_hand_picks_up_nothing_else_and_moves_nothing(scene: Scene) -> None:
+    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
+    scene.robot.attach(scene.cereal, LEFT_TOOL)
+    before = scene.world.save_state()
+    for action in (
+        PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT),
+        TransportActionPerformable(scene.milk, Arms.LEFT, Pose([-1.3, 1, 0.95])),
+    ):
+        with pytest.raises(EndEffectorFailure, match="the LEFT gripper holds cereal") as caught:
+            await action.perform()
+        assert (caught.value.data, scene.world.save_state()) == (("cereal",), before)
+    await PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.FRONT).perform()
+    assert scene.robot.attachments == {scene.cereal: LEFT_TOOL, scene.milk: RIGHT_TOOL}
+
+
+async def test_furniture_and_robots_are_not_picked_up_however_near_they_are(scene: Scene) -> None:
+    scene.robot.set_pose(Pose([-0.6, -0.188, 0]))
+    stool = Object("stool", ObjectType.ENVIRONMENT, scene.milk.description_text, Pose([0.05, 0, 0.8]))
+    before = scene.world.save_state()
+    for thing in (stool, scene.robot):
+        for action in (
+            PickUpActionPerformable(thing, Arms.LEFT, Grasp.FRONT),
+            TransportActionPerformable(thing, Arms.LEFT, Pose([-1.3, 1, 0.95])),
+        ):
+            with pytest.raises(IllPosedGoalFailure, match=f"{thing.name} is nothing that a gripper can hold") as caught:
+                await action.perform()
+            assert (caught.value.data, scene.world.save_state()) == ((thing.name,), before)
 
 
 async def test_an_object_is_taken_over_from_what_it_hung_on(scene: Scene) -> None:
