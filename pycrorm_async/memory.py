@@ -322,13 +322,16 @@ class Memory:
         """The asking side on its own: named questions, sessions, frames."""
         return self._now.reading
 
-    def session(self) -> AbstractAsyncContextManager[AsyncSession]:
-        """An ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager."""
-        return self._now.reading.session()
+    def session(self, *, simulated: bool = False) -> AbstractAsyncContextManager[AsyncSession]:
+        """An ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager.
 
-    async def dataframe(self, statement: Select[Any]) -> DataFrame:
-        """The answer as a pandas DataFrame (extra `learning`)."""
-        return await self._now.reading.dataframe(statement)
+        With `simulated` it also sees what was only thought through (`SimulatedTaskTree`).
+        """
+        return self._now.reading.session(simulated=simulated)
+
+    async def dataframe(self, statement: Select[Any], *, simulated: bool = False) -> DataFrame:
+        """The answer as a pandas DataFrame (extra `learning`); with `simulated`, thoughts too."""
+        return await self._now.reading.dataframe(statement, simulated=simulated)
 
     def mapped(self, designator: str | type) -> Any:
         """The mapped class of a designator type, by its dtype or its class, once one of it was flushed."""

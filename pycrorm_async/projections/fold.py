@@ -77,6 +77,8 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
         started.thought_by.episode if started.thought_by else None,
         started.thought_by.node if started.thought_by else None,
     ]
+    if started.simulated:
+        rows.inserts["simulated_episode"].append((event.number,))
 
 
 def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Designators, rows: Rows) -> None:

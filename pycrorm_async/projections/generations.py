@@ -31,7 +31,7 @@ from pycrorm_async.store.dialects import dialect_of
 __all__ = ["Generation", "PROJECTION", "PROJECTION_VERSION", "current_generation", "make_generation", "grow"]
 
 PROJECTION = "tables"
-PROJECTION_VERSION = 2
+PROJECTION_VERSION = 3
 """Counts what the fold means: tables of an older version must be rebuilt."""
 
 _NOTES = "pycrorm_generation"

@@ -48,6 +48,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "thought_by": "text",
         "thought_by_node": "integer",
     },
+    "simulated_episode": {"id": "key"},
     "task_tree_node": {
         "id": "key",
         "process_metadata_id": "row",
@@ -172,7 +173,11 @@ CORE: dict[str, dict[str, Storage]] = {
         "ns": "integer",
     },
 }
-"""Table by table, column by column, in the order a fold gives the values."""
+"""Table by table, column by column, in the order a fold gives the values.
+
+`simulated_episode` has no view. It repeats which episodes were only thought through, so that the others' rows are told
+from theirs by a look into a table that is small and nothing but a key.
+"""
 
 COLUMNS = {table: tuple(columns) for table, columns in CORE.items()}
 

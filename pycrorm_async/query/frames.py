@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sqlalchemy import BigInteger, Boolean, Float, Integer, Select, String, inspect, type_coerce
-from sqlalchemy.ext.asyncio import AsyncEngine
+from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.orm.types import Moment, Named
@@ -33,10 +33,10 @@ class _Asked(NamedTuple):
     dtype: str
 
 
-async def dataframe(engine: AsyncEngine, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
+async def dataframe(connection: AsyncConnection, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
     """The rows of a select over columns, mapped classes, views, or a mix.
 
-    >>> frame = await dataframe(engine, select(PickUpWithContextView))
+    >>> frame = await dataframe(connection, select(PickUpWithContextView))
 
     Raises `MissingExtra` where pandas is not installed.
     """
@@ -47,8 +47,7 @@ async def dataframe(engine: AsyncEngine, statement: Select[*tuple[Any, ...]]) ->
 
     asked = list(_distinct(_asked(statement)))
     plain = statement.with_only_columns(*(each.expression for each in asked))
-    async with engine.connect() as connection:
-        rows = (await connection.execute(plain)).all()
+    rows = (await connection.execute(plain)).all()
     by_column: Sequence[Sequence[Any]] = list(zip(*rows, strict=True)) or [()] * len(asked)
     return pd.DataFrame(
         {

@@ -7,15 +7,32 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import func, select
-from sqlalchemy.ext.asyncio import AsyncEngine
+from sqlalchemy import Select, func, select
+from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.orm import Designator, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
 
-__all__ = ["EpisodeSummary", "NodeSummary", "episodes", "episode_named", "task_tree"]
+__all__ = ["EpisodeSummary", "NodeSummary", "Thinker", "episodes", "episode_named", "task_tree"]
+
+
+@dataclass(frozen=True)
+class Thinker:
+    """The node in which a plan was thought through.
+
+    Attributes:
+        id: the UUID of its episode.
+        episode, node: the number of that episode and the id of the node; None where this database does not have it.
+        dtype: what was performed; None also at the root.
+    """
+
+    id: str
+    episode: int | None
+    node: int | None
+    dtype: str | None
 
 
 @dataclass(frozen=True)
@@ -26,6 +43,8 @@ class EpisodeSummary:
         number, id: its number in this database, its UUID.
         duration_ns: from its first to its last event; None while it runs.
         nodes: of its task tree, the root included; `failed` of them ended otherwise than well.
+        simulated: it was thought through in a copy of the world, and nothing of it happened.
+        thought_by: who thought it, as far as that is known.
     """
 
     number: int
@@ -38,6 +57,8 @@ class EpisodeSummary:
     created_by: str
     nodes: int
     failed: int
+    simulated: bool = False
+    thought_by: Thinker | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +71,7 @@ class NodeSummary:
         duration_ns: None while it runs, and if it was LOST.
         parameters: as they were recorded, empty at the root; a reference to an object of the world has its name too.
         reason, failure_message: the class and the text of the failure it ended with.
+        thoughts: numbers of the episodes that were thought through in it.
     """
 
     id: int
@@ -64,70 +86,81 @@ class NodeSummary:
     reason: str | None
     failure_message: str | None
     simulated: bool
+    thoughts: tuple[int, ...] = ()
 
 
-async def episodes(engine: AsyncEngine) -> list[EpisodeSummary]:
-    """Every episode, the oldest first."""
-    node = TaskTreeNode
+async def episodes(connection: AsyncConnection, number: int | None = None) -> list[EpisodeSummary]:
+    """Every episode that the connection sees, the oldest first; or only the one of that number."""
+    question = _overview()
+    if number is not None:
+        question = question.where(ProcessMetaData.id == number)
+    return [
+        EpisodeSummary(
+            number=row.id,
+            id=row.uuid,
+            started_at=row.created_at,
+            ended_at=row.ended_at,
+            duration_ns=_nanoseconds(row.created_at, row.ended_at),
+            status=row.status,
+            description=row.description,
+            created_by=row.created_by,
+            nodes=row.nodes,
+            failed=row.failed,
+            simulated=row.simulated,
+            thought_by=Thinker(row.thought_by, row.thinker_number, row.thinker_id, row.thinker_dtype)
+            if row.thought_by is not None
+            else None,
+        )
+        for row in await connection.execute(question)
+    ]
+
+
+def _overview() -> Select[*tuple[Any, ...]]:
+    node, episode = TaskTreeNode, ProcessMetaData
+    thinker, thinking = aliased(ProcessMetaData), aliased(TaskTreeNode)
     ended_well = node.status.in_([TaskStatus.SUCCEEDED, TaskStatus.RUNNING])
-    counted = (
+    of_it = node.process_metadata_id == episode.id
+    nodes = select(func.count()).where(of_it).scalar_subquery()
+    failed = select(func.count()).where(of_it, ~ended_well).scalar_subquery()
+    thinking_id = thinker.id * row_id(1, 0, SLOT_NODE) + episode.thought_by_node * row_id(0, 1, SLOT_NODE)
+    return (
         select(
-            node.process_metadata_id.label("number"),
-            func.count().label("nodes"),
-            func.count().filter(~ended_well).label("failed"),
+            episode.__table__,
+            nodes.label("nodes"),
+            failed.label("failed"),
+            thinker.id.label("thinker_number"),
+            thinking.id.label("thinker_id"),
+            thinking.dtype.label("thinker_dtype"),
         )
-        .group_by(node.process_metadata_id)
-        .subquery()
+        .outerjoin(thinker, thinker.uuid == episode.thought_by)
+        .outerjoin(thinking, thinking.id == thinking_id)
+        .order_by(episode.id)
     )
-    question = (
-        select(
-            ProcessMetaData.__table__,
-            func.coalesce(counted.c.nodes, 0).label("nodes"),
-            func.coalesce(counted.c.failed, 0).label("failed"),
-        )
-        .outerjoin(counted, counted.c.number == ProcessMetaData.id)
-        .order_by(ProcessMetaData.id)
-    )
-    async with engine.connect() as connection:
-        return [
-            EpisodeSummary(
-                number=row.id,
-                id=row.uuid,
-                started_at=row.created_at,
-                ended_at=row.ended_at,
-                duration_ns=_nanoseconds(row.created_at, row.ended_at),
-                status=row.status,
-                description=row.description,
-                created_by=row.created_by,
-                nodes=row.nodes,
-                failed=row.failed,
-            )
-            for row in await connection.execute(question)
-        ]
 
 
-async def episode_named(engine: AsyncEngine, name: str) -> EpisodeSummary:
-    """The episode of that number, or id, or first digits of its id; `last` is the newest one.
+async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummary:
+    """The episode of that number, or id, or first digits of its id; `last` is the newest that really happened.
 
     Raises `UnknownEpisode`, also when several ids begin like that.
     """
-    known = await episodes(engine)
-    if name == "last" and known:
-        return known[-1]
-    if name.isdecimal():
-        # A short one is a number; a long one may be the beginning of an id that happens to have no letter.
-        by_number = [each for each in known if each.number == int(name)]
-        if by_number:
-            return by_number[0]
-    found = [each for each in known if len(name) >= 4 and each.id.startswith(name.lower())]
-    if len(found) == 1:
-        return found[0]
-    if found:
+    question = select(ProcessMetaData.id, ProcessMetaData.uuid, ProcessMetaData.simulated).order_by(ProcessMetaData.id)
+    known = (await connection.execute(question)).all()
+    real = [each.id for each in known if not each.simulated]
+    # A short one is a number; a long one may be the beginning of an id that happens to have no letter.
+    if name == "last" and real:
+        found = real[-1:]
+    elif name.isdecimal() and any(each.id == int(name) for each in known):
+        found = [int(name)]
+    else:
+        found = [each.id for each in known if len(name) >= 4 and each.uuid.startswith(name.lower())]
+    if len(found) > 1:
         raise UnknownEpisode(f"{len(found)} episodes have an id that begins with {name!r}: give more of it")
-    raise UnknownEpisode(f"there is no episode {name!r} (`pycrorm episodes` lists the {len(known)} there are)")
+    if not found:
+        raise UnknownEpisode(f"there is no episode {name!r} (`pycrorm episodes` lists the {len(real)} there are)")
+    return (await episodes(connection, found[0]))[0]
 
 
-async def task_tree(engine: AsyncEngine, number: int) -> list[NodeSummary]:
+async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummary]:
     """The nodes of an episode, each before its children, children in the order they started; empty without any."""
     table, designator, thing = TaskTreeNode.__table__, Designator.__table__, Object.__table__
     question = (
@@ -137,29 +170,43 @@ async def task_tree(engine: AsyncEngine, number: int) -> list[NodeSummary]:
         .order_by(table.c.id)
     )
     named = select(thing.c.id, thing.c.name).where(thing.c.process_metadata_id == number)
+    names = {row.id: row.name for row in await connection.execute(named)}
+    thoughts = await _thoughts_by_node(connection, number)
     children: dict[int | None, list[NodeSummary]] = {}
-    async with engine.connect() as connection:
-        names = {row.id: row.name for row in await connection.execute(named)}
-        for row in await connection.execute(question):
-            children.setdefault(row.parent_id, []).append(
-                NodeSummary(
-                    id=row.id,
-                    parent_id=row.parent_id,
-                    depth=0,
-                    dtype=row.dtype,
-                    kind=row.kind,
-                    parameters={
-                        name: _with_name(value, number, names) for name, value in (row.parameters or {}).items()
-                    },
-                    status=row.status.name if isinstance(row.status, TaskStatus) else row.status,
-                    started_at=row.start_time,
-                    duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
-                    reason=row.reason,
-                    failure_message=row.failure_message,
-                    simulated=row.simulated,
-                )
+    for row in await connection.execute(question):
+        children.setdefault(row.parent_id, []).append(
+            NodeSummary(
+                id=row.id,
+                parent_id=row.parent_id,
+                depth=0,
+                dtype=row.dtype,
+                kind=row.kind,
+                parameters={name: _with_name(value, number, names) for name, value in (row.parameters or {}).items()},
+                status=row.status.name if isinstance(row.status, TaskStatus) else row.status,
+                started_at=row.start_time,
+                duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
+                reason=row.reason,
+                failure_message=row.failure_message,
+                simulated=row.simulated,
+                thoughts=tuple(thoughts.get(row.id, ())),
             )
+        )
     return list(_depth_first(children))
+
+
+async def _thoughts_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
+    """By the id of the node of this episode that thought them, the numbers of what was thought through."""
+    thinker, thought = aliased(ProcessMetaData), ProcessMetaData
+    question = (
+        select(thought.id, thought.thought_by_node)
+        .join(thinker, thinker.uuid == thought.thought_by)
+        .where(thinker.id == number, thought.thought_by_node.is_not(None))
+        .order_by(thought.id)
+    )
+    found: dict[int, list[int]] = {}
+    for row in await connection.execute(question):
+        found.setdefault(row_id(number, row.thought_by_node, SLOT_NODE), []).append(row.id)
+    return found
 
 
 def _depth_first(children: dict[int | None, list[NodeSummary]]) -> Iterator[NodeSummary]:

@@ -13,7 +13,7 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Self
 
 from sqlalchemy import Select
-from sqlalchemy.ext.asyncio import AsyncSession, async_sessionmaker
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession, async_sessionmaker
 
 from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id
@@ -24,6 +24,7 @@ from pycrorm_async.projections.union import unite
 from pycrorm_async.query import questions
 from pycrorm_async.query.frames import dataframe
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
+from pycrorm_async.query.thoughts import all_views, with_thoughts
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -34,12 +35,18 @@ __all__ = ["Reading"]
 
 
 class Reading:
-    """The asking side of one memory. Belongs to the loop it was opened in."""
+    """The asking side of one memory. Belongs to the loop it was opened in.
+
+    What was only thought through (`plan.SimulatedTaskTree`) is left out of every answer. With `simulated=True` the same
+    questions see it too; `TaskTreeNode.simulated` and `ProcessMetaData.simulated` tell it from what happened. Such a
+    session or frame costs some ms more.
+    """
 
     def __init__(self, log: EventLog) -> None:
         self._log = log
         self._classes = DynamicClasses()
         self._declarations: list[bytes] = []
+        self._all_views: tuple[int, dict[str, str]] = (-1, {})
         self._classes.use_in(log.engine)
         self._sessions = async_sessionmaker(log.engine, expire_on_commit=False)
 
@@ -80,16 +87,24 @@ class Reading:
             self._declarations = declarations
 
     @asynccontextmanager
-    async def session(self) -> AsyncIterator[AsyncSession]:
+    async def session(self, *, simulated: bool = False) -> AsyncIterator[AsyncSession]:
         """An ordinary session. Its objects stay readable when it is over."""
         await self.refresh()
-        async with self._sessions() as session:
+        if not simulated:
+            async with self._sessions() as session:
+                yield session
+            return
+        async with (
+            self._connection(simulated=True) as connection,
+            AsyncSession(connection, expire_on_commit=False) as session,
+        ):
             yield session
 
-    async def dataframe(self, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
+    async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> pd.DataFrame:
         """The answer as a pandas DataFrame, see `pycrorm_async.query.frames`. Raises `MissingExtra`."""
         with self._log.translated():
-            return await dataframe(self._log.engine, statement)
+            async with self._connection(simulated=simulated) as connection:
+                return await dataframe(connection, statement)
 
     def mapped(self, designator: str | type) -> type[Designator]:
         """The mapped class of a dtype, a table or a designator class, as of the last `refresh`.
@@ -100,20 +115,26 @@ class Reading:
 
     # --- named questions --------------------------------------------------------------------------------------
 
-    async def episodes(self) -> list[EpisodeSummary]:
+    async def episodes(self, *, simulated: bool = False) -> list[EpisodeSummary]:
         """Every episode, the oldest first."""
         with self._log.translated():
-            return await questions.episodes(self._log.engine)
+            async with self._connection(simulated=simulated) as connection:
+                return await questions.episodes(connection)
 
     async def episode(self, name: str) -> EpisodeSummary:
-        """The episode of that number, or id, or first digits of its id, or `last`. Raises `UnknownEpisode`."""
+        """The episode of that number, or id, or first digits of its id, also one that was only thought through.
+
+        `last` is the newest that really happened. Raises `UnknownEpisode`.
+        """
         with self._log.translated():
-            return await questions.episode_named(self._log.engine, name)
+            async with self._connection(simulated=True) as connection:
+                return await questions.episode_named(connection, name)
 
     async def tree(self, number: int) -> list[NodeSummary]:
-        """The task tree of an episode, each node before its children."""
+        """The task tree of an episode, also of one that was only thought through; each node before its children."""
         with self._log.translated():
-            return await questions.task_tree(self._log.engine, number)
+            async with self._connection(simulated=True) as connection:
+                return await questions.task_tree(connection, number)
 
     async def number_of(self, episode: str) -> int:
         """The number this database gave to the episode of that UUID. Raises `UnknownEpisode`."""
@@ -123,6 +144,18 @@ class Reading:
         return number
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    @asynccontextmanager
+    async def _connection(self, *, simulated: bool) -> AsyncIterator[AsyncConnection]:
+        if not simulated:
+            async with self._log.engine.connect() as connection:
+                yield connection
+            return
+        generation = await self._generation()
+        if generation.revision != self._all_views[0]:
+            self._all_views = generation.revision, all_views(generation, self._log.engine.dialect)
+        async with with_thoughts(self._log.engine, self._all_views[1]) as connection:
+            yield connection
 
     async def _generation(self) -> Generation:
         with self._log.translated():

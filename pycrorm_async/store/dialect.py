@@ -126,6 +126,13 @@ class Dialect(Protocol):
         """Name and SQL of each. A view may stand on those before it in `after`."""
         ...
 
+    async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
+        """For this connection alone, until it is closed, these views stand before those of the same names.
+
+        Nothing may have happened in the transaction before. A view may stand on those before it.
+        """
+        ...
+
     async def insert_rows(
         self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
     ) -> None:

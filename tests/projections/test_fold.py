@@ -96,7 +96,8 @@ def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:
                 7, time_us(1), "me", "why", "1.2", "host", "3.11.7", "breakfast", "a kitchen", 42,
                 "FAILED", time_us(2), "plans.IKError", "too far", True, "018bcfe5-6800-7000-8000-000000000001", 12,
             )
-        ]
+        ],
+        "simulated_episode": [(7,)],
     }  # fmt: skip
 
 

@@ -306,6 +306,6 @@ async def test_opening_again_changes_nothing(log: EventLog) -> None:
 async def test_tables_of_another_version_are_refused(log: EventLog) -> None:
     await Projector(log).open()
     async with log.engine.begin() as connection:
-        await connection.exec_driver_sql("UPDATE pycrorm_generation SET version = 3")
-    with pytest.raises(DatabaseForeign, match=r"made by version 3 of the fold, this is version 2: use a newer pycrorm"):
+        await connection.exec_driver_sql("UPDATE pycrorm_generation SET version = 4")
+    with pytest.raises(DatabaseForeign, match=r"made by version 4 of the fold, this is version 3: use a newer pycrorm"):
         await Projector(log).open()

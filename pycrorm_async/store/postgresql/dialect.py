@@ -128,6 +128,15 @@ class PostgreSQL:
         for name, text in after.items():
             await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
 
+    async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        # Also where a connection may only read: a temporary view is nobody else's.
+        await connection.exec_driver_sql("SET TRANSACTION READ WRITE")
+        driver = (await connection.get_raw_connection()).driver_connection
+        assert driver is not None
+        # One message for all of them, instead of one each.
+        await driver.execute("; ".join(f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()))
+
     async def insert_rows(
         self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
     ) -> None:

@@ -130,6 +130,11 @@ class SQLite:
             if before.get(name) != text:
                 await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
 
+    async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        for name, text in views.items():
+            await connection.exec_driver_sql(f"CREATE TEMP VIEW {quote(name)} AS {text}")
+
     async def insert_rows(
         self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
     ) -> None:
