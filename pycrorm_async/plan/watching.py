@@ -60,7 +60,7 @@ class Watch:
             if isinstance(self._condition, asyncio.Event):
                 await self._condition.wait()
             else:
-                while not await self._holds():  # noqa: ASYNC110  nobody tells when a callable's answer changes
+                while not (self.fired or await self._holds()):  # noqa: ASYNC110  a callable tells nobody
                     await asyncio.sleep(interval_s)
         except Exception as error:  # noqa: BLE001  the monitor raises it
             self._fire(error)

@@ -1,0 +1,363 @@
+"""Monitors: when they interrupt, what is interrupted, and what goes on."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from pycrorm_async.plan import (
+    ActionAbstract,
+    ChosenRobot,
+    Monitor,
+    MoveGripperMotion,
+    MoveMotion,
+    MoveTorsoAction,
+    NavigateActionPerformable,
+    Outcome,
+    PlanFailure,
+    TaskStatus,
+    collected_tree,
+)
+from pycrorm_async.plan.failures import NotALanguageExpression
+from pycrorm_async.world import Arms, GripperState, Pose
+from tests.plan.conftest import Scene
+from tests.plan.recording import Recording
+from tests.plan.told import Around, Step, drawn, failing
+
+INTERRUPTED = Outcome(results=(None,), interrupted=True)
+
+
+class Waiting(ActionAbstract):
+    """Waits for ever; says whether it was cancelled."""
+
+    def __init__(self) -> None:
+        self.begun = asyncio.Event()
+        self.cancelled = False
+
+    async def perform(self) -> None:
+        self.begun.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            self.cancelled = True
+            raise
+
+
+def after(count: int) -> Callable[[], bool]:
+    """A condition that holds from the asking after so many."""
+    asked = 0
+
+    def holds() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > count
+
+    return holds
+
+
+async def test_a_plan_whose_monitor_never_holds_is_performed_to_its_end() -> None:
+    with collected_tree() as tree:
+        outcome = await (Step("a") + Step("b") >> Monitor(lambda: False)).perform()
+    assert outcome == Outcome((Outcome(("a", "b"), (0, 1)),), (0,), interrupted=False)
+    assert drawn(tree) == [
+        "Monitor SUCCEEDED",
+        "└── Sequential SUCCEEDED",
+        "    ├── Step SUCCEEDED",
+        "    └── Step SUCCEEDED",
+    ]
+
+
+async def test_a_plan_that_never_suspends_is_interrupted_between_its_nodes() -> None:
+    log: list[str] = []
+    with collected_tree() as tree:
+        outcome = await ((Step("a", log) * 1000 >> Monitor(after(3))) + Step("b", log)).perform()
+    # Asked before the Repeat, before the first step, before the second: the fourth time it holds.
+    assert log == ["a", "a.", "a", "a.", "b", "b."]
+    assert outcome.results == (INTERRUPTED, "b")
+    assert drawn(tree) == [
+        "Sequential SUCCEEDED",
+        "├── Monitor INTERRUPTED",
+        "│   └── Repeat INTERRUPTED (CancelledError)",
+        "│       ├── Step SUCCEEDED",
+        "│       └── Step SUCCEEDED",
+        "└── Step SUCCEEDED",
+    ]
+
+
+async def test_the_robot_stays_where_the_interruption_found_it(scene: Scene) -> None:
+    def beyond_one_metre() -> bool:
+        return scene.robot.pose.position.x > 1
+
+    way = [NavigateActionPerformable(Pose([x / 10, 0, 0])) for x in range(1, 40)]
+    plan = way[0] + way[1]
+    for each in way[2:]:
+        plan += each
+    outcome = await (plan >> Monitor(beyond_one_metre)).perform()
+    assert outcome == INTERRUPTED
+    assert scene.robot.pose.position.x == pytest.approx(1.1)
+
+
+@pytest.mark.parametrize("kind", ["sync", "async", "event"])
+async def test_a_plan_is_interrupted_inside_of_an_await(kind: str) -> None:
+    happened = asyncio.Event()
+
+    async def later() -> bool:
+        await asyncio.sleep(0)
+        return happened.is_set()
+
+    conditions: dict[str, Any] = {"sync": happened.is_set, "async": later, "event": happened}
+    waiting = Waiting()
+    with collected_tree() as tree:
+        plan = asyncio.create_task((Around(waiting) >> Monitor(conditions[kind], interval_s=0.001)).perform())
+        await waiting.begun.wait()
+        happened.set()
+        assert await plan == INTERRUPTED
+    assert waiting.cancelled
+    assert drawn(tree) == [
+        "Monitor INTERRUPTED",
+        "└── Around INTERRUPTED (CancelledError)",
+        "    └── Waiting INTERRUPTED (CancelledError)",
+    ]
+
+
+async def test_a_motion_that_awaits_is_interrupted_at_its_await() -> None:
+    driving, reached = asyncio.Event(), []
+
+    class Slow:
+        async def navigate(self, motion: MoveMotion) -> None:
+            driving.set()
+            await asyncio.sleep(60)
+            reached.append(motion)
+
+        async def move_gripper(self, motion: MoveGripperMotion) -> None:
+            raise AssertionError("after the interruption")
+
+    there = MoveMotion(Pose([1, 0, 0])) + MoveGripperMotion(GripperState.OPEN, Arms.LEFT)
+    with ChosenRobot("slow", Slow()), collected_tree() as tree:  # type: ignore[arg-type]  # it has no more
+        assert await (there >> Monitor(driving)).perform() == INTERRUPTED
+    assert reached == []
+    assert [node.status.name for node in tree] == ["INTERRUPTED"] * 3
+
+
+async def test_a_monitor_that_holds_from_the_start_lets_nothing_start() -> None:
+    with collected_tree() as tree:
+        assert await (Step("a") >> Monitor(lambda: True)).perform() == INTERRUPTED
+    assert drawn(tree) == ["Monitor INTERRUPTED"]
+
+
+async def test_all_branches_are_interrupted_whichever_notices_it() -> None:
+    waiting = Waiting()
+    branches = waiting | (Step("a", turns=2) + Step("b")) | Step("c", turns=1000)
+    with collected_tree() as tree:
+        assert await (branches >> Monitor(after(6), interval_s=60)).perform() == INTERRUPTED
+    assert waiting.cancelled
+    # Asked once by the monitor's own task, and before Parallel, Waiting, Sequential, a, c: the seventh time before b.
+    assert drawn(tree) == [
+        "Monitor INTERRUPTED",
+        "└── Parallel INTERRUPTED (CancelledError)",
+        "    ├── Waiting INTERRUPTED (CancelledError)",
+        "    ├── Sequential INTERRUPTED (CancelledError)",
+        "    │   └── Step SUCCEEDED",
+        "    └── Step INTERRUPTED (CancelledError)",
+    ]
+
+
+async def test_of_nested_monitors_each_interrupts_what_is_inside_of_it() -> None:
+    inner, outer, log = asyncio.Event(), asyncio.Event(), list[str]()
+    first, second = Waiting(), Waiting()
+    plan = (first >> Monitor(inner)) + second + Step("never", log) >> Monitor(outer)
+    with collected_tree() as tree:
+        task = asyncio.create_task((plan + Step("after", log)).perform())
+        await first.begun.wait()
+        inner.set()
+        await second.begun.wait()
+        outer.set()
+        assert (await task).results == (INTERRUPTED, "after")
+    assert log == ["after", "after."]
+    assert drawn(tree) == [
+        "Sequential SUCCEEDED",
+        "├── Monitor INTERRUPTED",
+        "│   └── Sequential INTERRUPTED (CancelledError)",
+        "│       ├── Monitor INTERRUPTED",
+        "│       │   └── Waiting INTERRUPTED (CancelledError)",
+        "│       └── Waiting INTERRUPTED (CancelledError)",
+        "└── Step SUCCEEDED",
+    ]
+
+
+async def test_the_outer_of_two_monitors_interrupts_the_inner_one_too() -> None:
+    outer, waiting = asyncio.Event(), Waiting()
+    with collected_tree() as tree:
+        task = asyncio.create_task((waiting >> Monitor(lambda: False) >> Monitor(outer)).perform())
+        await waiting.begun.wait()
+        outer.set()
+        assert await task == INTERRUPTED
+    assert drawn(tree) == [
+        "Monitor INTERRUPTED",
+        "└── Monitor INTERRUPTED (CancelledError)",
+        "    └── Waiting INTERRUPTED (CancelledError)",
+    ]
+
+
+@pytest.mark.parametrize("between_nodes", [True, False])
+@pytest.mark.parametrize("asks_later", [True, False])
+async def test_what_a_condition_raises_interrupts_and_is_raised(between_nodes: bool, asks_later: bool) -> None:
+    bug = ZeroDivisionError("bug")
+    asked = 0
+
+    def holds() -> bool:
+        nonlocal asked
+        asked += 1
+        if asked > 4:
+            raise bug
+        return False
+
+    async def holds_later() -> bool:
+        return holds()
+
+    inside: Any = Step("a") * 1000 if between_nodes else Around(Waiting())
+    monitor = Monitor(holds_later if asks_later else holds, interval_s=0.001)
+    with collected_tree() as tree, pytest.raises(ZeroDivisionError) as caught:
+        await (inside >> monitor).perform()
+    assert caught.value is bug
+    statuses = [node.status for node in tree if node.status is not TaskStatus.SUCCEEDED]
+    assert statuses[0] is TaskStatus.ERROR
+    assert set(statuses[1:]) == {TaskStatus.INTERRUPTED}
+
+
+async def test_a_failure_inside_is_raised_and_nothing_interrupted() -> None:
+    with collected_tree() as tree, pytest.raises(PlanFailure, match="a failed"):
+        await (failing("a") >> Monitor(lambda: False)).perform()
+    assert [node.status.name for node in tree] == ["FAILED", "FAILED"]
+
+
+async def test_a_cancellation_from_outside_is_none_of_the_monitors() -> None:
+    waiting = Waiting()
+    before = asyncio.all_tasks()
+    with collected_tree() as tree:
+        task = asyncio.create_task((waiting >> Monitor(lambda: False, interval_s=0.001)).perform())
+        await waiting.begun.wait()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+    assert [node.status.name for node in tree] == ["CANCELLED", "CANCELLED"]
+    assert asyncio.all_tasks() == before
+
+
+async def test_a_plan_that_cancels_itself_is_not_interrupted() -> None:
+    with collected_tree() as tree, pytest.raises(asyncio.CancelledError):
+        await (Step("a", fails=asyncio.CancelledError()) >> Monitor(lambda: False)).perform()
+    assert [node.status.name for node in tree] == ["CANCELLED", "CANCELLED"]
+
+
+async def test_what_an_interrupted_plan_does_in_finally_is_performed() -> None:
+    log: list[str] = []
+
+    class Careful(ActionAbstract):
+        async def perform(self) -> None:
+            try:
+                await (Step("a", log) * 1000).perform()
+            finally:
+                await (Step("tidy", log, turns=3) | Step("up", log, turns=3)).perform()
+
+    with collected_tree() as tree:
+        assert await (Careful() >> Monitor(after(5))).perform() == INTERRUPTED
+    assert log[-4:] == ["tidy", "up", "tidy.", "up."]
+    careful = tree.children(tree.roots[0])[0]
+    assert [node.status.name for node in tree.children(careful)] == ["INTERRUPTED", "SUCCEEDED"]
+
+
+async def test_a_failing_cleanup_of_an_interrupted_plan_is_raised() -> None:
+    class Careless(ActionAbstract):
+        async def perform(self) -> None:
+            try:
+                await (Step("a") * 1000).perform()
+            finally:
+                await failing("cleanup").perform()
+
+    with pytest.raises(PlanFailure, match="cleanup failed"):
+        await (Careless() >> Monitor(after(5))).perform()
+
+
+async def test_what_a_condition_performs_belongs_to_the_monitor_and_is_not_asked_about() -> None:
+    asked = 0
+
+    async def looks() -> bool:
+        nonlocal asked
+        asked += 1
+        await Around(Step("look")).perform()
+        return asked > 2
+
+    with collected_tree() as tree:
+        assert await (Around(Around(Step("a"))) >> Monitor(looks, interval_s=60)).perform() == INTERRUPTED
+    below = [type(node.designator).__name__ for node in tree.children(tree.roots[0])]
+    assert sorted(below) == ["Around"] * 4
+    assert sum(node.status is TaskStatus.INTERRUPTED for node in tree) == 2 + 1
+
+
+async def test_a_task_that_the_plan_left_behind_is_not_interrupted_later() -> None:
+    left: list[asyncio.Task[Any]] = []
+
+    class Leaving(ActionAbstract):
+        async def perform(self) -> None:
+            left.append(asyncio.create_task(Around(Step("a"), before=20).perform()))
+
+    held = asyncio.Event()
+    outcome = await (Leaving() >> Monitor(held)).perform()
+    assert outcome.interrupted is False
+    held.set()
+    assert await left[0] == "a"
+
+
+async def test_a_node_in_a_task_of_the_plan_interrupts_the_plan() -> None:
+    class AtOnce(ActionAbstract):
+        async def perform(self) -> None:
+            async with asyncio.TaskGroup() as group:
+                for _ in range(3):
+                    group.create_task((Step("a", turns=1) * 100).perform())
+
+    before = asyncio.all_tasks()
+    with collected_tree() as tree:
+        assert await (AtOnce() >> Monitor(after(20), interval_s=60)).perform() == INTERRUPTED
+    assert asyncio.all_tasks() == before
+    assert {node.status.name for node in tree} == {"INTERRUPTED", "SUCCEEDED"}
+
+
+async def test_a_monitor_of_nothing_cannot_be_performed() -> None:
+    with pytest.raises(NotALanguageExpression, match="this Monitor watches nothing: write plan >> Monitor"):
+        await Monitor(lambda: True).perform()
+    with pytest.raises(NotALanguageExpression, match="so Parallel cannot perform it"):
+        Step("a") | Monitor(lambda: True)
+
+
+@pytest.mark.parametrize("interval_s", [0, -1, float("inf"), float("nan"), "1", True, None])
+def test_an_interval_that_is_no_time_is_refused(interval_s: float) -> None:
+    with pytest.raises(NotALanguageExpression, match="Monitor asks every so many seconds, not every"):
+        Monitor(lambda: True, interval_s)
+
+
+async def test_a_class_of_ones_own_stays_that_class() -> None:
+    class Careful(Monitor):
+        async def perform(self) -> Outcome:
+            return await super().perform()
+
+    monitor = Careful(lambda: False, 2)
+    plan = MoveTorsoAction([0.1]) >> monitor
+    assert type(plan) is Careful
+    assert (plan.interval_s, monitor.operands) == (2.0, ())
+
+
+async def test_a_recorder_is_told_of_interruptions_in_legal_order() -> None:
+    with Recording().listening() as recording:
+        await ((Step("a") * 1000 >> Monitor(after(3))) + Step("b")).perform()
+    assert recording.open == []
+    assert recording.told[-5:] == [
+        "end Repeat INTERRUPTED",
+        "end Monitor INTERRUPTED",
+        "start Step",
+        "end Step SUCCEEDED",
+        "end Sequential SUCCEEDED",
+    ]

@@ -1,0 +1,378 @@
+"""Branches take turns where they need the same part of the robot, and never wait for each other for ever."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+from collections.abc import Iterable
+from contextlib import suppress
+
+import pytest
+
+from pycrorm_async.plan import (
+    ActionAbstract,
+    Code,
+    Monitor,
+    NavigateAction,
+    Parallel,
+    PickUpActionPerformable,
+    PlanFailure,
+    Resource,
+    TaskStatus,
+    TryAll,
+    collected_tree,
+)
+from pycrorm_async.plan.failures import ResourceDeadlock
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose, WorldMode
+from pycrorm_async.world.watch import current_world
+from tests.plan.conftest import Scene
+from tests.plan.recording import Recording
+from tests.plan.told import Around, Step, drawn
+
+LEFT, RIGHT, BASE, HEAD = Resource.LEFT_ARM, Resource.RIGHT_ARM, Resource.BASE, Resource.HEAD
+
+
+def step(name: str, log: list[str], *needs: Resource, turns: int = 3) -> Step:
+    return Step(name, log, turns=turns, needs=needs)
+
+
+@pytest.mark.parametrize("kind", [Parallel, TryAll])
+async def test_branches_that_need_the_same_part_take_turns_as_they_came(kind: type[Parallel]) -> None:
+    log: list[str] = []
+    await kind(*(step(name, log, BASE) for name in "abcd")).perform()
+    assert "".join(log) == "aa.bb.cc.dd."
+
+
+async def test_branches_that_need_different_parts_go_at_once() -> None:
+    log: list[str] = []
+    await (step("a", log, LEFT) | step("b", log, RIGHT) | step("c", log) | step("d", log)).perform()
+    assert "".join(log) == "abcda.b.c.d."
+
+
+async def test_a_node_that_waits_has_not_started() -> None:
+    log: list[str] = []
+    with collected_tree() as tree, Recording().listening() as recording:
+        await (step("a", log, BASE) | step("b", log, BASE)).perform()
+    assert recording.told == [
+        "start Parallel",
+        "start Step",
+        "end Step SUCCEEDED",
+        "start Step",
+        "end Step SUCCEEDED",
+        "end Parallel SUCCEEDED",
+    ]
+    one, two = tree.children(tree.roots[0])
+    assert one.ended_ns is not None
+    assert two.started_ns >= one.ended_ns
+
+
+async def test_all_that_is_needed_is_taken_at_once_or_nothing_of_it() -> None:
+    log: list[str] = []
+    # b waits for the base with nothing in its hand, so c has the left arm meanwhile; d came after b and waits for it.
+    await (
+        step("a", log, BASE, turns=5)
+        | step("b", log, BASE, HEAD)
+        | step("c", log, LEFT, turns=1)
+        | step("d", log, HEAD)
+    ).perform()
+    assert "".join(log) == "acc.a.bb.dd."
+
+
+async def test_what_a_node_holds_those_inside_it_may_use_and_others_not_before_its_end() -> None:
+    log: list[str] = []
+    holding = Around(Around(step("a", log, BASE), needs=[BASE]), needs=[BASE, LEFT])
+    await (holding | step("b", log, BASE)).perform()
+    assert "".join(log) == "aa.bb."
+
+
+class Two(ActionAbstract):
+    """Performs two others at once, and holds the base meanwhile."""
+
+    def __init__(self, *parts: ActionAbstract) -> None:
+        self.parts = parts
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({BASE})
+
+    async def perform(self) -> None:
+        await Parallel(*self.parts).perform()
+
+
+class TwoTasks(Two):
+    async def perform(self) -> None:
+        await asyncio.gather(*(part.perform() for part in self.parts))
+
+
+@pytest.mark.parametrize("kind", [Two, TwoTasks])
+async def test_of_two_that_run_at_once_inside_of_a_holder_one_waits_for_the_other(kind: type[Two]) -> None:
+    log: list[str] = []
+    await (kind(step("a", log, BASE), step("b", log, BASE)) | step("c", log, BASE)).perform()
+    assert "".join(log) == "aa.bb.cc."
+    log.clear()
+    await (step("c", log, BASE) | kind(step("a", log, BASE), step("b", log, BASE))).perform()
+    assert "".join(log) == "cc.aa.bb."
+
+
+async def test_branches_of_an_inner_expression_take_turns_with_those_of_the_outer_one() -> None:
+    log: list[str] = []
+    inner = (step("a", log, BASE) | step("b", log, LEFT)) + step("c", log, LEFT)
+    await (inner | step("d", log, BASE) | step("e", log, LEFT)).perform()
+    assert sorted(log) == sorted("a a. b b. c c. d d. e e.".split())
+    assert [each for each in log if each[0] in "ad"] in (["a", "a.", "d", "d."], ["d", "d.", "a", "a."])
+    assert "".join(each for each in log if each[0] in "bce") in ("bb.ee.cc.", "ee.bb.cc.")
+
+
+async def test_outside_of_parallel_branches_nobody_waits() -> None:
+    log: list[str] = []
+    await asyncio.gather(step("a", log, BASE).perform(), step("b", log, BASE).perform())
+    assert "".join(log) == "aba.b."
+
+
+async def test_two_pick_ups_with_different_arms_both_happen_one_after_the_other(scene: Scene) -> None:
+    # The base is needed by both: 60 cm before the counter, between milk and cereal.
+    await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
+    await Code(scene.robot.set_joint_positions, positions={"torso_lift_joint": 0.3}).perform()
+    scene.cereal.set_pose(Pose([1.3, 0.2, 0.95]))
+    milk = PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT)
+    cereal = PickUpActionPerformable(scene.cereal, Arms.RIGHT, Grasp.FRONT)
+    with collected_tree() as tree:
+        await (milk | cereal).perform()
+    assert set(scene.robot.attachments) == {scene.milk, scene.cereal}
+    one, two = tree.children(tree.roots[0])
+    assert one.ended_ns is not None
+    assert (one.designator, two.designator) == (milk, cereal)
+    assert two.started_ns >= one.ended_ns
+
+
+async def test_a_wait_that_would_never_end_is_refused_and_names_the_part(scene: Scene) -> None:
+    log: list[str] = []
+    one = Around(step("a", log, RIGHT), needs=[LEFT], before=2)
+    two = Around(step("b", log, LEFT), needs=[RIGHT], before=4)
+    with collected_tree() as tree:
+        outcome = await (one ^ two).perform()
+    assert outcome.succeeded == (0,)
+    (failure,) = outcome.failures
+    assert isinstance(failure, ResourceDeadlock)
+    assert (failure.resource, failure.held_by, failure.wanted_by, failure.waits_for) == (
+        LEFT,
+        "AroundAction",
+        "StepAction",
+        "AroundAction",
+    )
+    assert str(failure) == (
+        "StepAction would wait for LEFT_ARM for ever: AroundAction holds it and waits, in the end, for AroundAction,"
+        " which StepAction is part of"
+    )
+    assert drawn(tree) == [
+        "TryAll SUCCEEDED",
+        "├── Around SUCCEEDED",
+        "│   └── Step SUCCEEDED",
+        "└── Around FAILED (ResourceDeadlock)",
+    ]
+    assert log == ["a", "a."]
+
+
+async def test_a_ring_of_five_is_broken_once_and_the_others_get_through() -> None:
+    parts = list(Resource)
+    log: list[str] = []
+    ring = [
+        Around(step(f"{number}", log, parts[(number + 1) % 5]), needs=[parts[number]], before=2 + number)
+        for number in range(5)
+    ]
+    with pytest.raises(ResourceDeadlock) as caught:
+        await Parallel(*ring).perform()
+    assert caught.value.resource is parts[0]
+    assert log == ["3", "3.", "2", "2.", "1", "1.", "0", "0."]
+
+
+async def test_a_plan_may_try_again_after_a_refused_wait() -> None:
+    log: list[str] = []
+
+    class Patient(ActionAbstract):
+        async def perform(self) -> None:
+            try:
+                await Around(step("b", log, LEFT), needs=[RIGHT], before=4).perform()
+            except ResourceDeadlock:
+                await step("c", log, LEFT).perform()
+
+    await (Around(step("a", log, RIGHT), needs=[LEFT], before=2) | Patient()).perform()
+    assert "".join(log) == "aa.cc."
+
+
+async def test_nobody_queues_behind_one_who_waits_for_the_end_of_what_he_is_part_of() -> None:
+    log: list[str] = []
+    # b waits for base and head; what is inside of the holder of the base wants the head too, and goes first.
+    holding = Around(step("a", log, HEAD), needs=[BASE], before=4)
+    await (holding | step("b", log, BASE, HEAD)).perform()
+    assert "".join(log) == "aa.bb."
+
+
+async def test_branches_in_different_worlds_are_not_in_each_others_way() -> None:
+    meeting = asyncio.Barrier(3)
+
+    class Meeting(ActionAbstract):
+        def resources(self) -> frozenset[Resource]:
+            return frozenset({BASE})
+
+        async def perform(self) -> None:
+            await meeting.wait()
+
+    class Elsewhere(ActionAbstract):
+        async def perform(self) -> None:
+            with BulletWorld(mode=WorldMode.DIRECT):
+                await Meeting().perform()
+
+    async with asyncio.timeout(60):
+        await (Elsewhere() | Elsewhere() | Meeting()).perform()
+    assert current_world.get() is None
+
+
+async def test_waiting_can_be_cancelled_and_leaves_its_place_to_the_next() -> None:
+    log: list[str] = []
+    waiting: list[asyncio.Task[object]] = []
+
+    class Gone(ActionAbstract):
+        async def perform(self) -> None:
+            task = asyncio.create_task(step("gone", log, BASE).perform())
+            waiting.append(task)
+            for _ in range(2):
+                await asyncio.sleep(0)
+            task.cancel()
+            await asyncio.wait([task])
+
+    await (step("a", log, BASE, turns=6) | Gone() | step("b", log, BASE)).perform()
+    assert waiting[0].cancelled()
+    assert "".join(log) == "aa.bb."
+
+
+async def test_a_wait_that_is_cancelled_just_when_it_ends_takes_nothing() -> None:
+    for turns in range(12):
+        log: list[str] = []
+        plan = step("a", log, BASE, turns=3) | step("b", log, BASE, turns=1)
+        again = asyncio.create_task((plan ^ step("c", log, BASE, turns=0)).perform())
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        again.cancel()
+        await asyncio.wait([again])
+        open_ones = [each for each in log if len(each) == 1 and f"{each}." not in log]
+        assert len(open_ones) <= 1
+
+
+async def test_a_monitor_interrupts_one_who_waits() -> None:
+    held, log = asyncio.Event(), list[str]()
+    long = step("a", log, BASE, turns=20)
+    with collected_tree() as tree:
+        waits = step("b", log, BASE) >> Monitor(held)
+        outcome = await (long | waits + step("c", log) | Code(held.set)).perform()
+    assert outcome.succeeded == (0, 1, 2)
+    assert "".join(log) == "acc.a."
+    assert [node.status.name for node in tree if isinstance(node.designator, Monitor)] == ["INTERRUPTED"]
+
+
+async def test_a_holder_that_fails_or_is_cancelled_leaves_what_it_held() -> None:
+    log: list[str] = []
+    for fails in (PlanFailure("no"), asyncio.CancelledError()):
+        log.clear()
+        first = Step("a", log, turns=1, needs=[BASE], fails=fails)
+
+        class Anyway(ActionAbstract):
+            async def perform(self, first: Step = first) -> None:
+                with suppress(PlanFailure, asyncio.CancelledError):
+                    await first.perform()
+
+        await (Anyway() | step("b", log, BASE)).perform()
+        assert "".join(log) == "abb."
+
+
+async def test_a_recorder_that_refuses_a_node_leaves_what_it_would_have_held() -> None:
+    class Refusing(Recording):
+        def node_started(self, node: object) -> None:
+            if isinstance(getattr(node, "designator", None), Refused):
+                raise PlanFailure("refused")
+            super().node_started(node)  # type: ignore[arg-type]  # it is one
+
+    class Refused(Step):
+        pass
+
+    log: list[str] = []
+    with Refusing().listening(), pytest.raises(PlanFailure, match="refused"):
+        await (Refused("a", log, needs=[BASE]) | step("b", log, BASE)).perform()
+    assert "".join(log) == "bb."
+
+
+async def test_the_loop_of_a_thread_is_not_that_of_the_branches() -> None:
+    log: list[str] = []
+
+    def elsewhere() -> None:
+        asyncio.run(Parallel(step("a", log, BASE), step("b", log, BASE)).perform())
+
+    await (step("c", log, BASE, turns=1) | Code(lambda: asyncio.to_thread(elsewhere))).perform()
+    assert [each for each in log if each[0] in "ab"] == ["a", "a.", "b", "b."]
+
+
+# --- all ways in which some can want some -----------------------------------------------------------------------------
+
+
+class Checked(ActionAbstract):
+    """Holds what it needs, and is witness that nobody else who is not around it does."""
+
+    def __init__(self, needs: Iterable[Resource], held: list[Checked], inner: Checked | None) -> None:
+        self.needs = frozenset(needs)
+        self.held = held
+        self.inner = inner
+
+    def resources(self) -> frozenset[Resource]:
+        return self.needs
+
+    def is_around(self, other: Checked) -> bool:
+        return self.inner is not None and (self.inner is other or self.inner.is_around(other))
+
+    async def perform(self) -> None:
+        assert [each for each in self.held if each.needs & self.needs and not each.is_around(self)] == []
+        self.held.append(self)
+        try:
+            await asyncio.sleep(0)
+            if self.inner is not None:
+                await self.inner.perform()
+            await asyncio.sleep(0)
+        finally:
+            self.held.remove(self)
+
+
+@pytest.mark.parametrize("seed", range(200))
+async def test_whatever_is_wanted_inside_of_what_every_plan_ends(seed: int) -> None:
+    dice = random.Random(seed)
+    held: list[Checked] = []
+
+    def nested(depth: int) -> Checked:
+        needs = dice.sample(list(Resource), dice.randint(0, 3))
+        return Checked(needs, held, nested(depth - 1) if depth else None)
+
+    plan = TryAll(*(nested(dice.randint(0, 3)) for _ in range(dice.randint(2, 6))))
+    with collected_tree() as tree:
+        async with asyncio.timeout(10):
+            try:
+                await plan.perform()
+            except PlanFailure:
+                assert all(node.status is not TaskStatus.RUNNING for node in tree)
+    failures = {type(node.failure).__name__ for node in tree if node.failure is not None}
+    assert failures <= {"ResourceDeadlock", "PlanFailures"}
+    assert held == []
+
+
+@pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
+async def test_first_come_is_first_served_in_every_order(order: tuple[int, ...]) -> None:
+    log: list[str] = []
+
+    class Later(ActionAbstract):
+        def __init__(self, number: int) -> None:
+            self.number = number
+
+        async def perform(self) -> None:
+            for _ in range(order[self.number] + 1):
+                await asyncio.sleep(0)
+            await step(str(self.number), log, BASE).perform()
+
+    await (step("x", log, BASE, turns=9) | Later(0) | Later(1) | Later(2)).perform()
+    assert [each for each in log if each in "012"] == [str(order.index(place)) for place in range(3)]
