@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from typing import Any, NamedTuple
 
 import pybullet
 import pytest
-from sqlalchemy import select
+from sqlalchemy import Select, select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.orm import Attachment, JointChange, ObjectRemoval, TaskTreeNode
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.plan.task_tree import current_node
-from pycrorm_async.world import Object, Pose
+from pycrorm_async.world import BulletWorld, Object, Pose
 from tests.promises.remembering import at, every, turned
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -38,28 +38,54 @@ class Chronicle:
 
     def __init__(self) -> None:
         self.entries: list[Entry] = []
+        self._known: dict[str, tuple[tuple[float, ...], dict[str, float]]] = {}
+        """Pose and joints of every object, as they were told last."""
+
+    def begin_with(self, things: Iterable[Object]) -> None:
+        """These were there before it came."""
+        self._known |= {each.name: (numbers(each.pose), each.joint_positions()) for each in things}
+
+    def known_pose(self, name: str) -> tuple[float, ...]:
+        """Where the object was told to be last."""
+        return self._known[name][0]
 
     def object_added(self, added: Object) -> None:
         assert_bullet_says(added, added.pose)
-        self._note("added", added.name, numbers(added.pose), dict(added.joint_positions()))
+        self._known[added.name] = (numbers(added.pose), added.joint_positions())
+        self._note("added", added.name, numbers(added.pose), added.joint_positions())
 
     def object_removed(self, removed: Object) -> None:
-        self._note("removed", removed.name)
+        self._note("removed", removed.name, self._known.pop(removed.name)[0])
 
     def object_moved(self, moved: Object) -> None:
         assert_bullet_says(moved, moved.pose)
+        self._known[moved.name] = (numbers(moved.pose), self._known[moved.name][1])
         self._note("moved", moved.name, numbers(moved.pose))
 
     def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
         of_bullet = joints_of_bullet(moved)
         assert {joint: of_bullet[joint] for joint in positions} == pytest.approx(dict(positions), abs=1e-9)
-        self._note("joints", moved.name, dict(positions))
+        self._known[moved.name][1].update(positions)
+        self._note("joints", moved.name, dict(positions), self._known[moved.name][0])
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        self._note("attached", parent.name, child.name, link)
+        self._note("attached", parent.name, child.name, link, *self._poses(parent, child))
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        self._note("detached", parent.name, child.name, link)
+        self._note("detached", parent.name, child.name, link, *self._poses(parent, child))
+
+    def _poses(self, *things: Object) -> list[tuple[float, ...]]:
+        """As they were told last."""
+        return [self.known_pose(each.name) for each in things]
+
+    def assert_nothing_untold(self, world: BulletWorld) -> None:
+        """Every object is, in Bullet, where and as it was told last."""
+        assert {each.name for each in world.objects} == self._known.keys()
+        for each in world.objects:
+            pose, joints = self._known[each.name]
+            assert_bullet_says(each, Pose(pose[:3], pose[3:]))
+            of_bullet = joints_of_bullet(each)
+            assert {joint: of_bullet[joint] for joint in joints} == pytest.approx(joints, abs=1e-9)
 
     def _note(self, *what: Any) -> None:
         node = current_node.get()
@@ -72,12 +98,15 @@ class Chronicle:
         return [(*each.what[:2], each.cause) for each in self.entries]
 
 
-async def told_by_memory(memory: Memory | Reading, number: int = 1) -> list[Entry]:
+async def told_by_memory(memory: Memory | Reading, number: int = 1, *, simulated: bool = False) -> list[Entry]:
     """The same of the tables: every change of the episode, in the order of the log."""
     entries: dict[int, Entry] = {}
-    causes = {
-        node.id: node.dtype for node in await every(memory, select(TaskTreeNode).where(TaskTreeNode.dtype.is_not(None)))
-    }
+
+    async def all_of(statement: Select[Any]) -> list[Any]:
+        return await every(memory, statement, simulated=simulated)
+
+    nodes = await all_of(select(TaskTreeNode).where(TaskTreeNode.dtype.is_not(None)))
+    causes = {node.id: node.dtype for node in nodes}
 
     def note(row: Any, *what: Any) -> None:
         assert row.id not in entries
@@ -87,19 +116,19 @@ async def told_by_memory(memory: Memory | Reading, number: int = 1) -> list[Entr
     def of(mapped: Any) -> Any:
         return select(mapped).where(mapped.process_metadata_id == number).order_by(mapped.id)
 
-    for row in await every(memory, of(ObjectRow).where(ObjectRow.identity_id.is_not(None))):
-        pose = (*at(row.pose), *turned(row.pose))
+    for row in await all_of(of(ObjectRow).where(ObjectRow.identity_id.is_not(None))):
         if row.id == row.identity_id:
-            note(row, "added", row.name, pose, row.joints or {})
+            note(row, "added", row.name, pose_of(row), row.joints or {})
         else:
-            note(row, "moved", row.name, pose)
-    for row in await every(memory, of(ObjectRemoval)):
-        note(row, "removed", row.object.name)
-    for row in await every(memory, of(Attachment)):
-        note(row, row.kind, row.parent.name, row.child.name, row.link)
-    for _, rows in groupby(await every(memory, of(JointChange)), key=lambda row: row.id):
+            note(row, "moved", row.name, pose_of(row))
+    for row in await all_of(of(ObjectRemoval)):
+        note(row, "removed", row.object.name, pose_of(row.object))
+    for row in await all_of(of(Attachment)):
+        note(row, row.kind, row.parent.name, row.child.name, row.link, pose_of(row.parent), pose_of(row.child))
+    for _, rows in groupby(await all_of(of(JointChange)), key=lambda row: row.id):
         first, *others = rows
-        note(first, "joints", first.object.name, {row.joint: row.position for row in (first, *others)})
+        positions = {row.joint: row.position for row in (first, *others)}
+        note(first, "joints", first.object.name, positions, pose_of(first.object))
     return [entries[key] for key in sorted(entries)]
 
 
@@ -109,6 +138,12 @@ def assert_same(remembered: list[Entry], observed: list[Entry]) -> None:
     before = [each.moment - timedelta(microseconds=2) for each in observed]
     for earliest, row, note in zip([_EPOCH, *before[:-1]], remembered, observed, strict=True):
         assert earliest <= row.moment <= note.moment, row
+
+
+def pose_of(row: ObjectRow) -> tuple[float, ...]:
+    """Of an object as it was: its position and orientation."""
+    assert row.pose is not None
+    return (*at(row.pose), *turned(row.pose))
 
 
 def numbers(pose: Pose) -> tuple[float, ...]:

@@ -70,9 +70,9 @@ async def remembered(folder: Path) -> AsyncIterator[Memory]:
         assert memory.status.faults.total == 0, memory.status.faults.last
 
 
-async def every(memory: Memory | Reading, statement: Select[Any]) -> list[Any]:
-    """All that the question gives, of one column or class."""
-    async with memory.session() as session:
+async def every(memory: Memory | Reading, statement: Select[Any], *, simulated: bool = False) -> list[Any]:
+    """All that the question gives, of one column or class; of what was only thought through too, if asked for."""
+    async with memory.session(simulated=simulated) as session:
         return list(await session.scalars(statement))
 
 

@@ -12,17 +12,23 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
+from pycrorm_async.orm import JointChange, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm import Object as ObjectRow
-from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import (
     ActionAbstract,
     IKError,
+    MoveTorsoActionPerformable,
     NavigateActionPerformable,
+    ParkArmsAction,
+    PickUpAction,
     PickUpActionPerformable,
     PlaceActionPerformable,
+    SetGripperAction,
+    SimulatedTaskTree,
 )
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.plan.task_tree import TaskStatus
-from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.notes import NoteActionPerformable
 from tests.promises.chronicle import Chronicle, assert_same, told_by_memory
@@ -54,6 +60,7 @@ async def test_every_change_of_a_plan_is_remembered_with_its_cause(tmp_path: Pat
             await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([1.2, 1.0, 0.9])).perform()
             await RearrangingActionPerformable(lambda: scene.milk.set_pose(Pose([3, 3, 0]))).perform()
             await RearrangingActionPerformable(spoon.remove).perform()
+            chronicle.assert_nothing_untold(scene.world)
         await memory.flush()
         assert [each for each in chronicle.short() if each[0] != "added"] == [
             ("moved", "cereal", None),
@@ -85,7 +92,7 @@ async def test_every_change_of_a_plan_is_remembered_with_its_cause(tmp_path: Pat
         assert_same(told[: len(chronicle.entries)], chronicle.entries)
         # The world was left inside the episode: then nothing is in it any more, and no node did that.
         assert [(each.what, each.cause) for each in told[len(chronicle.entries) :]] == [
-            (("removed", name), None) for name in ("pr2", "milk", "cereal")
+            (("removed", name, chronicle.known_pose(name)), None) for name in ("pr2", "milk", "cereal")
         ]
 
 
@@ -157,6 +164,62 @@ async def test_branches_at_the_same_time_each_cause_their_own_changes(tmp_path: 
         assert [(f"moves {row.name}", row.pose.x) for row in rows] == [(step.label, step.step) for step in caused]
 
 
+async def test_an_expression_names_the_branch_that_caused_a_change(tmp_path: Path) -> None:
+    async with remembered(tmp_path) as memory:
+        chronicle = Chronicle()
+        with lab(chronicle) as scene:
+            # The left hand carries the milk while the right one opens, base and torso first: all change the world.
+            await NavigateActionPerformable(WITHIN_REACH).perform()
+            take = PickUpAction(scene.milk, [Arms.LEFT], [Grasp.FRONT])
+            wave = ParkArmsAction([Arms.RIGHT]) + SetGripperAction([Arms.RIGHT], [GripperState.OPEN])
+            push = BranchActionPerformable("moves cereal", scene.cereal)
+            await (take | wave | push).perform()
+        await memory.flush()
+        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        rows = {node.id: node for node in await every(memory, select(TaskTreeNode))}
+
+        def branch(node: TaskTreeNode) -> str | None:
+            """The type of the branch it is in."""
+            while node.parent_id is not None and rows[node.parent_id].dtype != "Parallel":
+                node = rows[node.parent_id]
+            return node.dtype
+
+        causes = {
+            (each.object.name, each.joint[:1], branch(rows[each.node_id]))
+            for each in await every(memory, select(JointChange))
+        }
+        assert causes == {("pr2", "l", "PickUpAction"), ("pr2", "r", "Sequential")}
+        moved = select(ObjectRow).where(ObjectRow.id != ObjectRow.identity_id, ObjectRow.name != "pr2")
+        assert {(each.name, branch(rows[each.node_id])) for each in await every(memory, moved)} == {
+            ("milk", "PickUpAction"),
+            ("cereal", "BranchAction"),
+        }
+
+
+async def test_what_is_only_thought_through_changes_nothing_that_is_remembered_as_real(tmp_path: Path) -> None:
+    async with remembered(tmp_path) as memory:
+        real, imagined = Chronicle(), Chronicle()
+        with lab(real) as scene:
+            await NavigateActionPerformable(WITHIN_REACH).perform()
+            with SimulatedTaskTree():
+                copy = current_world.get()
+                assert copy is not None
+                imagined.begin_with(copy.objects)
+                copy.observe(imagined)
+                await PickUpActionPerformable(designator_of(scene.milk), Arms.LEFT, Grasp.FRONT).perform()
+            await MoveTorsoActionPerformable(0.1).perform()
+        await memory.flush()
+        assert real.short()[3:] == [("moved", "pr2", "MoveMotion"), ("joints", "pr2", "MoveJointsMotion")]
+        assert_same((await told_by_memory(memory))[: len(real.entries)], real.entries)
+        there, _, _, *thought = await told_by_memory(memory, 2, simulated=True)
+        assert (there.what[1], there.what[2][:3]) == ("pr2", (0.6, 0.9, 0))  # it begins with what is there
+        assert_same(thought[: len(imagined.entries)], imagined.entries)
+        assert ("attached", "pr2", "PickUpAction") in imagined.short()
+        assert await told_by_memory(memory, 2) == []
+        episodes = await every(memory, select(ProcessMetaData).order_by(ProcessMetaData.id), simulated=True)
+        assert [(each.simulated, each.status) for each in episodes] == [(False, "RUNNING"), (True, "SUCCEEDED")]
+
+
 async def test_a_reset_between_rollouts_is_remembered_and_no_node_did_it(tmp_path: Path) -> None:
     async with remembered(tmp_path) as memory:
         chronicle = Chronicle()
@@ -196,6 +259,7 @@ async def test_each_episode_in_one_world_begins_with_all_that_is_there(tmp_path:
             scene.cereal.set_pose(Pose([9, 9, 9]))  # while no episode is open
             async with memory.episode(description="second"):
                 scene.world.observe(chronicle := Chronicle())
+                chronicle.begin_with(scene.world.objects)
                 scene.world.reset()
                 scene.world.unobserve(chronicle)
             scene.cereal.set_pose(Pose([8, 8, 8]))
@@ -204,7 +268,7 @@ async def test_each_episode_in_one_world_begins_with_all_that_is_there(tmp_path:
         assert memory.status.faults.total == 0
         told = await told_by_memory(memory, 2)
         # What was attached when the episode began is told after what is there.
-        assert told[3].what == ("attached", "pr2", "milk", ARM)
+        assert told[3].what[:4] == ("attached", "pr2", "milk", ARM)
         assert [each.what[:2] for each in told[:3]] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
         assert (told[0].what[3]["l_gripper_l_finger_joint"], told[2].what[2][:3]) == (0.0, (9, 9, 9))
         assert_same(told[4:], chronicle.entries)
@@ -284,6 +348,7 @@ async def test_whatever_happens_to_a_world_is_remembered(tmp_path: Path, seed: i
                     await RearrangingActionPerformable(meddler.meddle).perform()
                 else:
                     meddler.meddle()
+                chronicle.assert_nothing_untold(scene.world)
     async with Reading.open(url_of(tmp_path)) as reading:
         told = await told_by_memory(reading)
     assert_same(told[: len(chronicle.entries)], chronicle.entries)
