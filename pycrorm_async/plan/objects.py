@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.plan.errors import ResolutionError
@@ -41,7 +41,11 @@ __all__ = [
     "ObjectLike",
     "designator_of",
     "in_world",
+    "place_of",
 ]
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,11 @@ class ObjectDesignator:
     frozen_pose: Pose | None = None
 
     def __post_init__(self) -> None:
+        _check(self, name=str, object_type=ObjectType)
         if self.world_object is None and self.frozen_pose is None:
             raise ResolutionError(type(self).__name__, missing=["world_object or frozen_pose"])
+        if self.frozen_pose is not None:
+            _check(self, frozen_pose=Pose)
 
     @property
     def pose(self) -> Pose:
@@ -109,6 +116,7 @@ class ObjectPart(ObjectDesignator):
         put(self, "world_object", None)
         put(self, "frozen_pose", frozen_pose)
         put(self, "part_of", designator_of(part_of))
+        _check(self, name=str, object_type=ObjectType)
 
     @property
     def pose(self) -> Pose:
@@ -153,8 +161,6 @@ class LocatedObject(ObjectDesignator):
         frozen_pose: Pose | None = None,
     ) -> None:
         told = timestamp if timestamp is not None else _moment(SYSTEM_CLOCK.wall_ns())
-        if told.tzinfo is None:
-            raise ResolutionError(type(self).__name__, wrong=["timestamp: expected a datetime with a time zone"])
         put = object.__setattr__
         put(self, "name", name)
         put(self, "object_type", object_type)
@@ -163,6 +169,9 @@ class LocatedObject(ObjectDesignator):
         put(self, "relative_pose", relative_pose)
         put(self, "reference", designator_of(reference))
         put(self, "timestamp", told)
+        _check(self, name=str, object_type=ObjectType, relative_pose=Pose, timestamp=datetime)
+        if told.tzinfo is None:
+            raise ResolutionError(type(self).__name__, wrong=["timestamp: expected a datetime with a time zone"])
 
     @property
     def pose(self) -> Pose:
@@ -187,15 +196,18 @@ class ObjectDesignatorDescription:
     """Describes objects by name or type; iterating it gives a designator for each that is in the world now.
 
     Args:
-        names: any of these names; the order is one of preference.
-        types: any of these types.
+        names: any of these names, or one; the order is one of preference.
+        types: any of these types, or one.
 
-    With names the order is theirs, without that of the world.
+    With names the order is theirs, without that of the world. Raises `ResolutionError` for names and types that
+    are none.
     """
 
-    def __init__(self, names: Iterable[str] | None = None, types: Iterable[ObjectType] | None = None) -> None:
-        self.names = tuple(names) if names is not None else None
-        self.types = tuple(types) if types is not None else None
+    def __init__(
+        self, names: str | Iterable[str] | None = None, types: ObjectType | Iterable[ObjectType] | None = None
+    ) -> None:
+        self.names = _all_of("names", str, names)
+        self.types = _all_of("types", ObjectType, types)
 
     def __iter__(self) -> Iterator[ObjectDesignator]:
         there = [each for each in world_here().objects if self.types is None or each.object_type in self.types]
@@ -224,12 +236,22 @@ class ObjectDesignatorDescription:
         return tuple(each.name for each in self.types) if self.types is not None else None
 
 
+def _all_of(name: str, kind: type[T], given: T | Iterable[T] | None) -> tuple[T, ...] | None:
+    if given is None:
+        return None
+    every: tuple[Any, ...] = tuple(given) if isinstance(given, Iterable) and not isinstance(given, kind) else (given,)
+    if wrong := [each for each in every if not isinstance(each, kind)]:
+        listed = f"{name}: expected each {kind.__name__}, got {wrong[0]!r}"
+        raise ResolutionError(ObjectDesignatorDescription.__name__, wrong=[listed])
+    return every
+
+
 class LocatedObjectDescription(ObjectDesignatorDescription):
     """Describes objects as an `ObjectDesignatorDescription` does, and tells where each is relative to others.
 
     Args:
         references: alternatives for what the place is told relative to.
-        names, types: any of these.
+        names, types: any of these, or one.
 
     Iterating it gives each object with each reference (never with itself), as they stand at that moment.
     """
@@ -237,8 +259,8 @@ class LocatedObjectDescription(ObjectDesignatorDescription):
     def __init__(
         self,
         references: Iterable[ObjectLike],
-        names: Iterable[str] | None = None,
-        types: Iterable[ObjectType] | None = None,
+        names: str | Iterable[str] | None = None,
+        types: ObjectType | Iterable[ObjectType] | None = None,
     ) -> None:
         super().__init__(names, types)
         self.references = tuple(designator_of(each) for each in references)
@@ -269,10 +291,24 @@ ObjectLike: TypeAlias = Object | ObjectDesignator
 
 
 def designator_of(meant: ObjectLike) -> ObjectDesignator:
-    """The designator of a world object; a designator is its own."""
+    """The designator of a world object; a designator is its own. Raises `ResolutionError` for anything else."""
     if isinstance(meant, ObjectDesignator):
         return meant
+    if not isinstance(meant, Object):
+        raise ResolutionError("ObjectDesignator", wrong=[f"expected an object or its designator, got {meant!r}"])
     return ObjectDesignator(meant.name, meant.object_type, meant)
+
+
+def place_of(meant: ObjectLike) -> Pose:
+    """Where it is, is believed or was told to be.
+
+    Raises:
+        PerceptionObjectNotInWorld: it was in the world and is there no more.
+    """
+    designator = designator_of(meant)
+    if designator.world_object is not None:
+        in_world(designator)
+    return designator.pose
 
 
 def in_world(meant: ObjectLike) -> Object:
@@ -300,6 +336,17 @@ def _world_of(thing: Object) -> BulletWorld:
     if here is None:
         return original(thing.world)
     return here if related(here, thing.world) else thing.world
+
+
+def _check(designator: ObjectDesignator, **expected: type) -> None:
+    """Raise `ResolutionError` naming the fields that are something else."""
+    wrong = [
+        f"{name}: expected {kind.__name__}, got {value!r}"
+        for name, kind in expected.items()
+        if not isinstance(value := getattr(designator, name), kind)
+    ]
+    if wrong:
+        raise ResolutionError(type(designator).__name__, wrong=wrong)
 
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)

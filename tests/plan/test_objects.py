@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta, timezone
+from typing import Any
 
 import pytest
 
@@ -164,3 +167,34 @@ def test_objects_are_located_relative_to_each_of_the_others(scene: Scene) -> Non
     assert (milk.name, milk.reference.name) == ("milk", "cereal")
     with pytest.raises(ObjectNotFound, match="no object is named milk, beside milk; in the world: pr2, kitchen"):
         LocatedObjectDescription([scene.milk], names=["milk"]).resolve()
+
+
+def test_one_name_or_type_needs_no_list_and_a_name_is_not_taken_apart(scene: Scene) -> None:
+    assert names(ObjectDesignatorDescription(names="milk")) == ["milk"]
+    assert names(ObjectDesignatorDescription(types=ObjectType.MILK)) == ["milk"]
+    assert names(LocatedObjectDescription([scene.kitchen], names="milk", types=ObjectType.MILK)) == ["milk"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "said"),
+    [
+        (ObjectDesignatorDescription, lambda _: ([ObjectType.MILK],), "names: expected each str, got <ObjectType.MILK"),
+        (ObjectDesignatorDescription, lambda _: (None, ["milk"]), "types: expected each ObjectType, got 'milk'"),
+        (ObjectDesignatorDescription, lambda _: (None, 3), "types: expected each ObjectType, got 3"),
+        (ObjectPart, lambda _: ("sink_area", "kitchen"), "expected an object or its designator, got 'kitchen'"),
+        (LocatedObject, lambda _: ("milk", ObjectType.MILK, Pose(), None), "its designator, got None"),
+        (ObjectPart, lambda s: (3, s.kitchen), "ObjectPart cannot be built; wrong: name: expected str, got 3"),
+        (BelieveObject, lambda _: ("cup", "CUP", Pose()), "object_type: expected ObjectType, got 'CUP'"),
+        (BelieveObject, lambda _: ("cup", ObjectType.JEROEN_CUP, [1, 0]), "frozen_pose: expected Pose, got [1, 0]"),
+        (
+            LocatedObject,
+            lambda s: ("milk", ObjectType.MILK, [0, 0, 0], s.cereal, "now"),
+            "relative_pose: expected Pose, got [0, 0, 0]; timestamp: expected datetime, got 'now'",
+        ),
+    ],
+)
+def test_what_is_no_object_name_type_or_place_is_refused_by_name(
+    scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], said: str
+) -> None:
+    with pytest.raises(ResolutionError, match=re.escape(said)):
+        kind(*arguments(scene))
