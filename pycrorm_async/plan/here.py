@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.failures import CapabilityAbsenceFailure, IllPosedGoalFailure
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import NoWorld
+from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.robot import ArmDescription, RobotDescription
 from pycrorm_async.world.watch import current_world
 
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["RobotHere", "world_here", "robot_here"]
+__all__ = ["RobotHere", "check_in_map", "world_here", "robot_here"]
 
 
 class RobotHere(NamedTuple):
@@ -64,3 +67,11 @@ def robot_here() -> RobotHere:
     if description is None:
         raise NoRobotHere(f"the robot {body.name!r} is not of a kind that is known here")
     return RobotHere(body, description)
+
+
+def check_in_map(target: Pose) -> None:
+    """Raise `CallerError` if the pose is in another frame than what is in the world, or not finite."""
+    if target.frame != "map":
+        raise CallerError(f"the target is in frame {target.frame!r}, the robot in 'map': transform it first")
+    if not math.isfinite(sum(target.position) + sum(target.orientation)):
+        raise CallerError(f"the target is not finite: {target!r}")

@@ -22,9 +22,10 @@ from pycrorm_async.plan.failures import (
     PlanFailure,
     ReachabilityFailure,
 )
-from pycrorm_async.plan.objects import ObjectLike, ObjectPart, designator_of
+from pycrorm_async.plan.objects import ObjectLike, ObjectPart, place_of
 from pycrorm_async.plan.opening_stands import opening_stands
 from pycrorm_async.plan.ports import Candidate, recorder
+from pycrorm_async.plan.properties import check_properties
 from pycrorm_async.plan.standing import stands
 from pycrorm_async.plan.surfaces import places_on
 from pycrorm_async.plan.task_tree import current_node
@@ -42,7 +43,13 @@ __all__ = [
 
 
 class LocationDesignator(ABC):
-    """What every location designator does. A subclass says which places it looks at."""
+    """What every location designator does. A subclass says which places it looks at.
+
+    Its fields are checked when it is built, as an action's are: `ResolutionError` names what does not fit.
+    """
+
+    def __post_init__(self) -> None:
+        check_properties(self)
 
     @abstractmethod
     def _look(self) -> Iterator[Location | None]:
@@ -119,7 +126,7 @@ class ObjectRelativeLocation(LocationDesignator):
     reference_object: ObjectLike
 
     def _look(self) -> Iterator[Location | None]:
-        yield Location(designator_of(self.reference_object).pose @ self.relative_pose)
+        yield Location(place_of(self.reference_object) @ self.relative_pose)
 
     def _nowhere(self) -> PlanFailure:
         raise AssertionError("beside a thing is somewhere")

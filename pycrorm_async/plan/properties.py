@@ -64,6 +64,8 @@ def _check(hint: Any) -> Check:
     if isinstance(origin, type) and issubclass(origin, Mapping) and arguments:
         key, item = map(_check, arguments)
         return lambda value: isinstance(value, origin) and all(map(key, value)) and all(map(item, value.values()))
+    if getattr(hint, "_is_protocol", False):  # what has its methods fits, and shows it when it is asked
+        return lambda _: True
     if hint is float:
         return lambda value: isinstance(value, numbers.Real) and not isinstance(value, bool)
     kind = origin or hint
@@ -71,6 +73,8 @@ def _check(hint: Any) -> Check:
 
 
 def _in_words(hint: Any) -> str:
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return " | ".join("None" if each is type(None) else _in_words(each) for each in typing.get_args(hint))
     return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
 
 

@@ -18,7 +18,8 @@ from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.grasping import pick_up_poses
 from pycrorm_async.plan.here import RobotHere, world_here
 from pycrorm_async.plan.locations import Location, LocationDesignator
-from pycrorm_async.plan.objects import ObjectDesignator, ObjectLike, designator_of
+from pycrorm_async.plan.objects import ObjectDesignator, ObjectLike, designator_of, place_of
+from pycrorm_async.plan.properties import check_properties
 from pycrorm_async.plan.standing import reaching_arms, robot_meant
 from pycrorm_async.world.costmaps import OccupancyCostmap
 from pycrorm_async.world.enums import Arms
@@ -59,6 +60,7 @@ class DatabaseCostmapLocation:
     def __post_init__(self) -> None:
         if not isinstance(self.target, Object | ObjectDesignator):
             raise CallerError("experience is remembered by the type of an object: give one as target, not a place")
+        check_properties(self)
         if self.reachable_arm is Arms.BOTH:
             raise CallerError("a pick-up is done with one arm: ask for LEFT, for RIGHT, or for None, either of them")
 
@@ -116,7 +118,7 @@ class _Remembered(LocationDesignator):
         return DatabaseCostmapLocation.__name__
 
     def _look(self) -> Iterator[Location | None]:
-        there = designator_of(self.target).pose
+        there = place_of(self.target)
         robot = robot_meant(self.reachable_for) if self.reachable_for is not None else None
         origin = Pose((there.position.x, there.position.y, 0.0))
         ignored = robot.with_load() if robot is not None else None

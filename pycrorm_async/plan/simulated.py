@@ -25,7 +25,7 @@ from pycrorm_async.plan.failures import (
     TorsoGoalUnreachable,
 )
 from pycrorm_async.plan.grasping import HOLD_DISTANCE_M_MAX, between
-from pycrorm_async.plan.here import RobotHere, robot_here
+from pycrorm_async.plan.here import RobotHere, check_in_map, robot_here
 from pycrorm_async.plan.objects import ObjectPart
 from pycrorm_async.plan.perceiving import seen_by_camera, told_by_world
 from pycrorm_async.plan.ports import Seen
@@ -67,6 +67,7 @@ class SimulatedModules:
 
     async def looking(self, motion: LookingMotion) -> None:
         robot = robot_here()
+        check_in_map(motion.target)
         robot.body.set_joint_positions(head_joints(robot, motion.target))
 
     async def move_gripper(self, motion: MoveGripperMotion) -> None:

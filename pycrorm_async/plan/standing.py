@@ -12,8 +12,8 @@ from functools import partial
 
 from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.grasping import pick_up_poses, place_pose, retracted
-from pycrorm_async.plan.here import RobotHere, world_here
-from pycrorm_async.plan.objects import ObjectLike, designator_of, in_world
+from pycrorm_async.plan.here import RobotHere, check_in_map, world_here
+from pycrorm_async.plan.objects import ObjectLike, in_world, place_of
 from pycrorm_async.plan.process_modules import chosen_limits
 from pycrorm_async.world.costmaps import Costmap, GaussianCostmap, OccupancyCostmap, VisibilityCostmap
 from pycrorm_async.world.enums import Arms, Grasp
@@ -36,7 +36,8 @@ def stands(
     """Poses of the base that face the target, best first, each with the arms that reach; None if it will not do."""
     reacher = robot_meant(reachable_for) if reachable_for is not None else None
     seer = robot_meant(visible_for) if visible_for is not None else None
-    goal = target if isinstance(target, Pose) else designator_of(target).pose
+    goal = target if isinstance(target, Pose) else place_of(target)
+    check_in_map(goal)
     costmap = _costmap(target, goal, [each for each in (reacher, seer) if each is not None], seer)
     for cell in costmap.best(CELLS_MAX):
         stand = facing(cell, goal)

@@ -199,7 +199,7 @@ def test_what_has_no_perform_cannot_be_made() -> None:
         ("high", ["la"], None, (), ("tone: expected float, got str 'high'",)),
         (True, ["la"], None, (), ("tone: expected float, got bool True",)),
         (1.0, ["la", 2], None, (), ("words: expected list[str], got list ['la', 2]",)),
-        (1.0, None, [0, 0], ("words",), ("where: expected pycrorm_async.world.pose.Pose | None, got list [0, 0]",)),
+        (1.0, None, [0, 0], ("words",), ("where: expected Pose | None, got list [0, 0]",)),
     ],
 )
 def test_a_motion_says_which_property_is_missing_or_wrong(

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import (
+    AccessingLocation,
     ActionAbstract,
     CostmapLocation,
+    DatabaseCostmapLocation,
     Location,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
@@ -18,6 +24,7 @@ from pycrorm_async.plan import (
     ParkArmsActionPerformable,
     PickUpActionPerformable,
     PlaceActionPerformable,
+    ResolutionError,
     SemanticCostmapLocation,
 )
 from pycrorm_async.plan.failures import (
@@ -142,12 +149,49 @@ def test_no_place_to_see_it_from_is_a_failure_and_is_recorded(scene: Scene) -> N
 
 def test_a_target_that_is_gone_or_no_robot_is_said(scene: Scene) -> None:
     scene.world.remove(scene.milk)
-    with pytest.raises(PerceptionObjectNotInWorld, match="milk"):
-        SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk).resolve()
+    for asked in (
+        SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk),
+        CostmapLocation(scene.milk, reachable_for=scene.robot),
+        CostmapLocation(designator_of(scene.milk), visible_for=scene.robot),
+        ObjectRelativeLocation(Pose([0, 0.5, 0]), scene.milk),
+    ):
+        with pytest.raises(PerceptionObjectNotInWorld, match="milk is not an object of the world"):
+            asked.resolve()
     with pytest.raises(NoRobotHere, match="'cereal' is not a robot"):
         CostmapLocation(scene.kitchen, reachable_for=scene.cereal).resolve()
     with pytest.raises(UnknownLink):
         SemanticCostmapLocation("attic", scene.kitchen).resolve()
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "said"),
+    [
+        (CostmapLocation, lambda _: ("milk",), "target: expected Pose | Object | ObjectDesignator, got str 'milk'"),
+        (CostmapLocation, lambda s: (s.milk, "pr2"), "reachable_for: expected Object | ObjectDesignator | None, got"),
+        (CostmapLocation, lambda s: (s.milk, s.robot, None, [Arms.LEFT]), "reachable_arm: expected Arms | None, got"),
+        (AccessingLocation, lambda s: ("fridge_door_handle", s.robot), "handle: expected ObjectPart, got str"),
+        (AccessingLocation, lambda s: (s.milk, s.robot), "handle: expected ObjectPart, got Object"),
+        (SemanticCostmapLocation, lambda s: (s.kitchen, "sink_area"), "urdf_link_name: expected str, got Object"),
+        (ObjectRelativeLocation, lambda _: (Pose(), "milk"), "reference_object: expected Object | ObjectDesignator"),
+        (Location, lambda _: ([0, 0, 0],), "pose: expected Pose, got list [0, 0, 0]"),
+        (DatabaseCostmapLocation, lambda s: (s.milk, "pr2"), "reachable_for: expected Object | ObjectDesignator"),
+        (DatabaseCostmapLocation, lambda s: (s.milk, None, [Arms.LEFT]), "reachable_arm: expected Arms | None"),
+    ],
+)
+def test_what_no_place_can_be_looked_for_is_refused_by_name(
+    scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], said: str
+) -> None:
+    with pytest.raises(ResolutionError, match=re.escape(said)):
+        kind(*arguments(scene))
+
+
+@pytest.mark.parametrize("role", ["reachable_for", "visible_for"])
+def test_a_place_in_another_frame_or_nowhere_is_refused(scene: Scene, role: str) -> None:
+    robot: Any = {role: scene.robot}
+    with pytest.raises(CallerError, match="the target is in frame 'base_link', the robot in 'map'"):
+        CostmapLocation(Pose([0.7, 0, 0.9], frame="base_link"), **robot).resolve()
+    with pytest.raises(CallerError, match="the target is not finite"):
+        CostmapLocation(Pose([math.nan, 0, 0.9]), **robot).resolve()
 
 
 # --- what a recorder hears -----------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import pytest
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import (
     IKError,
     LookingMotion,
@@ -163,6 +164,18 @@ async def test_the_neck_turns_as_far_as_it_can_to_what_is_behind(scene: Scene, w
     assert scene.robot.joint_position("head_pan_joint") == pan[0]
     assert scene.robot.joint_position("head_tilt_joint") == tilt[0]
     assert watching.seen == ["joints 2"]
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [(Pose([1, 0, 0], frame="base_link"), "in frame 'base_link'"), (Pose([math.nan, 0, 0]), "not finite")],
+)
+async def test_the_head_turns_to_nothing_that_is_not_in_the_map(
+    scene: Scene, watching: Watching, target: Pose, said: str
+) -> None:
+    with pytest.raises(CallerError, match=said):
+        await LookingMotion(target).perform()
+    assert watching.seen == []
 
 
 def test_a_motion_needs_what_it_is_made_of() -> None:
