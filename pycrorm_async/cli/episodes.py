@@ -1,11 +1,15 @@
-"""`pycrorm episodes`: what the memory holds, an episode a line."""
+"""`pycrorm episodes`: what the memory holds, an episode a line; what was only thought through if asked for."""
 
 from __future__ import annotations
 
 import asyncio
+from typing import Annotated
+
+import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_json, print_table
+from pycrorm_async.cli.tree import thought_text
 from pycrorm_async.cli.waiting import note_what_waits
 from pycrorm_async.query.questions import EpisodeSummary
 from pycrorm_async.query.reading import Reading
@@ -13,23 +17,31 @@ from pycrorm_async.query.reading import Reading
 __all__ = ["episodes"]
 
 
-def episodes(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> None:
+def episodes(
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="Also those that were only thought through (SimulatedTaskTree).")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
     """List the remembered episodes."""
 
     async def asked() -> list[EpisodeSummary]:
         async with Reading.open(url) as reading:
-            return await reading.episodes()
+            return await reading.episodes(simulated=simulated)
 
     found = asyncio.run(asked())
     note_what_waits(url, spool)
     if as_json:
         print_json(found)
         return
-    print_table(
-        f"Episodes of {url}",
-        ("episode", "started", "took", "status", "nodes", "failed", "description"),
-        [
-            (e.number, moment(e.started_at), duration(e.duration_ns), e.status, e.nodes, e.failed, e.description)
-            for e in found
-        ],
-    )
+    columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")
+    rows: list[tuple[object, ...]] = [
+        (e.number, moment(e.started_at), duration(e.duration_ns), e.status, e.nodes, e.failed, e.description)
+        for e in found
+    ]
+    if simulated:
+        columns = (*columns, "simulated")
+        rows = [(*row, thought_text(e) if e.simulated else "") for row, e in zip(rows, found, strict=True)]
+    print_table(f"Episodes of {url}", columns, rows)

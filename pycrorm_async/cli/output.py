@@ -54,7 +54,7 @@ def print_facts(title: str, facts: Mapping[str, object]) -> None:
     stdout.print(f"[bold]{escape(title)}[/]")
     for name, value in facts.items():
         if value not in (None, ""):
-            stdout.print(f"  [dim]{name:<8}[/] {_cell(value)}")
+            stdout.print(f"  [dim]{name:<9}[/] {_cell(value)}")
 
 
 def duration(nanoseconds: int | None) -> str:

@@ -10,11 +10,12 @@ from rich.text import Text
 from rich.tree import Tree
 
 from pycrorm_async.cli.output import duration, stdout
-from pycrorm_async.query.questions import NodeSummary
+from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
 
-__all__ = ["print_tree", "parameters_text"]
+__all__ = ["print_tree", "parameters_text", "thought_text"]
 
 _TEXT_MAX = 60
+_THOUGHTS_MAX = 10
 
 _STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED": "yellow", "INTERRUPTED": "yellow"}
 
@@ -43,7 +44,19 @@ def _line(node: NodeSummary) -> Text:
     if node.reason:
         message = " ".join((node.failure_message or "").split())
         line.append(f"  {node.reason}{': ' if message else ''}{message[:100]}", style="red")
+    if node.thoughts:
+        numbers = ", ".join(map(str, node.thoughts[:_THOUGHTS_MAX]))
+        more = f" and {len(node.thoughts) - _THOUGHTS_MAX} more" if len(node.thoughts) > _THOUGHTS_MAX else ""
+        line.append(f"  thought through in episode{'s' * (len(node.thoughts) > 1)} {numbers}{more}", style="magenta")
     return line
+
+
+def thought_text(episode: EpisodeSummary) -> str:
+    """Who thought it through, in a few words."""
+    by = episode.thought_by
+    if by is None:
+        return "thought through"
+    return f"thought through by {by.dtype or 'the plan'} of episode {by.episode if by.episode is not None else by.id}"
 
 
 def parameters_text(parameters: Mapping[str, Any]) -> str:
