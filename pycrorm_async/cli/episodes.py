@@ -9,7 +9,7 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_json, print_table
-from pycrorm_async.cli.tree import thought_text
+from pycrorm_async.cli.tree import thinker_text
 from pycrorm_async.cli.waiting import note_what_waits
 from pycrorm_async.query.questions import EpisodeSummary
 from pycrorm_async.query.reading import Reading
@@ -42,6 +42,6 @@ def episodes(
         for e in found
     ]
     if simulated:
-        columns = (*columns, "simulated")
-        rows = [(*row, thought_text(e) if e.simulated else "") for row, e in zip(rows, found, strict=True)]
+        columns = (*columns, "thought through")
+        rows = [(*row, thinker_text(e) if e.simulated else "") for row, e in zip(rows, found, strict=True)]
     print_table(f"Episodes of {url}", columns, rows)

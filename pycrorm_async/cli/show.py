@@ -9,7 +9,7 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_facts, print_json
-from pycrorm_async.cli.tree import print_tree, thought_text
+from pycrorm_async.cli.tree import print_tree, thinker_text
 from pycrorm_async.cli.waiting import note_what_waits
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
@@ -43,7 +43,7 @@ def show(
             "by": found.created_by,
             "took": duration(found.duration_ns),
             "status": found.status,
-            "simulated": f"nothing of it happened: {thought_text(found)}" if found.simulated else None,
+            "simulated": f"thought through {thinker_text(found)}; nothing of it happened" if found.simulated else None,
         },
     )
     print_tree(tree)

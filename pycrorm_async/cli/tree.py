@@ -12,7 +12,7 @@ from rich.tree import Tree
 from pycrorm_async.cli.output import duration, stdout
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
 
-__all__ = ["print_tree", "parameters_text", "thought_text"]
+__all__ = ["print_tree", "parameters_text", "thinker_text"]
 
 _TEXT_MAX = 60
 _THOUGHTS_MAX = 10
@@ -51,12 +51,12 @@ def _line(node: NodeSummary) -> Text:
     return line
 
 
-def thought_text(episode: EpisodeSummary) -> str:
+def thinker_text(episode: EpisodeSummary) -> str:
     """Who thought it through, in a few words."""
     by = episode.thought_by
     if by is None:
-        return "thought through"
-    return f"thought through by {by.dtype or 'the plan'} of episode {by.episode if by.episode is not None else by.id}"
+        return "outside any episode"
+    return f"by {by.dtype or 'the plan'} of episode {by.episode if by.episode is not None else by.id}"
 
 
 def parameters_text(parameters: Mapping[str, Any]) -> str:

@@ -210,10 +210,10 @@ async def test_the_command_leaves_thoughts_out_and_tells_of_them_when_asked(tmp_
     assert [each["dtype"] for each in thought["tree"]][:3] == [None, "MoveAndPickUpAction", "NavigateAction"]
 
     table = pycrorm("episodes", "--simulated", *url, cwd=tmp_path).stdout
-    assert table.count("thought through by FetchFromAnywhereAction of episode 1") == 2
+    assert table.count("by FetchFromAnywhereAction of episode 1") == 2
     assert "thought" not in pycrorm("episodes", *url, cwd=tmp_path).stdout
     shown = pycrorm("show", "3", *url, cwd=tmp_path).stdout
-    assert "simulated nothing of it happened: thought through by FetchFromAnywhereAction of episode 1" in shown
+    assert "thought through by FetchFromAnywhereAction of episode 1; nothing of it happened" in shown
     real = pycrorm("show", "1", *url, cwd=tmp_path).stdout
     thinker = next(line for line in real.splitlines() if "FetchFromAnywhereAction" in line)
     assert thinker.endswith("thought through in episodes 2, 3")
