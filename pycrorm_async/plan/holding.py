@@ -1,13 +1,13 @@
-"""What a gripper can take, and the taking over of a thing from what it hung on."""
+"""What a hand can act on and what a gripper can take, and the taking over of a thing from what it hung on."""
 
 from __future__ import annotations
 
-from pycrorm_async.plan.failures import EndEffectorFailure, IllPosedGoalFailure
+from pycrorm_async.plan.failures import EndEffectorFailure, IllPosedGoalFailure, PerceptionObjectNotInWorld
 from pycrorm_async.plan.here import RobotHere
 from pycrorm_async.world.enums import Arms, ObjectType
 from pycrorm_async.world.objects import Object
 
-__all__ = ["check_free", "check_takable", "take"]
+__all__ = ["check_beside", "check_free", "check_takable", "take"]
 
 
 def check_takable(robot: RobotHere, arm: Arms, wanted: Object) -> None:
@@ -16,11 +16,19 @@ def check_takable(robot: RobotHere, arm: Arms, wanted: Object) -> None:
     Raises:
         IllPosedGoalFailure: furniture or a robot is to be held, or not one arm is named.
         EndEffectorFailure: the gripper holds something else.
+        PerceptionObjectNotInWorld: it is in another world than the robot.
         CapabilityAbsenceFailure: the robot has no such arm.
     """
+    check_beside(robot, wanted)
     if wanted.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
         raise IllPosedGoalFailure(f"{wanted.name} is nothing that a gripper can hold", wanted.name)
     check_free(robot, arm, wanted)
+
+
+def check_beside(robot: RobotHere, thing: Object) -> None:
+    """Raise `PerceptionObjectNotInWorld` if it is in another world than the robot, which moves nothing there."""
+    if thing.world is not robot.body.world:
+        raise PerceptionObjectNotInWorld(f"{thing.name} is in another world than {robot.body.name}", thing.name)
 
 
 def check_free(robot: RobotHere, arm: Arms, *but: Object) -> None:

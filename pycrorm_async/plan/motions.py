@@ -107,7 +107,10 @@ class MoveGripperMotion(BaseMotion):
 
 @dataclass
 class MoveArmJointsMotion(BaseMotion):
-    """Bring arm joints (by name) to positions in rad, both arms at once. Raises `ConfigurationNotReached`."""
+    """Bring arm joints (by name) to positions in rad, both arms at once.
+
+    Raises `ConfigurationNotReached`, and `UnknownJoint` for one that is not of that arm.
+    """
 
     concept: ClassVar[str | None] = "AssumingArmPose"
 
@@ -129,7 +132,7 @@ class MoveJointsMotion(BaseMotion):
     Raises:
         TorsoGoalUnreachable: the torso alone was to go where it cannot.
         ConfigurationNotReached: a position is outside its joint's limits.
-        ResolutionError: not one position for each name.
+        ResolutionError: not one position for each name, or a name twice.
     """
 
     concept: ClassVar[str | None] = "AssumingPose"
@@ -142,6 +145,8 @@ class MoveJointsMotion(BaseMotion):
         if len(self.names) != len(self.positions):
             counts = f"expected {len(self.names)} values, one for each name, got {len(self.positions)}"
             raise ResolutionError(type(self).__name__, wrong=[f"positions: {counts}"])
+        if twice := {name for name in self.names if self.names.count(name) > 1}:
+            raise ResolutionError(type(self).__name__, wrong=[f"names: {', '.join(sorted(twice))} more than once"])
 
     def resources(self) -> frozenset[Resource]:
         world = current_world.get()

@@ -26,11 +26,12 @@ from pycrorm_async.plan.failures import (
 )
 from pycrorm_async.plan.grasping import HOLD_DISTANCE_M_MAX, between
 from pycrorm_async.plan.here import RobotHere, check_in_map, robot_here
+from pycrorm_async.plan.holding import check_beside
 from pycrorm_async.plan.objects import ObjectPart
 from pycrorm_async.plan.perceiving import seen_by_camera, told_by_world
 from pycrorm_async.plan.ports import Seen
 from pycrorm_async.world.enums import Arms
-from pycrorm_async.world.errors import JointLimitExceeded
+from pycrorm_async.world.errors import JointLimitExceeded, UnknownJoint
 from pycrorm_async.world.kinematics import Limits, Unreachable, solve
 from pycrorm_async.world.pose import Pose
 
@@ -78,7 +79,14 @@ class SimulatedModules:
         robot.body.set_joint_positions(joints)
 
     async def move_arm_joints(self, motion: MoveArmJointsMotion) -> None:
-        _set_joints(robot_here(), (motion.left_arm_poses or {}) | (motion.right_arm_poses or {}))
+        robot = robot_here()
+        wanted: dict[str, float] = {}
+        for arm, positions in ((Arms.LEFT, motion.left_arm_poses), (Arms.RIGHT, motion.right_arm_poses)):
+            for joint in positions or {}:
+                if joint not in (known := robot.one_arm(arm).joints):
+                    raise UnknownJoint(f"{robot.body.name}, {arm.name} arm", joint, known)
+            wanted |= positions or {}
+        _set_joints(robot, wanted)
 
     async def move_joints(self, motion: MoveJointsMotion) -> None:
         _set_joints(robot_here(), dict(zip(motion.names, motion.positions, strict=True)))
@@ -108,6 +116,7 @@ class SimulatedModules:
 
     def _lead(self, robot: RobotHere, arm: Arms, handle: Handle, goal: float) -> None:
         """Bring the handle's joint to `goal` with the hand that is on it; the hand is on it as before then."""
+        check_beside(robot, handle.whole)
         tool_frame = robot.one_arm(arm).tool_frame
         tool = robot.body.link_pose(tool_frame)
         apart = between(tool, handle.whole.bounding_box(handle.link))

@@ -21,6 +21,7 @@ from pycrorm_async.plan import (
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     ObjectPart,
+    OpeningMotion,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
     PlaceActionPerformable,
@@ -39,7 +40,7 @@ from pycrorm_async.plan.failures import (
     PerceptionObjectNotInWorld,
 )
 from pycrorm_async.plan.objects import designator_of
-from pycrorm_async.world import Arms, Grasp, GripperState, Limits, Object, ObjectType, Pose
+from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Limits, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
@@ -299,3 +300,21 @@ async def test_an_effort_below_zero_holds_nothing(scene: Scene) -> None:
         with pytest.raises(IllPosedGoalFailure, match=r"an effort of \S+ N holds nothing"):
             await GripActionPerformable(Arms.LEFT, scene.milk, effort).perform()
     assert scene.robot.attachments == {}
+
+
+async def test_what_is_in_another_world_is_neither_taken_nor_opened(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    before = scene.world.save_state()
+    with BulletWorld():
+        Object("pr2", ObjectType.ROBOT, pose=Pose([0.6, 0.9, 0]))
+        for action in (
+            PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT),
+            GripActionPerformable(Arms.LEFT, scene.milk, 1.0),
+            TransportActionPerformable(scene.milk, Arms.LEFT, Pose([1.3, 0.9, 0.95])),
+        ):
+            with pytest.raises(PerceptionObjectNotInWorld, match="milk is in another world than pr2") as caught:
+                await action.perform()
+            assert caught.value.data == ("milk",)
+        with simulated_robot_within(Limits.HARD), pytest.raises(PerceptionObjectNotInWorld, match="kitchen is in"):
+            await OpeningMotion(handle, Arms.LEFT).perform()
+    assert scene.world.save_state() == before

@@ -20,6 +20,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.failures import ConfigurationNotReached, TorsoGoalUnreachable
 from pycrorm_async.world import Arms, GripperState, Object, Pose
+from pycrorm_async.world.errors import UnknownJoint
 from pycrorm_async.world.pose import rotated, yaw_quaternion
 from tests.plan.conftest import Scene
 
@@ -124,9 +125,21 @@ async def test_joints_beyond_their_limits_are_plan_failures_and_move_nothing(sce
     assert watching.seen == []
 
 
-def test_each_joint_needs_a_position() -> None:
+async def test_an_arm_is_moved_by_its_own_joints(scene: Scene, watching: Watching) -> None:
+    for motion, arm in (
+        (MoveArmJointsMotion(right_arm_poses={"l_elbow_flex_joint": -1.0}), "RIGHT"),
+        (MoveArmJointsMotion({"torso_lift_joint": 0.1}), "LEFT"),
+    ):
+        with pytest.raises(UnknownJoint, match=f"'pr2, {arm} arm' has no movable joint"):
+            await motion.perform()
+    assert watching.seen == []
+
+
+def test_each_joint_needs_one_position() -> None:
     with pytest.raises(ResolutionError, match="expected 2 values, one for each name, got 1"):
         MoveJointsMotion(["a", "b"], [1.0])
+    with pytest.raises(ResolutionError, match="names: b, c more than once"):
+        MoveJointsMotion(["c", "b", "a", "b", "c"], [1.0, 1.0, 1.0, 2.0, 2.0])
 
 
 @pytest.mark.parametrize(
