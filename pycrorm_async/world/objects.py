@@ -18,6 +18,7 @@ from pycrorm_async.world.boxes import BoundingBox
 from pycrorm_async.world.description import urdf_text
 from pycrorm_async.world.enums import JointType, ObjectType
 from pycrorm_async.world.errors import (
+    AttachmentRefused,
     DuplicateName,
     JointLimitExceeded,
     NoWorld,
@@ -240,6 +241,8 @@ class Object:
             UnknownLink, WorldClosed, ObjectNotInWorld.
         """
         self.check_present()
+        if not isinstance(child, Object):
+            raise AttachmentRefused(f"what is attached to {self.name!r} is an Object, not {child!r}")
         child.check_present()
         if link is not None:
             self._check_link(link)
@@ -304,6 +307,8 @@ def _check_identity(name: object, object_type: object) -> None:
 
 def _accepted(name: str, pose: Pose) -> Pose:
     """The same pose, if the thing of that name can be put there."""
+    if not isinstance(pose, Pose):
+        raise PoseRefused(name, pose, "it is no Pose")
     if pose.frame != "map":
         raise PoseRefused(name, pose, f"it is given in {pose.frame!r}: transform it into 'map' first")
     if not all(abs(value) <= COORDINATE_MAX for value in (*pose.position, *pose.orientation)):

@@ -205,6 +205,8 @@ def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(
     assert refused.value.pose is pose
     assert str(refused.value).startswith(f"'crane' cannot be put at {pose!r}: ")
     assert (thing.pose, milk.pose) == (LEANING, Pose())
+    with pytest.raises(PoseRefused, match=r"'crane' cannot be put at \[1, 2, 3\]: it is no Pose"):
+        thing.set_pose([1, 2, 3])  # type: ignore[arg-type]  # the fault this test is about
     with pytest.raises(PoseRefused, match="'cup'"):
         Object("cup", ObjectType.JEROEN_CUP, pose=pose)
     assert [present.name for present in world.objects] == ["crane", "milk"]

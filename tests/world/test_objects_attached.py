@@ -146,6 +146,8 @@ def test_what_is_detached_stays_where_it_is(crane: Object, cup: Object, witness:
 def test_what_cannot_be_attached_or_detached_is_refused(crane: Object, cup: Object, spoon: Object) -> None:
     crane.attach(cup, "hook")
     cup.attach(spoon)
+    with pytest.raises(AttachmentRefused, match="attached to 'crane' is an Object, not 'cup'"):
+        crane.attach("cup")  # type: ignore[arg-type]  # the fault this test is about
     with pytest.raises(AttachmentRefused, match="'cup' is attached to 'crane' already"):
         crane.attach(cup, "hook")
     with pytest.raises(AttachmentRefused, match="'spoon' is attached to 'cup' already"):
