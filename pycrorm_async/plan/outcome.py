@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 from pycrorm_async.plan.failures import PlanFailures, in_words, is_plan_failure
@@ -11,7 +11,7 @@ from pycrorm_async.plan.failures import PlanFailures, in_words, is_plan_failure
 __all__ = ["Attempt", "Outcome", "attempted", "together"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Outcome:
     """How an expression went; a memory keeps `in_brief()` as the result of its node.
 
@@ -29,6 +29,10 @@ class Outcome:
     failures: tuple[Exception, ...] = ()
     rounds: int | None = None
     interrupted: bool | None = None
+
+    def __repr__(self) -> str:
+        told = ((each.name, getattr(self, each.name)) for each in fields(self))
+        return f"Outcome({', '.join(f'{name}={value!r}' for name, value in told if value not in ((), None))})"
 
     def in_brief(self) -> dict[str, Any]:
         """As plain values. What the operands returned is at their own nodes.

@@ -242,6 +242,11 @@ async def test_an_expression_is_written_as_what_it_performs() -> None:
     assert repr(Code(print)) == "Code(print)"
 
 
+async def test_an_outcome_is_written_as_what_there_is_to_say() -> None:
+    assert repr(await (Step("a") - Step("b")).perform()) == "Outcome(results=('a', None), succeeded=(0,))"
+    assert repr(Outcome((None,), interrupted=False)) == "Outcome(results=(None,), interrupted=False)"
+
+
 async def test_code_keeps_names_and_short_texts_of_its_arguments() -> None:
     code = Code(asyncio.sleep, delay=0, result="x" * 200, odd=Odd())
     assert code.function == "asyncio.tasks.sleep"
