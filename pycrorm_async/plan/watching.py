@@ -7,12 +7,13 @@ performed while the interrupted plan cleans up is left alone.
 from __future__ import annotations
 
 import asyncio
+import functools
 import inspect
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator
+from contextvars import Context, copy_context
 from typing import Any, TypeAlias
 
 from pycrorm_async.plan.surroundings import Surroundings, surroundings
-from pycrorm_async.plan.task_tree import current_node
 
 __all__ = ["Condition", "Watch"]
 
@@ -31,8 +32,7 @@ class Watch:
         self.fired = False
         self.error: BaseException | None = None
         self._condition = condition
-        self._outside = surroundings.get()
-        self._node = current_node.get()
+        self._context = copy_context()
         self._task: asyncio.Task[Any] | None = None
 
     def of(self, task: asyncio.Task[Any]) -> None:
@@ -41,43 +41,52 @@ class Watch:
 
     def inside(self) -> Surroundings:
         """The surroundings of what it watches."""
-        outside = self._outside or Surroundings()
+        outside = self._context.get(surroundings) or Surroundings()
         return Surroundings((*outside.watches, self), outside.arbiter, outside.claim)
 
     async def check(self) -> None:
         """Raise `CancelledError` if the condition holds, and interrupt the task that is watched."""
-        error = None
-        try:
-            holds = await self._holds()
-        except Exception as raised:  # noqa: BLE001  the monitor raises it
-            holds, error = True, raised
+        holds, error = await self._asked()
         if holds and self._fire(error):
             raise asyncio.CancelledError("interrupted by a monitor")
 
     async def keep_asking(self, interval_s: float) -> None:
-        """Interrupt the task as soon as the condition holds. Ends then, or when it is cancelled."""
-        try:
-            if isinstance(self._condition, asyncio.Event):
-                await self._condition.wait()
+        """Interrupt the task as soon as the condition holds. Ends then, or when it is cancelled or the task is over."""
+        assert self._task is not None
+        if isinstance(self._condition, asyncio.Event):
+            await self._condition.wait()
+        # A condition may swallow the cancellation with which the monitor ends the asking.
+        while not (self.fired or self._task.done()):
+            holds, error = await self._asked()
+            if holds:
+                self._fire(error)
             else:
-                while not (self.fired or await self._holds()):  # noqa: ASYNC110  a callable tells nobody
-                    await asyncio.sleep(interval_s)
-        except Exception as error:  # noqa: BLE001  the monitor raises it
-            self._fire(error)
-        else:
-            self._fire(None)
+                await asyncio.sleep(interval_s)
+
+    async def _asked(self) -> tuple[bool, BaseException | None]:
+        """Whether to interrupt, and what the condition raised, if that is why: the monitor raises it."""
+        try:
+            return await self._holds(), None
+        except asyncio.CancelledError as raised:
+            asking = asyncio.current_task()
+            if asking is None or asking.cancelling():
+                raise
+            return True, raised
+        except Exception as raised:  # noqa: BLE001  the monitor raises it
+            return True, raised
 
     async def _holds(self) -> bool:
-        """Ask the condition. What it performs belongs to the monitor, and is not watched by it."""
+        """Ask the condition, where the monitor is: what it performs belongs to that, and is not watched by it.
+
+        What is asked while the plan only thinks is asked about what really happens.
+        """
         if isinstance(self._condition, asyncio.Event):
             return self._condition.is_set()
-        around, node = surroundings.set(self._outside), current_node.set(self._node)
-        try:
-            answer = self._condition()
-            return bool(await answer if inspect.isawaitable(answer) else answer)
-        finally:
-            current_node.reset(node)
-            surroundings.reset(around)
+        context = self._context.copy()
+        answer = context.run(self._condition)
+        if not inspect.isawaitable(answer):
+            return bool(answer)
+        return bool(await _Within(context, answer))
 
     def _fire(self, error: BaseException | None) -> bool:
         """Whether it interrupts: only once, and not what is over already."""
@@ -90,3 +99,32 @@ class Watch:
         elif asyncio.current_task() is not task:
             task.cancel()
         return True
+
+
+class _Within:
+    """Awaits in the same task, but in another context."""
+
+    def __init__(self, context: Context, awaitable: Awaitable[Any]) -> None:
+        self._context = context
+        self._awaitable = awaitable
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        steps = self._context.run(self._awaitable.__await__)
+        step: Callable[[], Any] = functools.partial(next, steps)
+        try:
+            while True:
+                wanted = self._context.run(step)
+                try:
+                    yield wanted
+                    step = functools.partial(next, steps)
+                except BaseException as raised:  # noqa: BLE001  a cancellation, say, is for the one that is awaited
+                    step = functools.partial(_thrown, steps, raised)
+        except StopIteration as done:
+            return done.value
+        finally:
+            # The traceback of what was thrown holds this frame: no cycle for the collector.
+            del step
+
+
+def _thrown(steps: Generator[Any, Any, Any], raised: BaseException) -> Any:
+    return steps.throw(raised)
