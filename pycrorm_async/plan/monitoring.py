@@ -56,6 +56,12 @@ class Monitor(Expression):
                 " tells whether to interrupt",
                 repr(given),
             )
+        if isinstance(getattr(given, "__self__", None), asyncio.Event) and name_of(given).endswith("Event.wait"):
+            raise NotALanguageExpression(
+                "Monitor asks its condition before each node, so one that waits keeps the plan from starting: give it"
+                " the Event itself, not its wait",
+                repr(given),
+            )
         if isinstance(interval_s, bool) or not isinstance(interval_s, Real) or not 0 < interval_s < math.inf:
             raise NotALanguageExpression(f"Monitor asks every so many seconds, not every {interval_s!r}", interval_s)
         self.condition = name_of(condition)

@@ -18,6 +18,7 @@ from pycrorm_async.plan import (
     TaskStatus,
     collected_tree,
 )
+from pycrorm_async.plan.failures import NotALanguageExpression
 from pycrorm_async.plan.ports import thinking
 from pycrorm_async.world import Pose, current_world
 from tests.plan.conftest import Scene
@@ -127,3 +128,8 @@ async def test_a_condition_that_is_cancelled_interrupts_as_whatever_it_raises(as
     with pytest.raises(asyncio.CancelledError):
         async with asyncio.timeout(10):
             await plan.perform()
+
+
+def test_the_wait_of_an_event_is_refused_and_the_event_asked_for() -> None:
+    with pytest.raises(NotALanguageExpression, match="give it the Event itself, not its wait"):
+        Monitor(asyncio.Event().wait)
