@@ -6,7 +6,7 @@ import asyncio
 import logging
 
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import EpisodeParked, FlushTimeout
+from pycrorm_async.errors import DatabaseError, EpisodeParked, FlushTimeout
 from pycrorm_async.queue.progress import Drained
 from pycrorm_async.queue.recorder import RecorderQueue
 
@@ -29,13 +29,14 @@ class HandedOver:
     async def flush(self, position: int) -> None:
         """Returns when everything up to this position is stored and shows in the tables.
 
-        Raises `EpisodeParked` for episodes of this queue that stopped, and `FlushTimeout` after `flush_timeout_s`,
-        which says whether anybody drains at all.
+        Raises `EpisodeParked` for episodes of this queue that stopped, `DatabaseError` when whoever drains it had to
+        stop, and `FlushTimeout` after `flush_timeout_s`, which says whether anybody drains at all.
         """
         before = self._said.stored
         try:
             async with asyncio.timeout(self._settings.flush_timeout_s):
-                while not self._is_there(position):
+                while self._said.folded < position:
+                    self._raise_given_up()
                     await asyncio.sleep(_LOOK_S)
         except TimeoutError:
             raise FlushTimeout(
@@ -54,7 +55,7 @@ class HandedOver:
         before, position = self._said.stored, self._queue.written
         loop = asyncio.get_running_loop()
         tended_s = began_s = loop.time()
-        while not self._is_there(position):
+        while self._said.folded < position:
             now_s = loop.time()
             if self._is_tended:
                 tended_s = now_s
@@ -78,12 +79,13 @@ class HandedOver:
     @property
     def _is_tended(self) -> bool:
         note = self._said.note
-        return note.away is None and note.given_up is None and self._queue.is_drained
+        return note.away is None and (note.given_up is None or bool(note.stopped)) and self._queue.is_drained
 
-    def _is_there(self, position: int) -> bool:
-        """Also when an episode was refused: what it left behind keeps the position from ever being reached."""
-        said = self._said
-        return said.folded >= position or (said.note.given_up is not None and bool(said.note.stopped))
+    def _raise_given_up(self) -> None:
+        """A refused episode is no reason to stop: what others said afterwards is stored all the same."""
+        note = self._said.note
+        if note.given_up is not None and not note.stopped:
+            raise DatabaseError(f"{note.given_up}; everything recorded is safe in the spool")
 
     def _hindrance(self, before: int) -> str:
         said = self._said

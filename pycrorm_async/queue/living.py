@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Self
 
 import msgspec
 
@@ -42,7 +43,7 @@ class LiveQueue:
         self._drain = drain
         self._progress = progress
         before = progress.drained()
-        self._said = Drained(before.stored, before.folded)  # what a drainer before said in words is not ours to repeat
+        self._said = before._replace(note=Note())  # what a drainer before said in words is not ours to repeat
         self._reader = Reader(recorder=recorder, start=self._segment_of(before.stored), load=self._load)
         self._skip_to(min(before.stored, progress.recorded().synced))
         self._until: int | None = None
@@ -50,7 +51,7 @@ class LiveQueue:
         progress.tell_drained(self._said)
 
     @classmethod
-    def take(cls, folder: Path) -> LiveQueue | None:
+    def take(cls, folder: Path) -> Self | None:
         """The folder as a source, or None: it is not offered, somebody drains it, it is all drained, or its recorder
         is dead.
 
@@ -61,7 +62,7 @@ class LiveQueue:
             progress = Progress.open(folder, writing=True)
             if progress is None:
                 return None
-            taken: LiveQueue | None = None
+            taken: Self | None = None
             try:
                 taken = cls._take(folder, progress)
             except FileNotFoundError:  # a segment that was stored and deleted while this looked: the next look finds on
@@ -72,7 +73,7 @@ class LiveQueue:
             return taken
 
     @classmethod
-    def _take(cls, folder: Path, progress: Progress) -> LiveQueue | None:
+    def _take(cls, folder: Path, progress: Progress) -> Self | None:
         recorded = progress.recorded()
         if recorded.closed and progress.drained().stored >= recorded.synced:
             return None  # the recorder is about to delete it
@@ -122,15 +123,16 @@ class LiveQueue:
         """Nothing is given any more beyond what is synced now."""
         self._until = self._progress.recorded().synced
 
-    def note_folded(self, position: int) -> None:
-        """Everything up to this position shows in the tables, or never will. Raises `SpoolUnavailable`."""
-        position = min(position, self._said.stored)
-        if position > self._said.folded:
-            self._say(self._said._replace(folded=position))
+    def note_shown(self, position: int, stopped: Mapping[str, str]) -> None:
+        """Everything up to this position shows in the tables, or never will: of the episodes that are `stopped`, by id.
 
-    def note_stopped(self, reasons: Mapping[str, str]) -> None:
-        """These episodes, by id, are refused or parked. Raises `SpoolUnavailable`."""
-        self._say_in_words(stopped=dict(reasons))
+        Raises `SpoolUnavailable`.
+        """
+        assert position <= self.given, "only what was given can be shown"
+        note = msgspec.structs.replace(self._said.note, stopped=dict(stopped))
+        said = self._said._replace(folded=max(position, self._said.folded), note=note)
+        if said != self._said:
+            self._say(said)
 
     def note_away(self, reason: str | None) -> None:
         """Why the database takes nothing now; None when it does again. Raises `SpoolUnavailable`."""
@@ -151,6 +153,11 @@ class LiveQueue:
         """Whether the recorder lives, and does not delete its folder. Raises `SpoolUnavailable`."""
         with available(self.folder):
             return is_locked(self.folder / ALIVE)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the recorder will put nothing more."""
+        return self._progress.recorded().closed
 
     def release(self) -> None:
         """Another may drain it. Twice is once."""
@@ -174,9 +181,9 @@ class LiveQueue:
         return not self.is_alive
 
     def _say_in_words(self, **words: object) -> None:
-        note = msgspec.structs.replace(self._said.note, **words)
-        if note != self._said.note:
-            self._say(self._said._replace(note=note))
+        said = self._said._replace(note=msgspec.structs.replace(self._said.note, **words))
+        if said != self._said:
+            self._say(said)
 
     def _say(self, said: Drained) -> None:
         with available(self.folder):

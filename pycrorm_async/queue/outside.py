@@ -34,8 +34,9 @@ class Outside:
     def believed(self, *, synced: int) -> Drained:
         """What the drainer says. Nothing that is not synced left the folder, so it cannot be stored."""
         said = self._progress.drained()
-        stored = said.stored if said.stored <= synced else 0
-        return said._replace(stored=stored, folded=min(said.folded, stored))
+        if max(said.stored, said.folded) > synced:
+            return Drained()
+        return said
 
     def close(self) -> None:
         """Gives up the file; what was heard last stands."""

@@ -127,6 +127,11 @@ class Drain:
         return self._appended >= position
 
     @property
+    def appended(self) -> int:
+        """Position of the last record the log was given."""
+        return self._appended
+
+    @property
     def state(self) -> DrainState:
         return DrainState(
             source=self._source.name,
