@@ -372,7 +372,12 @@ class Memory:
 
         Where a daemon writes, also once something was asked, for until then there is no connection.
         """
-        return self._now.reading.mapped(designator)
+        reading = self._now.reading
+        if not reading.is_open:
+            raise CallerError(
+                "nothing was asked of this memory yet, and `mapped` knows its types then: open a session first"
+            )
+        return reading.mapped(designator)
 
     async def number_of(self, episode: Episode) -> int:
         """The number this database gave the episode; after `flush`."""

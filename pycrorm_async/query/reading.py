@@ -95,7 +95,7 @@ class Reading:
         await self._ready()
         declarations = await self._log.declarations()
         if declarations != self._declarations:
-            generation = await self._generation()
+            generation = await _generation(self._log)
             self._classes.learn(unite(generation.layout, declarations).accepted.values())
             self._declarations = declarations
 
@@ -170,12 +170,11 @@ class Reading:
                 if self._opened is None:
                     log = await EventLog.open(self._address, create=False)
                     try:
-                        self._use(log)
-                        await self._generation()
+                        await _generation(log)
                     except BaseException:
-                        self._opened = None
                         await log.close()
                         raise
+                    self._use(log)
 
     def _use(self, log: EventLog) -> None:
         self._opened = log
@@ -193,18 +192,17 @@ class Reading:
             async with self._log.engine.connect() as connection:
                 yield connection
             return
-        generation = await self._generation()
+        generation = await _generation(self._log)
         if generation.revision != self._all_views[0]:
             self._all_views = generation.revision, all_views(generation, self._log.engine.dialect)
         async with with_thoughts(self._log.engine, self._all_views[1]) as connection:
             yield connection
 
-    async def _generation(self) -> Generation:
-        with self._log.translated():
-            async with self._log.engine.connect() as connection:
-                generation = await current_generation(connection)
-        if generation is None:
-            raise DatabaseUnavailable(
-                f"{self._log.address} has a log and no tables yet: `pycrorm writer --once` makes them"
-            )
-        return generation
+
+async def _generation(log: EventLog) -> Generation:
+    with log.translated():
+        async with log.engine.connect() as connection:
+            generation = await current_generation(connection)
+    if generation is None:
+        raise DatabaseUnavailable(f"{log.address} has a log and no tables yet: `pycrorm writer --once` makes them")
+    return generation

@@ -15,8 +15,8 @@ __all__ = ["HandedOver"]
 _log = logging.getLogger("pycrorm_async")
 _LOOK_S = 0.01
 _UNTENDED_S = 2.0
-"""How long closing waits while nobody drains, or the database is away: the folder is safe, and found when it is dead.
-Longer than the daemon takes to look round."""
+"""How long nobody drains, or the database is away, before closing does not wait: the folder is safe, and found when it is
+dead. Longer than a daemon takes to look round for a queue that was just made."""
 
 
 class HandedOver:
@@ -25,6 +25,7 @@ class HandedOver:
     def __init__(self, queue: RecorderQueue, settings: Settings) -> None:
         self._queue = queue
         self._settings = settings
+        self._tended_s = asyncio.get_running_loop().time()
 
     async def flush(self, position: int) -> None:
         """Returns when everything up to this position is stored and shows in the tables.
@@ -54,14 +55,14 @@ class HandedOver:
         await self._queue.synced_to()
         before, position = self._said.stored, self._queue.written
         loop = asyncio.get_running_loop()
-        tended_s = began_s = loop.time()
+        began_s = loop.time()
         while self._said.folded < position:
             now_s = loop.time()
             if self._is_tended:
-                tended_s = now_s
-            if now_s - tended_s > _UNTENDED_S or now_s - began_s > self._settings.flush_timeout_s:
+                self._tended_s = now_s
+            if now_s - self._tended_s > _UNTENDED_S or now_s - began_s > self._settings.flush_timeout_s:
                 _log.warning(
-                    "%d events are safe in %s and not in the database yet (%s); `pycrorm writer` brings them in",
+                    "%d events are safe in %s and not in the database yet (%s)",
                     position - self._said.stored,
                     self._queue.folder.parent,
                     self._hindrance(before),
