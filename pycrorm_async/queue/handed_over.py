@@ -15,8 +15,8 @@ __all__ = ["HandedOver"]
 _log = logging.getLogger("pycrorm_async")
 _LOOK_S = 0.01
 _UNTENDED_S = 2.0
-"""How long nobody drains, or the database is away, before closing does not wait: the folder is safe, and found when it is
-dead. Longer than a daemon takes to look round for a queue that was just made."""
+"""How long nobody drains, or the database is away, before closing does not wait: the folder is safe, and found when it
+is dead. Longer than a daemon takes to look round for a queue that was just made."""
 
 
 class HandedOver:
