@@ -288,7 +288,7 @@ class RecorderQueue:
 
     def _exchange(self, outside: Outside) -> bool:
         """Tells whoever drains this queue what is synced, hears what is stored; False if it could not be told."""
-        told = outside.tell(synced=self._synced, closed=self._closed and self._synced == self.written)
+        told = self._tell(outside)
         said = outside.believed(synced=self._synced)
         self._stored = max(self._stored, said.stored)
         if said.note.given_up != self._appender.stuck:
@@ -308,7 +308,12 @@ class RecorderQueue:
         self._appender.end_sync(span)
         self._safe_number = span.segments[-1].number
         self._synced = span.position
+        if self._outside is not None:
+            self._tell(self._outside)  # first, so that who waited for the disk need not wait for this
         self._bell.ring()
+
+    def _tell(self, outside: Outside) -> bool:
+        return outside.tell(synced=self._synced, closed=self._closed and self._synced == self.written)
 
     def _trimmable(self) -> bool:
         return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))

@@ -15,6 +15,7 @@ import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck
+from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue import LiveQueue, RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.progress import Drained, Progress, Recorded
 from tests.queue.test_room import ALL, ORDINARY, PAYLOAD, fill
@@ -80,7 +81,7 @@ async def test_what_is_synced_is_given_whole_and_in_order_over_many_segments(spo
         queue.put_nowait(node(), b"%d" % number + b"x" * 200)
     queue.put_nowait(ended(), b"{}")
     await queue.synced_to()
-    records = []
+    records: list[Record] = []
     while len(records) < 33:
         records += await source.get_batch(events_max=7, bytes_max=2**22, age_s_max=0.05)
     assert records == [
@@ -373,7 +374,7 @@ async def test_a_recorder_killed_while_it_is_drained_ends_the_source_and_recover
         (folder,) = Spool(spool).recorders()
         source = LiveQueue.take(folder.path)
         assert source is not None
-        given = []
+        given: list[Record] = []
         while len(given) < 11:
             given += await source.get_batch(events_max=4, bytes_max=2**20, age_s_max=0.0)
         await source.acknowledge(6)
