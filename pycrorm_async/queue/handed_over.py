@@ -79,14 +79,13 @@ class HandedOver:
 
     @property
     def _is_tended(self) -> bool:
-        note = self._said.note
-        return note.away is None and (note.given_up is None or bool(note.stopped)) and self._queue.is_drained
+        return self._said.note.away is None and self._queue.is_drained
 
     def _raise_given_up(self) -> None:
-        """A refused episode is no reason to stop: what others said afterwards is stored all the same."""
-        note = self._said.note
-        if note.given_up is not None and not note.stopped:
-            raise DatabaseError(f"{note.given_up}; everything recorded is safe in the spool")
+        """Where an episode is refused the drainer goes on with the others; one that had to stop is gone."""
+        reason = self._said.note.given_up
+        if reason is not None and not self._queue.is_drained:
+            raise DatabaseError(f"{reason}; everything recorded is safe in the spool")
 
     def _hindrance(self, before: int) -> str:
         said = self._said

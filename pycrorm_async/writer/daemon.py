@@ -56,8 +56,7 @@ class Daemon:
         self._rests: dict[str, tuple[int, float]] = {}  # by name: how often it was tried, when it may be again
         self._news = asyncio.Event()
         self._away: str | None = None
-        self._fold_fault: str | None = None
-        self._look_fault: str | None = None
+        self._said: dict[str, str] = {}  # by what it is about, the last line
         self._recorders = self._records = 0
 
     async def run(self, leave: asyncio.Event) -> Moved:
@@ -102,9 +101,9 @@ class Daemon:
         except SpoolForeign:
             raise
         except FilesError as error:
-            self._look_fault = self._say_news(f"cannot look for recorders: {error}", self._look_fault)
+            self._say_news(f"cannot look for recorders: {error}", "look")
             return []
-        self._look_fault = None
+        self._said.pop("look", None)
         for name, fault in found.failed.items():
             self._rest(name, str(fault))
         return list(found.held)
@@ -114,14 +113,22 @@ class Daemon:
         pause_s = _REST.pause_s(attempt, self._randomness())
         assert pause_s is not None, "it is tried for ever"
         self._rests[name] = attempt, self._now_s() + pause_s
-        self._say(f"recorder {name}: {reason}; tried again in {pause_s:.0f} s")
+        self._say_news(f"recorder {name}: {reason}; tried again now and then", f"{name} rests")
 
     # --- one recorder -----------------------------------------------------------------------------------------
 
     async def _serve(self, held: Held) -> None:
-        serving = Serving(held, self._destination, settings=self._settings, on_append=self._news.set)
-        self._serving[held.name] = serving
-        self._say(f"recorder {held.name} " + ("appeared" if held.is_alive else "is dead: recovering what it left"))
+        name = held.name
+        serving = Serving(
+            held,
+            self._destination,
+            settings=self._settings,
+            on_append=self._news.set,
+            on_give_up=lambda line: self._say_news(line, name),
+        )
+        self._serving[name] = serving
+        if name not in self._rests:
+            self._say(f"recorder {name} " + ("appeared" if held.is_alive else "is dead: recovering what it left"))
         fault: str | None = None
         try:
             if self._away is not None:
@@ -140,7 +147,8 @@ class Daemon:
                 fault = next(
                     (f"episode {episode} {why}" for episode, why in state.refused.items()), "not all is stored"
                 )
-            self._say(f"recorder {name} {left.what}; {state.records} events stored")
+            if fault is None:
+                self._say(f"recorder {name} {left.what}; {state.records} events stored")
         except PycrormError as error:
             fault = fault or str(error)
         del self._serving[name]
@@ -148,6 +156,8 @@ class Daemon:
         self._records += state.records
         if fault is None:
             self._rests.pop(name, None)
+            self._said.pop(name, None)
+            self._said.pop(f"{name} rests", None)
         else:
             self._rest(name, fault)
 
@@ -166,12 +176,12 @@ class Daemon:
             except Exception as error:  # noqa: BLE001 - told, and tried again; appending goes on
                 attempt += 1
                 if not isinstance(error, DatabaseUnavailable):
-                    line = f"the tables cannot be brought up to date: {_in_a_line(error)}"
-                    self._fold_fault = self._say_news(line, self._fold_fault)
+                    self._say_news(f"the tables cannot be brought up to date: {_in_a_line(error)}", "fold")
                 self._news.set()
                 await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0.0)
             else:
-                attempt, self._fold_fault = 0, None
+                attempt = 0
+                self._said.pop("fold", None)
 
     async def _tell_what_shows(self) -> None:
         before = [(each, each.appended) for each in self._serving.values()]
@@ -201,11 +211,11 @@ class Daemon:
             except FilesError as error:
                 self._say(f"recorder {serving.name}: {error}")
 
-    def _say_news(self, line: str, before: str | None) -> str:
-        """Says it unless it was the last thing said of its kind."""
-        if line != before:
+    def _say_news(self, line: str, about: str) -> None:
+        """Says it unless it was the last thing said about that."""
+        if self._said.get(about) != line:
+            self._said[about] = line
             self._say(line)
-        return line
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()

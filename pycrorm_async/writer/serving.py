@@ -25,10 +25,16 @@ class Serving(Source):
     """
 
     def __init__(
-        self, held: Held, destination: Destination, *, settings: Settings, on_append: Callable[[], None]
+        self,
+        held: Held,
+        destination: Destination,
+        *,
+        settings: Settings,
+        on_append: Callable[[], None],
+        on_give_up: Callable[[str], None],
     ) -> None:
         self.held = held
-        self._drain = Drain(self, destination, settings=settings, on_append=on_append)
+        self._drain = Drain(self, destination, settings=settings, on_append=on_append, on_give_up=on_give_up)
         self._unshown: deque[tuple[int, dict[str, int]]] = (
             deque()
         )  # position, and each episode's last sequence up to it
