@@ -94,8 +94,8 @@ class Lab:
         self.daemon: subprocess.Popen[bytes] | None = None
         self.log = folder / "daemon.log"
 
-    def start_robot(self) -> Robot:
-        name = f"robot{len(self.robots) + len(self.gone)}"
+    def start_robot(self, name: str | None = None) -> Robot:
+        name = name or f"robot{len(self.robots) + len(self.gone)}"
         robot = Robot(self.url, self.spool, name, self.rng.randrange(2**31))
         self.robots.append(robot)
         return robot

@@ -93,3 +93,29 @@ def test_a_file_that_another_program_locks_for_a_while_costs_nothing(tmp_path: P
         lab.prove_that_everything_is_there_once_and_in_order()
     finally:
         lab.clear()
+
+
+@pytest.mark.soak
+def test_two_daemons_of_two_spools_fold_into_one_server_without_hindering_each_other(
+    own_server: Server, tmp_path: Path
+) -> None:
+    url, seed = own_server.new_database(), random.randrange(2**31)
+    labs = [Lab(tmp_path / name, url, seed + number) for number, name in enumerate(("one", "two"))]
+    try:
+        for lab in labs:
+            lab.folder.mkdir()
+            lab.start_daemon()
+            for prefix in ("a", "b"):
+                lab.start_robot(f"{lab.folder.name}.{prefix}").wait_until_it_walks()
+        time.sleep(20)
+        for lab in labs:
+            lab.stop_robots()
+            assert lab.stop_daemon() == 0
+            assert "tables cannot" not in lab.log.read_text()
+            assert "away" not in lab.log.read_text()
+        labs[0].gone += labs[1].gone
+        labs[0].prove_that_everything_is_there_once_and_in_order()
+        assert [path.name for path in labs[1].spool.iterdir() if path.is_dir()] == []
+    finally:
+        for lab in labs:
+            lab.clear()
