@@ -1,6 +1,7 @@
 """A plan with memory against the same plan without: navigate, face, look and try to pick up, as fast as it goes.
 
-Prints one JSON line: rollouts a second with and without, paired in turns within one run, and what the memory costs.
+Prints one JSON line: rollouts a second without, with a memory that writes by a thread, and with one whose events a
+daemon writes meanwhile, paired in turns within one run; and what either costs.
 Run it with `python -m bench.plan`.
 """
 
@@ -10,10 +11,14 @@ import statistics
 import tempfile
 import time
 from contextlib import AsyncExitStack, suppress
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from bench.daemon import start_daemon, stop
 from pycrorm_async import Memory
+from pycrorm_async.config import Writer
 from pycrorm_async.plan import MoveAndPickUpPerformable, PlanFailure, simulated_robot
 from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
@@ -22,10 +27,16 @@ ROLLOUTS = 300
 TURNS = 10
 
 
-async def rollouts(world: BulletWorld, milk: Object, generator: np.random.Generator) -> float:
-    """Seconds for one turn."""
+class Took(NamedTuple):
+    """Seconds of one turn, on the wall and of the plan's thread on a processor."""
+
+    wall: float
+    thread: float
+
+
+async def rollouts(world: BulletWorld, milk: Object, generator: np.random.Generator) -> Took:
     target = designator_of(milk)
-    began = time.perf_counter()
+    began, began_thread = time.perf_counter(), time.thread_time()
     for _ in range(ROLLOUTS):
         x, y = generator.uniform(-0.9, 0.9, 2)
         arm = (Arms.LEFT, Arms.RIGHT)[generator.integers(2)]
@@ -33,14 +44,17 @@ async def rollouts(world: BulletWorld, milk: Object, generator: np.random.Genera
         with simulated_robot, suppress(PlanFailure):
             await MoveAndPickUpPerformable(Pose([1.3 + x, 1.0 + y, 0.0]), target, arm, grasp).perform()
         world.reset()
-    return time.perf_counter() - began
+    return Took(time.perf_counter() - began, time.thread_time() - began_thread)
 
 
-async def turn(url: str | None, seed: int) -> float:
-    """Seconds of one turn in a world of its own, while the memory writes beside it; folding comes after."""
+async def turn(url: str | None, seed: int, *, writer: Writer = "thread") -> Took:
+    """One turn in a world of its own, while the memory is written beside it.
+
+    A thread folds afterwards, a daemon meanwhile, on another core where there is one.
+    """
     async with AsyncExitStack() as stack:
         if url is not None:
-            memory = await stack.enter_async_context(Memory.open(url))
+            memory = await stack.enter_async_context(Memory.open(url, writer=writer))
             await stack.enter_async_context(memory.episode(description="bench"))
         world = stack.enter_context(BulletWorld())
         Object("pr2", ObjectType.ROBOT)
@@ -49,20 +63,37 @@ async def turn(url: str | None, seed: int) -> float:
 
 
 async def measured() -> dict[str, object]:
-    with_memory, without = [], []
+    with_memory, by_daemon, without = [], [], []
     with tempfile.TemporaryDirectory() as folder:
+        url = f"sqlite:///{folder}/daemon.db"
+        daemon = start_daemon(url, Path(f"{folder}/daemon.db.spool"))
         for seed in range(TURNS):
             without.append(await turn(None, seed))
             with_memory.append(await turn(f"sqlite:///{folder}/bench.db", seed))
-    shares = [one / other - 1 for one, other in zip(with_memory, without, strict=True)]
+            by_daemon.append(await turn(url, seed, writer="daemon"))
+        stop(daemon)
     return {
         "bench": "plan",
         "rollouts_a_turn": ROLLOUTS,
         "turns": TURNS,
-        "rollouts_per_s_without": round(ROLLOUTS / statistics.median(without)),
-        "rollouts_per_s_with": round(ROLLOUTS / statistics.median(with_memory)),
-        "slower_by_median": round(statistics.median(shares), 3),
-        "slower_by_each": [round(each, 3) for each in shares],
+        "rollouts_per_s_without": rate(without),
+        "with_thread": {"rollouts_per_s": rate(with_memory), **cost(with_memory, without)},
+        "with_daemon": {"rollouts_per_s": rate(by_daemon), **cost(by_daemon, without)},
+    }
+
+
+def rate(turns: list[Took]) -> int:
+    return round(ROLLOUTS / statistics.median(each.wall for each in turns))
+
+
+def cost(turns: list[Took], without: list[Took]) -> dict[str, object]:
+    """Shares, each turn against the one without memory beside it; the thread's hardly depend on who else is at work."""
+    wall = [one.wall / other.wall - 1 for one, other in zip(turns, without, strict=True)]
+    thread = [one.thread / other.thread - 1 for one, other in zip(turns, without, strict=True)]
+    return {
+        "slower_by_median": round(statistics.median(wall), 3),
+        "slower_by_each": [round(each, 3) for each in wall],
+        "plan_thread_busier_by_median": round(statistics.median(thread), 3),
     }
 
 

@@ -5,9 +5,11 @@ With `memory.py` this is where the parts are wired: no other module sees a queue
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import ExitStack, asynccontextmanager
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,29 +20,54 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.views import UserView
+from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.once import Recovered, drain_once
+from pycrorm_async.writer.ports import Source
 
-__all__ = ["LogAndTables", "open_destination", "dead_queues", "RecoveryReport", "recover", "Waiting", "waiting"]
+__all__ = [
+    "LogAndTables",
+    "open_destination",
+    "shared_address",
+    "dead_queues",
+    "living_queues",
+    "RecoveryReport",
+    "recover",
+    "Waiting",
+    "waiting",
+]
+
+_APPENDS_AT_ONCE = 4
+"""On a server, however many recorders a daemon drains: as many as its pool has connections for, and one to fold."""
 
 _log = logging.getLogger("pycrorm_async")
 
 
 class LogAndTables:
-    """The writer's far end: the log, and the tables behind it. Implements the writer's `Destination`."""
+    """The writer's far end: the log, and the tables behind it. Implements the writer's `Destination` and `Shown`."""
 
     def __init__(self, log: EventLog, projector: Projector) -> None:
+        self.log_id = log.log_id
         self._log = log
         self._projector = projector
+        # SQLite has one writer at a time, and whoever waits for it sleeps and tries again: better to wait in turn here.
+        self._appending = asyncio.Semaphore(1 if log.address.is_sqlite else _APPENDS_AT_ONCE)
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self._log.append(records)
+        async with self._appending:
+            return await self._log.append(records)
 
     async def fold(self) -> int:
         return await self._projector.fold_behind()
+
+    async def fold_some(self) -> bool:
+        return await self._projector.fold_some()
+
+    async def behind(self) -> Mapping[str, int]:
+        return {each.id: each.folded for each in await self._log.behind()}
 
     async def stopped(self) -> Mapping[str, str]:
         return {each.id: each.refused or each.parked or "" for each in await self._log.stopped()}
@@ -96,26 +123,57 @@ class RecoveryReport(NamedTuple):
 
     Attributes:
         drained: what was drained and folded.
+        living: how many of the sources drained, the first ones, belong to living processes.
         lost: ids of the episodes that were left open and ended LOST.
         failed: by the folder's name, why it could not be recovered.
     """
 
     drained: Recovered
+    living: int
     lost: tuple[str, ...]
     failed: Mapping[str, PycrormError]
 
 
 async def recover(url: str, *, spool: Path | None = None, settings: Settings | None = None) -> RecoveryReport:
-    """Append and fold all that dead processes left in the spool of a database. Raises as `Memory.open` does."""
+    """Append and fold all there is in the spool of a database and nobody drains, of the dead and of the living.
+
+    Of a living process what is synced at this moment. Raises as `Memory.open` does.
+    """
     failures: dict[str, PycrormError] = {}
     lost: list[str] = []
-    address = DatabaseAddress.parse(url)
-    if address.is_private:
-        raise CallerError("sqlite:// is gone with its process: there is nothing to recover")
+    address = shared_address(url)
     place = Spool(spool or address.default_spool)
     async with open_destination(address, place, clock=SYSTEM_CLOCK) as destination:
-        done = await drain_once(dead_queues(place, failures, lost), destination, settings=settings or Settings())
-    return RecoveryReport(done, tuple(lost), {**done.failed, **failures})
+        with ExitStack() as held:
+            living = list(living_queues(place, failures, held))
+            sources: Iterator[Source] = chain(living, dead_queues(place, failures, lost))
+            done = await drain_once(sources, destination, settings=settings or Settings())
+            reasons = done.stopped
+            for queue, state in zip(living, done.drained, strict=False):
+                queue.note_shown(state.appended or queue.given, {each: reasons[each] for each in state.refused})
+    return RecoveryReport(done, len(living), tuple(lost), {**done.failed, **failures})
+
+
+def shared_address(url: str) -> DatabaseAddress:
+    """The address of a database that another process can open too. Raises `UnknownUrl`, `CallerError`."""
+    address = DatabaseAddress.parse(url)
+    if address.is_private:
+        raise CallerError("sqlite:// is gone with its process: no other can write it or recover anything")
+    return address
+
+
+def living_queues(spool: Spool, failures: dict[str, PycrormError], held: ExitStack) -> Iterator[LiveQueue]:
+    """What living recorders have synced by now and nobody drains; held until the stack is closed."""
+    for folder in spool.recorders():
+        try:
+            queue = LiveQueue.take(folder.path) if folder.alive else None
+        except PycrormError as error:
+            failures[folder.name] = error
+            continue
+        if queue is not None:
+            held.callback(queue.release)
+            queue.finish()
+            yield queue
 
 
 class Waiting(NamedTuple):

@@ -12,13 +12,14 @@ from typing import Literal, get_args
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["Settings", "OnFull", "OnUnrecordable"]
+__all__ = ["Settings", "OnFull", "OnUnrecordable", "Writer"]
 
 OnFull = Literal["wait", "fail"]
 OnUnrecordable = Literal["refuse", "record_missing"]
+Writer = Literal["thread", "daemon"]
 _MAY_BE_NONE = frozenset({"sample_interval_ms"})
 _MAY_BE_ZERO = frozenset({"sample_change_min"})
-_CHOICES = {"on_full": get_args(OnFull), "on_unrecordable": get_args(OnUnrecordable)}
+_CHOICES = {"writer": get_args(Writer), "on_full": get_args(OnFull), "on_unrecordable": get_args(OnUnrecordable)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,6 +27,7 @@ class Settings:
     """Limits and rhythms of one memory.
 
     Attributes:
+        writer: who moves events to the database: a thread of this process, or the daemon `pycrorm writer`.
         sync_interval_ms: a sync of what was written begins after at most this long.
         segment_bytes: size of one file of the write-ahead queue, allocated ahead.
         spool_bytes_max: what one recorder may hold on disk before `on_full` applies.
@@ -43,6 +45,7 @@ class Settings:
         on_unrecordable: refuse a perform whose parameters cannot be recorded, or record them as missing.
     """
 
+    writer: Writer = "thread"
     sync_interval_ms: int = 50
     segment_bytes: int = 8 * 2**20
     spool_bytes_max: int = 4 * 2**30

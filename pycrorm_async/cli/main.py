@@ -22,7 +22,7 @@ from typing import Any
 import typer
 from rich.logging import RichHandler
 
-from pycrorm_async.cli import demo, episodes, run, show, writer
+from pycrorm_async.cli import demo, episodes, run, show, status, writer
 from pycrorm_async.cli.output import problem, stderr
 from pycrorm_async.errors import (
     CallerError,
@@ -86,6 +86,7 @@ _VERBS: dict[str, Callable[..., int | None]] = {
     "episodes": episodes.episodes,
     "show": show.show,
     "writer": writer.writer,
+    "status": status.status,
 }
 for _name, _verb in _VERBS.items():
     app.command(_name)(_told_in_a_line(_verb))

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["UrlOption", "SpoolOption", "JsonOption", "DEFAULT_URL"]
+from pycrorm_async.config import Writer
+
+__all__ = ["UrlOption", "SpoolOption", "JsonOption", "WriterOption", "DEFAULT_URL"]
 
 DEFAULT_URL = "sqlite:///pycrorm.db"
 
@@ -16,7 +18,7 @@ UrlOption = Annotated[
     typer.Option(
         "--url",
         envvar="PYCRORM_URL",
-        help="The database: sqlite:///memory.db, sqlite:////absolute/path.db.",
+        help="The database: sqlite:///memory.db, sqlite:////absolute/path.db, postgresql://user@host/database.",
         show_envvar=True,
     ),
 ]
@@ -24,6 +26,15 @@ SpoolOption = Annotated[
     Path | None,
     typer.Option(
         "--spool", envvar="PYCRORM_SPOOL", help="The write-ahead queue's folder; default: beside the database."
+    ),
+]
+WriterOption = Annotated[
+    Writer,
+    typer.Option(
+        "--writer",
+        envvar="PYCRORM_WRITER",
+        help="Who moves events to the database: a thread of this process, or the daemon `pycrorm writer`.",
+        show_envvar=True,
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Answer with one JSON document.")]

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.loading import LoadedPlan, load_plan
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, WriterOption
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
 from pycrorm_async.errors import EpisodeParked
 from pycrorm_async.hooks.values import message_of
@@ -22,6 +22,8 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.query.questions import EpisodeSummary
 
 __all__ = ["run"]
+
+_FOUND_AFTER_S = 2
 
 
 def run(
@@ -34,6 +36,7 @@ def run(
         str | None, typer.Option(help="Why; default: the function's docstring, or its name.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Recorded with the episode; the plan itself must use it.")] = None,
+    writer: WriterOption = "thread",
     show_traceback: Annotated[bool, typer.Option("--traceback", help="Of a plan that raises, on stderr.")] = False,
     as_json: JsonOption = False,
 ) -> int:
@@ -43,16 +46,17 @@ def run(
     Exit code 1 if the plan failed: everything up to there is remembered.
     """
     loaded = load_plan(plan)
+    memory = Memory.open(url, spool=spool, writer=writer)
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         try:
-            asyncio.run(_remembered(loaded, url, spool, description or loaded.description, seed, outcome))
+            asyncio.run(_remembered(loaded, memory, description or loaded.description, seed, outcome))
         except asyncio.CancelledError as cancelled:  # the plan's own doing: Ctrl-C is a KeyboardInterrupt here
             outcome.failure = cancelled
     failure, episodes = outcome.failure, outcome.episodes
     if as_json:
         print_json({"plan": loaded.name, "failure": _one_line(failure), "episodes": episodes})
-    else:
+    elif outcome.is_written:
         print_table(
             loaded.name,
             ("episode", "description", "status", "nodes"),
@@ -68,16 +72,17 @@ def run(
 
 @dataclass
 class _Outcome:
-    """What the plan ended with, if not well, and its episodes."""
+    """What the plan ended with, if not well, and its episodes, once they are in the database."""
 
     failure: BaseException | None = None
     episodes: list[EpisodeSummary] = field(default_factory=list)
+    is_written: bool = True
 
 
 async def _remembered(
-    loaded: LoadedPlan, url: str, spool: Path | None, description: str, seed: int | None, outcome: _Outcome
+    loaded: LoadedPlan, opened: Memory, description: str, seed: int | None, outcome: _Outcome
 ) -> None:
-    async with Memory.open(url, spool=spool) as memory:
+    async with opened as memory:
         try:
             if loaded.takes_memory:
                 await loaded.function(memory)
@@ -97,6 +102,9 @@ async def _remembered(
 async def _summarise(memory: Memory, outcome: _Outcome) -> None:
     if not memory.is_open:  # the plan closed it
         return
+    if not await _is_written(memory):
+        outcome.is_written = False  # closing says so
+        return
     try:
         await memory.flush()
     except EpisodeParked as parked:
@@ -105,6 +113,15 @@ async def _summarise(memory: Memory, outcome: _Outcome) -> None:
     if memory.opened_count > len(recent):
         note(f"the last {len(recent)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")
     outcome.episodes = [each for each in await memory.reading.episodes() if each.id in recent]
+
+
+async def _is_written(memory: Memory) -> bool:
+    """Whether there is somebody to wait for: a daemon may take a moment to find a recorder that is new."""
+    for _ in range(_FOUND_AFTER_S * 10):
+        if memory.status.drained:
+            return True
+        await asyncio.sleep(0.1)
+    return False
 
 
 def _one_line(failure: BaseException | None) -> str | None:

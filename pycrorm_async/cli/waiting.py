@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pycrorm_async.adoption import waiting
 from pycrorm_async.cli.output import note
+from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["note_what_waits"]
 
@@ -17,7 +18,7 @@ def note_what_waits(url: str, spool: Path | None) -> None:
         option = f" --spool {spool}" if spool else ""
         note(
             f"{dead} dead recorder{'s' * (dead > 1)} left events that are not in the database:"
-            f" `pycrorm writer --once --url {url}{option}` brings them in."
+            f" `pycrorm writer --once --url {DatabaseAddress.parse(url).to_type}{option}` brings them in."
         )
     if alive:
         note(f"{alive} recorder{'s are' if alive > 1 else ' is'} at work: the newest events may not be in yet.")

@@ -1,32 +1,73 @@
-"""`pycrorm writer --once`: recover, append and fold what dead processes left in a spool."""
+"""`pycrorm writer`: the daemon that brings a spool into its database; with `--once` it does that once."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
+import threading
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pycrorm_async.adoption import RecoveryReport, recover
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import print_json, problem, stderr, stdout
-from pycrorm_async.errors import CallerError, DamageError
+from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
+from pycrorm_async.daemon import serve
+from pycrorm_async.errors import DamageError
+from pycrorm_async.writer.daemon import LEAVE_S, Moved
 
 __all__ = ["writer"]
 
+_HANGING_S = 5.0
+"""How much longer than `LEAVE_S` a database that does not answer at all may keep the process."""
+
 
 def writer(
-    once: Annotated[bool, typer.Option("--once", help="Recover, append and fold all there is, then exit.")] = False,
+    once: Annotated[
+        bool, typer.Option("--once", help="Recover, append and fold all there is at this moment, then exit.")
+    ] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Bring what dead processes left in the spool into the database.
+    """Bring what is recorded below a spool into the database and its tables, as it comes.
 
-    Exit code 0 also when an episode was lost with its process; 4 if files are damaged, 1 if an episode is stopped.
+    Drains plans that run with `writer="daemon"` and what dead processes left, until SIGTERM or Ctrl-C: then stores what
+    is synced and exits 0 within 15 seconds. A database that goes away is waited for; one that cannot be opened at the
+    start, or a spool that another `pycrorm writer` drains, is exit code 3.
+
+    With --once: exit code 0 also when an episode was lost with its process; 4 if files are damaged, 1 if an episode is
+    stopped.
     """
-    if not once:
-        raise CallerError("`pycrorm writer` runs with --once: a live process writes its own events")
+    if once:
+        return _once(url, spool, as_json=as_json)
+    moved = asyncio.run(_until_told_to_leave(url, spool))
+    if as_json:
+        print_json(moved._asdict())
+    else:
+        note(f"left after {moved.records} events of {moved.recorders} recorders")
+    return 0
+
+
+async def _until_told_to_leave(url: str, spool: Path | None) -> Moved:
+    leave = asyncio.Event()
+
+    def told() -> None:
+        if leave.is_set():
+            os._exit(130)  # asked twice; what is not stored is safe in the spool
+        leave.set()
+        watchdog = threading.Timer(LEAVE_S + _HANGING_S, os._exit, (0,))
+        watchdog.daemon = True
+        watchdog.start()
+
+    for each in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(each, told)
+    return await serve(url, spool=spool, leave=leave, say=note)
+
+
+def _once(url: str, spool: Path | None, *, as_json: bool) -> int:
     with stderr.status("recovering what dead processes left …"):
         report = asyncio.run(recover(url, spool=spool))
     if as_json:
@@ -47,8 +88,10 @@ def writer(
 def _print(report: RecoveryReport) -> None:
     drained = report.drained.drained
     events = sum(each.records for each in drained)
+    dead = len(drained) - report.living
+    living = f"{report.living} living, " if report.living else ""
     stdout.print(
-        f"{len(drained)} dead recorder{'' if len(drained) == 1 else 's'}, {events} events stored,"
+        f"{dead} dead recorder{'' if dead == 1 else 's'}, {living}{events} events stored,"
         f" {report.drained.folded} folded, {len(report.lost)} episode{'' if len(report.lost) == 1 else 's'} LOST"
     )
     for episode in report.lost:

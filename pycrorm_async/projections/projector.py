@@ -106,6 +106,14 @@ class Projector:
                 count += await self._fold_batch(events)
         return count
 
+    async def fold_some(self) -> bool:
+        """One batch of the same; False if nothing was behind."""
+        with self._log.translated():
+            events = await self._log.unfolded(self._batch_events)
+            if events:
+                await self._fold_batch(events)
+        return bool(events)
+
     async def _fold_batch(self, events: Sequence[StoredEvent]) -> int:
         types = await self._types_now()
         folded = _folded(events, types.designators)

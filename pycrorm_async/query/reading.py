@@ -8,6 +8,7 @@ async with Reading.open("sqlite:///memory.db") as reading:
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any, Self
@@ -42,13 +43,16 @@ class Reading:
     session or frame costs some ms more.
     """
 
-    def __init__(self, log: EventLog) -> None:
-        self._log = log
+    def __init__(self, log: EventLog | DatabaseAddress) -> None:
+        """Of an open log; or of one at an address, which is opened at the first question and closed by `close`."""
+        self._address = log if isinstance(log, DatabaseAddress) else log.address
+        self._opened: EventLog | None = None
+        self._opening = asyncio.Lock()
         self._classes = DynamicClasses()
         self._declarations: list[bytes] = []
         self._all_views: tuple[int, dict[str, str]] = (-1, {})
-        self._classes.use_in(log.engine)
-        self._sessions = async_sessionmaker(log.engine, expire_on_commit=False)
+        if isinstance(log, EventLog):
+            self._use(log)
 
     @classmethod
     @asynccontextmanager
@@ -66,23 +70,32 @@ class Reading:
     @asynccontextmanager
     async def open_address(cls, address: DatabaseAddress) -> AsyncIterator[Self]:
         """The memory at a located address. Raises as `open` does."""
-        log = await EventLog.open(address, create=False)
+        reading = cls(address)
         try:
-            reading = cls(log)
-            try:
-                await reading._generation()
-                await reading.refresh()
-                yield reading
-            finally:
-                reading._classes.dispose()
+            await reading.refresh()
+            yield reading
         finally:
-            await log.close()
+            await reading.close()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether anything was asked yet."""
+        return self._opened is not None
+
+    async def close(self) -> None:
+        """Ends its connections and its classes. Twice is once."""
+        async with self._opening:
+            log, self._opened = self._opened, None
+            self._classes.dispose()
+            if log is not None:
+                await log.close()
 
     async def refresh(self) -> None:
         """Learns the designator types that were declared since; every session begins with it."""
+        await self._ready()
         declarations = await self._log.declarations()
         if declarations != self._declarations:
-            generation = await self._generation()
+            generation = await _generation(self._log)
             self._classes.learn(unite(generation.layout, declarations).accepted.values())
             self._declarations = declarations
 
@@ -102,6 +115,7 @@ class Reading:
 
     async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> pd.DataFrame:
         """The answer as a pandas DataFrame, see `pycrorm_async.query.frames`. Raises `MissingExtra`."""
+        await self._ready()
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
                 return await dataframe(connection, statement)
@@ -117,6 +131,7 @@ class Reading:
 
     async def episodes(self, *, simulated: bool = False) -> list[EpisodeSummary]:
         """Every episode, the oldest first."""
+        await self._ready()
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
                 return await questions.episodes(connection)
@@ -126,18 +141,21 @@ class Reading:
 
         `last` is the newest that really happened. Raises `UnknownEpisode`.
         """
+        await self._ready()
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
                 return await questions.episode_named(connection, name)
 
     async def tree(self, number: int) -> list[NodeSummary]:
         """The task tree of an episode, also of one that was only thought through; each node before its children."""
+        await self._ready()
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
                 return await questions.task_tree(connection, number)
 
     async def number_of(self, episode: str) -> int:
         """The number this database gave to the episode of that UUID. Raises `UnknownEpisode`."""
+        await self._ready()
         number = await self._log.episode_number(parse_episode_id(episode))
         if number is None:
             raise UnknownEpisode(f"nothing of the episode {episode} is in this database yet")
@@ -145,24 +163,46 @@ class Reading:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
+    async def _ready(self) -> None:
+        """The log is open afterwards: what is asked of it is asked after this."""
+        if self._opened is None:
+            async with self._opening:
+                if self._opened is None:
+                    log = await EventLog.open(self._address, create=False)
+                    try:
+                        await _generation(log)
+                    except BaseException:
+                        await log.close()
+                        raise
+                    self._use(log)
+
+    def _use(self, log: EventLog) -> None:
+        self._opened = log
+        self._classes.use_in(log.engine)
+        self._sessions = async_sessionmaker(log.engine, expire_on_commit=False)
+
+    @property
+    def _log(self) -> EventLog:
+        assert self._opened is not None, "made ready before it is asked"
+        return self._opened
+
     @asynccontextmanager
     async def _connection(self, *, simulated: bool) -> AsyncIterator[AsyncConnection]:
         if not simulated:
             async with self._log.engine.connect() as connection:
                 yield connection
             return
-        generation = await self._generation()
+        generation = await _generation(self._log)
         if generation.revision != self._all_views[0]:
             self._all_views = generation.revision, all_views(generation, self._log.engine.dialect)
         async with with_thoughts(self._log.engine, self._all_views[1]) as connection:
             yield connection
 
-    async def _generation(self) -> Generation:
-        with self._log.translated():
-            async with self._log.engine.connect() as connection:
-                generation = await current_generation(connection)
-        if generation is None:
-            raise DatabaseUnavailable(
-                f"{self._log.address} has a log and no tables yet: `pycrorm writer --once` makes them"
-            )
-        return generation
+
+async def _generation(log: EventLog) -> Generation:
+    with log.translated():
+        async with log.engine.connect() as connection:
+            generation = await current_generation(connection)
+    if generation is None:
+        raise DatabaseUnavailable(f"{log.address} has a log and no tables yet: `pycrorm writer --once` makes them")
+    return generation

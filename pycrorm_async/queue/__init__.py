@@ -2,9 +2,11 @@
 
     spool/                     one folder, bound to one database
       log                      id of that database's log, one line; stays while a recorder's folder is here
+      writer                   locked by the daemon that drains the spool
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
         drain                  locked by whoever drains the folder
+        progress               how far it is drained, if that is another process (`progress.py`)
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
         00000002.segment       the last one may be made ahead: all zero
         00000001.segment.tail  what sealing cut off, to be looked at until the folder is removed
@@ -54,8 +56,10 @@ if its base is the next position. The oldest segment's header knows the open epi
 when the segments that began them are gone: a segment goes only after the next one's header is safe.
 """
 
+from pycrorm_async.queue.handed_over import HandedOver
+from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.recorder import RecorderQueue
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
 from pycrorm_async.queue.spool import RecorderFolder, Spool
 
-__all__ = ["RecorderQueue", "RecoveredQueue", "open_dead", "Spool", "RecorderFolder"]
+__all__ = ["RecorderQueue", "HandedOver", "LiveQueue", "RecoveredQueue", "open_dead", "Spool", "RecorderFolder"]

@@ -33,6 +33,11 @@ class Bell:
             if ticket.set_running_or_notify_cancel():
                 ticket.set_result(None)
 
+    @property
+    def awaited(self) -> bool:
+        """Whether somebody waits now."""
+        return bool(self._tickets)
+
     async def until(self, reached: Callable[[], bool]) -> None:
         """Done when `reached` is true; it is asked now and after every ring, in the caller's loop."""
         while True:

@@ -14,6 +14,7 @@ from typing import Final
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.progress import PROGRESS
 from pycrorm_async.queue.segment import segment_numbers, segment_path, sync_folder
 
 __all__ = ["ALIVE", "DRAIN", "MAKING", "TAIL", "available", "make_folder", "remove_folder", "write_safely"]
@@ -56,7 +57,7 @@ def remove_folder(folder: Path) -> None:
     for path in list(folder.iterdir()):
         if path.suffix in {MAKING, TAIL}:
             path.unlink()
-    for name in (DRAIN, ALIVE):
+    for name in (PROGRESS, DRAIN, ALIVE):
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()

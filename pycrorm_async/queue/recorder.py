@@ -26,7 +26,9 @@ from pycrorm_async.queue.bell import Bell
 from pycrorm_async.queue.capacity import Capacity
 from pycrorm_async.queue.folder import DRAIN, available, make_folder, remove_folder
 from pycrorm_async.queue.frame import Buffer
-from pycrorm_async.queue.locks import FileLock, in_forked_child
+from pycrorm_async.queue.locks import FileLock, in_forked_child, is_locked
+from pycrorm_async.queue.outside import Outside
+from pycrorm_async.queue.progress import Drained
 from pycrorm_async.queue.reader import Batch, Cursor, Reader, map_segment
 from pycrorm_async.queue.segment import header_bytes, segment_path
 from pycrorm_async.queue.syncer import Syncer
@@ -34,16 +36,21 @@ from pycrorm_async.queue.syncer import Syncer
 __all__ = ["RecorderQueue"]
 
 _LAST_SYNC_S = 30.0
+_LOOK_S = 0.05
+"""How often the sync thread looks what another process has drained, while that may make a difference."""
 
 
 class RecorderQueue:
     """An asyncio queue whose items survive the process. Made by `create`; one recorder, one life of a process.
 
-    Producers are any threads and tasks. The consumer is one task of one loop, which may be another thread's; the first
-    `get_batch` takes the lock `drain`, so a queue nobody reads here can be drained by another process.
+    Producers are any threads and tasks. The consumer is one task of one loop, which may be another thread's and takes
+    the lock `drain` with its first `get_batch`. A queue that is `offered` has its consumer in another process
+    (`living.py`): what that stores and folds is seen in the file `progress`.
     """
 
-    def __init__(self, *, folder: Path, recorder: bytes, settings: Settings, clock: Clock, alive: FileLock) -> None:
+    def __init__(
+        self, *, folder: Path, recorder: bytes, settings: Settings, clock: Clock, alive: FileLock, offered: bool
+    ) -> None:
         """Used by `create`, which made and locked the folder. Raises `SpoolUnavailable`."""
         self.folder = folder
         self.name = folder.name
@@ -58,7 +65,8 @@ class RecorderQueue:
         self._closed = False
         self._gone = False
         self._safe_number = 0
-        self._syncer = Syncer(name=folder.name, interval_s=settings.sync_interval_ms / 1000, turn=self._turn)
+        self._sync_interval_s = settings.sync_interval_ms / 1000
+        self._syncer = Syncer(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
         with available(folder):
             self._appender = Appender(
                 folder=folder,
@@ -69,21 +77,25 @@ class RecorderQueue:
                 hurry=self._syncer.hurry,
             )
             self._disk_was_full = self._appender.prepare()
+            self._outside = Outside(folder) if offered else None
         self._reader = Reader(recorder=recorder, start=Cursor(1, header_bytes(0), 0), load=self._load)
         in_forked_child(self._forked)
         self._syncer.start()
 
     @classmethod
-    def create(cls, spool: Path, *, settings: Settings, clock: Clock, recorder: EpisodeId) -> RecorderQueue:
+    def create(
+        cls, spool: Path, *, settings: Settings, clock: Clock, recorder: EpisodeId, offered: bool = False
+    ) -> RecorderQueue:
         """A new queue in a folder of its own below `spool`, named by `recorder`, a UUIDv7.
 
-        Raises `SpoolUnavailable` when the folder cannot be made or written, `CallerError` for settings that contradict
-        each other. Blocks for the few milliseconds it takes to allocate the first segment.
+        With `offered` it is another process that drains it. Raises `SpoolUnavailable` when the folder cannot be made or
+        written, `CallerError` for settings that contradict each other. Blocks for the few milliseconds it takes to
+        allocate the first segment.
         """
         Capacity.of(settings)
         folder, alive = make_folder(spool, episode_text(recorder))
         try:
-            return cls(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive)
+            return cls(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
         except BaseException:
             with contextlib.suppress(OSError):
                 remove_folder(folder)
@@ -134,7 +146,11 @@ class RecorderQueue:
         return decided
 
     def _room_is_decided(self, *, reserved: bool) -> bool:
-        return self._over or self._appender.stuck is not None or self._appender.admits_again(reserved=reserved)
+        if self._over or self._appender.stuck is not None or self._appender.admits_again(reserved=reserved):
+            return True
+        if self._outside is not None:
+            self._syncer.call_in(_LOOK_S)
+        return False
 
     def _refuse_to_wait(self, *, reserved: bool) -> None:
         if self._appender.stuck is not None and not self._over and not self._appender.admits_again(reserved=reserved):
@@ -155,7 +171,20 @@ class RecorderQueue:
     @property
     def stored(self) -> int:
         """All up to this position are acknowledged."""
-        return self._stored
+        if self._outside is None:
+            return self._stored
+        return max(self._stored, self._outside.believed(synced=self._synced).stored)
+
+    @property
+    def drained_outside(self) -> Drained | None:
+        """What the process that drains this queue says, as far as it can be true; None if it is this one."""
+        return None if self._outside is None else self._outside.believed(synced=self._synced)
+
+    @property
+    def is_drained(self) -> bool:
+        """Whether somebody, here or elsewhere, drains it at this moment."""
+        with available(self.folder):
+            return self._drain is not None or is_locked(self.folder / DRAIN)
 
     @property
     def bytes_spooled(self) -> int:
@@ -181,8 +210,9 @@ class RecorderQueue:
         """The next synced records in order, at least one, at most the limits (a single larger record comes alone).
 
         Waits until one is there, then at most `age_s_max` for more; `bytes_max` counts payloads. Empty once the queue
-        is closed and drained. A batch whose call was cancelled is given again. After a failed sync gives what had been
-        synced before, then raises `SpoolUnavailable`. Raises it also while another process drains this queue.
+        is closed and drained. For a queue that is not offered. A batch whose call was cancelled is given again. After a
+        failed sync gives what had been synced before, then raises `SpoolUnavailable`. Raises it also while another
+        process drains this queue.
         """
         self._take_drain()
         await self._bell.until(partial(self._further, self._reader.cursor.position))
@@ -236,20 +266,35 @@ class RecorderQueue:
 
     # --- the sync thread ---------------------------------------------------------------------------------------
 
-    def _turn(self) -> bool:
-        """Syncs, deletes what is stored, makes the next segment ahead; whether to come again by itself."""
+    def _turn(self) -> float | None:
+        """Syncs, deletes what is stored, makes the next segment ahead; in how many seconds to come again by itself."""
         if self._failure is not None:
-            return False
+            return None
         try:
             self._sync()
+            told = self._outside is None or self._exchange(self._outside)
             self._trim()
-            return self._prepare()
+            full = self._prepare()
         except OSError as error:
             self._fail(SpoolUnavailable(self.folder, error.strerror or str(error)))
-            return False
+            return None
         except BaseException as error:
             self._fail(InternalError(f"the sync thread of {self.folder} failed: {error!r}"))
             raise
+        if full:
+            return self._sync_interval_s
+        waiting = self._outside is not None and (self._room_bell.awaited or len(self._appender.begun) > 1)
+        return _LOOK_S if waiting or not told else None
+
+    def _exchange(self, outside: Outside) -> bool:
+        """Tells whoever drains this queue what is synced, hears what is stored; False if it could not be told."""
+        told = self._tell(outside)
+        said = outside.believed(synced=self._synced)
+        self._stored = max(self._stored, said.stored)
+        if said.note.given_up != self._appender.stuck:
+            self._appender.stuck = said.note.given_up
+            self._room_bell.ring()
+        return told
 
     def _sync(self) -> None:
         span = self._appender.begin_sync()
@@ -263,7 +308,12 @@ class RecorderQueue:
         self._appender.end_sync(span)
         self._safe_number = span.segments[-1].number
         self._synced = span.position
+        if self._outside is not None:
+            self._tell(self._outside)  # first, so that who waited for the disk need not wait for this
         self._bell.ring()
+
+    def _tell(self, outside: Outside) -> bool:
+        return outside.tell(synced=self._synced, closed=self._closed and self._synced == self.written)
 
     def _trimmable(self) -> bool:
         return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))
@@ -322,10 +372,12 @@ class RecorderQueue:
         self._appender.close()
         self._reader.close()
         try:
-            if self._failure is None and self._stored == self.written and not self._appender.open:
+            if self._failure is None and self.stored == self.written and not self._appender.open:
                 with available(self.folder):
                     remove_folder(self.folder)
         finally:
+            if self._outside is not None:
+                self._outside.close()
             for lock in (self._drain, self._alive):
                 if lock is not None:
                     lock.release()

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.queue.frame import CHECKSUM, COMMIT, EVENT, HEADER_BYTES, Frame, chain, decode
+from pycrorm_async.queue.frame import CHECKSUM, COMMIT, EVENT, HEADER_BYTES, Buffer, Frame, chain, decode
 from pycrorm_async.queue.reader import Cursor
 from pycrorm_async.queue.segment import (
     CLOSES,
@@ -27,7 +27,7 @@ from pycrorm_async.queue.segment import (
     segment_path,
 )
 
-__all__ = ["Kept", "scan"]
+__all__ = ["Kept", "scan", "checked_header"]
 
 _SALT_OFFSET = HEADER_BYTES - 8
 
@@ -84,7 +84,7 @@ class _Walk:
         """Goes through one segment; False if it does not go on where the one before ended."""
         path = segment_path(self._folder, number)
         buffer = path.read_bytes()
-        header = _header(path, buffer, recorder=self._recorder, number=number)
+        header = checked_header(path, buffer, recorder=self._recorder, number=number)
         if not self._bases:
             if header is None and number > 1:
                 raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are gone")
@@ -143,7 +143,8 @@ class _Walk:
             raise SpoolDamaged(path, self._cut.offset, "the records before are not those that were safe here")
 
 
-def _header(path: Path, buffer: bytes, *, recorder: bytes, number: int) -> SegmentHeader | None:
+def checked_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
+    """The header of a segment; None if it was never begun, or torn. Raises `SpoolForeign` for one that is not ours."""
     written_in = format_of(buffer)
     if written_in is not None and written_in > FORMAT:
         raise SpoolForeign(f"{path} is in format {written_in} of a newer program; this one reads format {FORMAT}")

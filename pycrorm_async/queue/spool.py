@@ -8,11 +8,12 @@ from typing import Final, NamedTuple
 from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.queue.folder import ALIVE, available, write_safely
-from pycrorm_async.queue.locks import is_locked, one_at_a_time
+from pycrorm_async.queue.locks import FileLock, is_locked, one_at_a_time
 
 __all__ = ["Spool", "RecorderFolder"]
 
 BINDING: Final = "log"
+WRITER: Final = "writer"
 
 
 class RecorderFolder(NamedTuple):
@@ -46,7 +47,22 @@ class Spool:
     def strangers(self) -> list[Path]:
         """What lies in the spool and is not ours; it is left alone. Raises `SpoolUnavailable`."""
         with available(self.path):
-            return [path for path in self._entries() if path.name != BINDING and not _is_recorder(path)]
+            return [path for path in self._entries() if path.name not in {BINDING, WRITER} and not _is_recorder(path)]
+
+    def take_writer(self) -> FileLock | None:
+        """The lock of the one daemon that drains this spool, which is made if need be; None if there is one.
+
+        Raises `SpoolUnavailable`.
+        """
+        with available(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            return FileLock.take(self.path / WRITER)
+
+    @property
+    def has_writer(self) -> bool:
+        """Whether a daemon drains this spool now. Raises `SpoolUnavailable`."""
+        with available(self.path):
+            return is_locked(self.path / WRITER)
 
     def bind(self, log_id: str) -> None:
         """Notes that this spool is drained into this log; the spool is made if need be.

@@ -29,6 +29,9 @@ __all__ = ["DatabaseAddress", "BUSY_TIMEOUT_S"]
 BUSY_TIMEOUT_S = 5.0
 """How long a statement waits for another writer before the database counts as away."""
 
+_HARMLESS = frozenset({"host", "port", "user", "ssl"})
+"""Parts of a query that lead to a server and are no secret."""
+
 _WHAT_WORKS = (
     "what works: sqlite:///memory.db (a file here), sqlite:////data/memory.db (a file by its absolute path),"
     " sqlite:// (private, gone when closed)"
@@ -108,6 +111,19 @@ class DatabaseAddress:
         if not self.is_sqlite:
             return postgresql.make_engine(self._url, read_only=read_only, busy_timeout_s=busy_timeout_s)
         return sqlite.make_engine(self.path, read_only=read_only, busy_timeout_s=busy_timeout_s)
+
+    @property
+    def to_type(self) -> str:
+        """The URL without its password, to be used in a command: where a driver may find a password is left out too.
+
+        >>> DatabaseAddress.parse("postgresql://robot:secret@lab/memory?host=/tmp&passfile=x").to_type
+        'postgresql://robot@lab/memory?host=/tmp'
+        """
+        query = {name: value for name, value in self._url.query.items() if name in _HARMLESS}
+        url = URL.create(
+            self._url.drivername, self._url.username, None, self._url.host, self._url.port, self._url.database, query
+        )
+        return url.render_as_string()
 
     def __str__(self) -> str:
         # Without the query as well: drivers take passwords there.

@@ -66,6 +66,7 @@ class Drain:
         settings: Settings,
         backoff: Backoff = PATIENT,
         on_append: Callable[[], None] = lambda: None,
+        on_give_up: Callable[[str], None] = _log.error,
         randomness: Callable[[], float] = random.random,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
@@ -74,6 +75,7 @@ class Drain:
         self._settings = settings
         self._backoff = backoff
         self._on_append = on_append
+        self._on_give_up = on_give_up
         self._randomness = randomness
         self._sleep = sleep
         self._records = self._batches = self._retries = 0
@@ -127,6 +129,11 @@ class Drain:
         return self._appended >= position
 
     @property
+    def appended(self) -> int:
+        """Position of the last record the log was given."""
+        return self._appended
+
+    @property
     def state(self) -> DrainState:
         return DrainState(
             source=self._source.name,
@@ -170,7 +177,7 @@ class Drain:
             self._acknowledged = position
 
     def _give_up(self, reason: str) -> None:
-        _log.error("nothing more is acknowledged to recorder %s: %s", self._source.name, reason)
+        self._on_give_up(f"nothing more is acknowledged to recorder {self._source.name}: {reason}")
         self._source.give_up(reason)
 
     async def _tell(self) -> None:

@@ -1,14 +1,17 @@
-"""What the writer needs of its two ends: a source of synced records, and a log that takes and folds them."""
+"""What the writer needs of its two ends: a source of synced records, and a log that takes and folds them.
+
+`Source` and `Destination` are what a writer beside a plan needs; `Held` and `Shown` what a daemon needs more.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple, Protocol
 
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = ["Source", "Destination"]
+__all__ = ["Source", "Destination", "Held", "LetGo", "Look", "Found", "Shown"]
 
 
 class Source(Protocol):
@@ -57,4 +60,61 @@ class Destination(Protocol):
 
     async def stopped(self) -> Mapping[str, str]:
         """Every episode, by id, that is refused or parked, and why. Stays short however many episodes there are."""
+        ...
+
+
+class Held(Source, Protocol):
+    """One recorder's folder, held by a daemon: nobody else drains it meanwhile."""
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the recorder lives in another process and puts more into it."""
+        ...
+
+    def finish(self) -> None:
+        """Nothing beyond what is synced now is given any more."""
+        ...
+
+    def note_shown(self, position: int, stopped: Mapping[str, str]) -> None:
+        """Everything up to this position shows in the tables, or never will: of the `stopped` episodes, by id."""
+        ...
+
+    def note_away(self, reason: str | None) -> None:
+        """Why the database takes nothing now; None when it does again."""
+        ...
+
+    def let_go(self) -> LetGo:
+        """Leaves it to whoever comes next; what a dead recorder left is deleted if all of it is stored. Blocks."""
+        ...
+
+
+class LetGo(NamedTuple):
+    """What became of a folder, in words; `whole` unless something is left in it that could not be stored."""
+
+    what: str
+    whole: bool
+
+
+class Found(NamedTuple):
+    """What looking round brought: folders to drain, and by name those that cannot be, and why."""
+
+    held: Sequence[Held]
+    failed: Mapping[str, Exception]
+
+
+class Look(Protocol):
+    """Takes hold of every recorder's folder that can be drained, but for those of these names. Reads files: blocks."""
+
+    def __call__(self, but: Collection[str]) -> Found: ...
+
+
+class Shown(Destination, Protocol):
+    """A destination that says what shows in the tables, and folds in steps, so that appending goes on beside it."""
+
+    async def fold_some(self) -> bool:
+        """Shows some of what the tables do not show yet; False if there was nothing. Raises as `fold` does."""
+        ...
+
+    async def behind(self) -> Mapping[str, int]:
+        """By id, how far the tables show each episode of which they do not show all that they ever will."""
         ...

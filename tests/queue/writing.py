@@ -9,7 +9,7 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.config import Settings
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
-from pycrorm_async.queue import RecorderQueue, RecoveredQueue, open_dead
+from pycrorm_async.queue import LiveQueue, RecorderQueue, RecoveredQueue, open_dead
 from pycrorm_async.queue.appender import Appender
 from pycrorm_async.queue.capacity import Capacity
 
@@ -58,8 +58,8 @@ def lost(position: int, number: int, sequence: int) -> Record:
     return record(position, ended(number), sequence, b'{"status":"LOST"}')
 
 
-def make(spool: Path, *, settings: Settings = SMALL, clock: Clock = STILL) -> RecorderQueue:
-    return RecorderQueue.create(spool, settings=settings, clock=clock, recorder=RECORDER)
+def make(spool: Path, *, settings: Settings = SMALL, clock: Clock = STILL, offered: bool = False) -> RecorderQueue:
+    return RecorderQueue.create(spool, settings=settings, clock=clock, recorder=RECORDER, offered=offered)
 
 
 def as_left_by_a_kill(queue: RecorderQueue, spool: Path) -> Path:
@@ -69,7 +69,7 @@ def as_left_by_a_kill(queue: RecorderQueue, spool: Path) -> Path:
     return folder
 
 
-async def drain(queue: RecorderQueue | RecoveredQueue, *, events_max: int = 10_000) -> list[Record]:
+async def drain(queue: RecorderQueue | RecoveredQueue | LiveQueue, *, events_max: int = 10_000) -> list[Record]:
     """All that is left, without acknowledging; a live queue must be closed."""
     records: list[Record] = []
     while batch := await queue.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0):

@@ -1,0 +1,197 @@
+"""`pycrorm status`: who records, who drains, how far the database and its tables are behind, and what is stopped."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from pycrorm_async.adoption import shared_address
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import print_json, print_table, problem, stdout
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import DatabaseError
+from pycrorm_async.queue.folder import DRAIN, available
+from pycrorm_async.queue.locks import is_locked
+from pycrorm_async.queue.progress import Progress
+from pycrorm_async.queue.segment import segment_numbers, segment_path
+from pycrorm_async.queue.spool import RecorderFolder, Spool
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+
+__all__ = ["status", "RecorderState", "EpisodeState"]
+
+
+@dataclass(frozen=True)
+class RecorderState:
+    """One recorder of the spool, as its folder shows it.
+
+    Attributes:
+        name: of its folder, a UUID that sorts by time.
+        alive: whether its process lives.
+        drained: by `itself`, by `another` process, or by `nobody`.
+        synced, stored, folded: positions; None where its own process drains it, or it is dead.
+        bytes_spooled: what its files take; a living one's are allocated ahead.
+        away: why the database takes nothing now, as whoever drains it says.
+        given_up: why nothing more of it is stored.
+        stopped: by id, its episodes that are refused or parked, and why.
+    """
+
+    name: str
+    alive: bool
+    drained: str
+    synced: int | None
+    stored: int | None
+    folded: int | None
+    bytes_spooled: int
+    away: str | None
+    given_up: str | None
+    stopped: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class EpisodeState:
+    """An episode the tables do not show all of, or that is stopped; `lag_s` is the age of what they show next."""
+
+    number: int
+    id: str
+    head: int
+    folded: int
+    lag_events: int
+    lag_s: float | None
+    refused: str | None
+    parked: str | None
+
+
+def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
+    """Say who records, who drains, and how far database and tables are behind. Reads only.
+
+    Exit code 1 if an episode or a recorder is stopped, 3 if the database or the spool is not available.
+    """
+    address = shared_address(url)
+    place = Spool(spool or address.default_spool)
+    recorders = [_recorder(each) for each in place.recorders()]
+    has_daemon = place.has_writer
+    episodes: list[EpisodeState] = []
+    fault: str | None = None
+    try:
+        episodes = asyncio.run(_episodes(address))
+    except DatabaseError as error:
+        fault = str(error)
+    if as_json:
+        print_json(
+            {
+                "url": address.to_type,
+                "spool": place.path,
+                "daemon": has_daemon,
+                "database": fault or "ok",
+                "recorders": recorders,
+                "episodes": episodes,
+            }
+        )
+    else:
+        _print(place, recorders, episodes, has_daemon=has_daemon, known=fault is None)
+    if fault is not None:
+        problem(fault)
+        return 3
+    stopped = [each for each in episodes if each.refused or each.parked]
+    for episode in stopped:
+        problem(f"episode {episode.number} ({episode.id}) is stopped: {episode.refused or episode.parked}")
+    given_up = [each for each in recorders if each.given_up]
+    for recorder in given_up:
+        problem(f"nothing more of recorder {recorder.name} is stored: {recorder.given_up}")
+    return 1 if stopped or given_up else 0
+
+
+def _recorder(folder: RecorderFolder) -> RecorderState:
+    with available(folder.path):
+        locked = is_locked(folder.path / DRAIN)
+        spooled = sum(_size(segment_path(folder.path, number)) for number in _numbers(folder.path))
+        progress = Progress.open(folder.path, writing=False) if folder.alive else None
+        if progress is None:
+            drained = "nobody" if not locked else "itself" if folder.alive else "another"
+            return RecorderState(folder.name, folder.alive, drained, None, None, None, spooled, None, None, {})
+        try:
+            recorded, said = progress.recorded(), progress.drained()
+        finally:
+            progress.close()
+    drained, note = ("another" if locked else "nobody"), said.note
+    return RecorderState(
+        folder.name,
+        folder.alive,
+        drained,
+        recorded.synced,
+        said.stored,
+        said.folded,
+        spooled,
+        note.away if locked else None,
+        note.given_up if locked else None,
+        note.stopped,
+    )
+
+
+def _numbers(folder: Path) -> list[int]:
+    try:
+        return segment_numbers(folder)
+    except FileNotFoundError:  # it was all stored, and is gone since it was listed
+        return []
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
+
+
+async def _episodes(address: DatabaseAddress) -> list[EpisodeState]:
+    log = await EventLog.open(address, create=False)
+    try:
+        found = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
+        now_ns = SYSTEM_CLOCK.wall_ns()
+        states = []
+        for row in (found[number] for number in sorted(found)):
+            following = await log.events(row.number, after=row.folded, limit=1)
+            lag_s = (now_ns - following[0].wall_ns) / 1e9 if following else None
+            lag_events = row.head - row.folded
+            states.append(
+                EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
+            )
+        return states
+    finally:
+        await log.close()
+
+
+def _print(
+    place: Spool, recorders: list[RecorderState], episodes: list[EpisodeState], *, has_daemon: bool, known: bool
+) -> None:
+    if recorders:
+        print_table(
+            f"Recorders below {place.path}",
+            ("recorder", "process", "drained by", "synced", "stored", "folded", "bytes", "database"),
+            [
+                (
+                    each.name,
+                    "alive" if each.alive else "dead",
+                    each.drained,
+                    each.synced,
+                    each.stored,
+                    each.folded,
+                    each.bytes_spooled,
+                    f"away: {each.away}" if each.away else "",
+                )
+                for each in recorders
+            ],
+        )
+    else:
+        stdout.print(f"Nobody records below {place.path}", markup=False)
+    stdout.print("A daemon drains this spool." if has_daemon else "No daemon drains this spool.")
+    if episodes:
+        print_table(
+            "Episodes the tables do not show all of",
+            ("episode", "id", "stored", "folded", "behind", "by s", "stopped"),
+            [(e.number, e.id, e.head, e.folded, e.lag_events, e.lag_s, e.refused or e.parked) for e in episodes],
+        )
+    elif known:
+        stdout.print("The tables show all that is stored.")

@@ -1,0 +1,133 @@
+"""`pycrorm writer`: wires the daemon between a spool and its database."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+
+from pycrorm_async.adoption import open_destination, shared_address
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import PycrormError, SpoolUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.queue.living import LiveQueue
+from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
+from pycrorm_async.queue.spool import RecorderFolder, Spool
+from pycrorm_async.writer.daemon import Daemon, Moved
+from pycrorm_async.writer.ports import Found, Held, LetGo
+
+__all__ = ["serve"]
+
+
+async def serve(
+    url: str,
+    *,
+    spool: Path | None,
+    leave: asyncio.Event,
+    say: Callable[[str], None],
+    settings: Settings | None = None,
+) -> Moved:
+    """Drains every recorder of the spool and folds, until `leave` is set; `say` gets one line for each notable thing.
+
+    Raises `SpoolUnavailable` when another daemon drains this spool, and as `Memory.open` does.
+    """
+    address = shared_address(url)
+    place = Spool(spool or address.default_spool)
+    lock = place.take_writer()
+    if lock is None:
+        raise SpoolUnavailable(place.path, "another `pycrorm writer` drains it already")
+    try:
+        async with open_destination(address, place, clock=SYSTEM_CLOCK) as destination:
+            say(f"draining {place.path} into {address}")
+            look = _Folders(place, destination.log_id)
+            return await Daemon(destination, look, settings=settings or Settings(), say=say).run(leave)
+    finally:
+        lock.release()
+
+
+class _Folders:
+    """Looks round in a spool, and takes hold of what can be drained. Implements the writer's `Look`."""
+
+    def __init__(self, spool: Spool, log_id: str) -> None:
+        self._spool = spool
+        self._log_id = log_id
+
+    def __call__(self, but: Collection[str]) -> Found:
+        held: list[Held] = []
+        failed: dict[str, Exception] = {}
+        folders = [each for each in self._spool.recorders() if each.name not in but]
+        if folders:  # with a folder in it the spool cannot be bound to another log any more
+            self._spool.bind(self._log_id)
+        for folder in folders:
+            try:
+                taken = _take(folder)
+            except PycrormError as error:
+                failed[folder.name] = error
+            else:
+                if taken is not None:
+                    held.append(taken)
+        return Found(held, failed)
+
+
+def _take(folder: RecorderFolder) -> Held | None:
+    if folder.alive:
+        return _Living.take(folder.path)
+    dead = open_dead(folder.path)
+    if dead is None:
+        return None
+    try:
+        dead.seal()
+    except BaseException:
+        dead.release()
+        raise
+    return _Dead(dead)
+
+
+class _Living(LiveQueue):
+    """A living recorder's folder, as the daemon holds it. Implements `Held`."""
+
+    def let_go(self) -> LetGo:
+        is_alive, closed = self.is_alive, self.is_closed
+        self.release()
+        what = "has ended" if closed else "is left at work" if is_alive else "died"
+        return LetGo(what, whole=self.stored == self.given or not is_alive)
+
+
+class _Dead(Held):
+    """What a dead recorder left. Nobody waits there, so nobody is told anything."""
+
+    is_alive = False
+
+    def __init__(self, queue: RecoveredQueue) -> None:
+        self._queue = queue
+
+    @property
+    def name(self) -> str:
+        return self._queue.name
+
+    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+        return await self._queue.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+
+    async def acknowledge(self, position: int) -> None:
+        await self._queue.acknowledge(position)
+
+    def give_up(self, reason: str) -> None:
+        self._queue.give_up(reason)
+
+    def finish(self) -> None:
+        """All of it is there already."""
+
+    def note_shown(self, position: int, stopped: Mapping[str, str]) -> None: ...
+
+    def note_away(self, reason: str | None) -> None: ...
+
+    def let_go(self) -> LetGo:
+        if self._queue.stored < self._queue.last:
+            self._queue.release()
+            return LetGo("is kept", whole=False)
+        self._queue.remove()
+        count = len(self._queue.lost)
+        return LetGo(
+            f"is recovered ({count} episode{'s' * (count != 1)} LOST)" if count else "is recovered", whole=True
+        )

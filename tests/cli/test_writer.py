@@ -1,0 +1,195 @@
+"""`pycrorm writer` as a daemon and `pycrorm status`, as a user meets them: in processes of their own."""
+
+import json
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.databases import ask_to_change
+
+PLAN = '''
+import asyncio, os
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+    async def perform(self): ...
+
+async def plan():
+    """Take three notes."""
+    for text in "abc":
+        await NoteActionPerformable(text).perform()
+
+async def waits():
+    await NoteActionPerformable("a").perform()
+    os.write(1, b"waiting\\n")
+    await asyncio.sleep(600)
+'''
+URL = "sqlite:///pycrorm.db"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "notes.py").write_text(PLAN)
+    return tmp_path
+
+
+def start(*arguments: str, cwd: Path, **settings: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*COMMAND, *arguments],
+        cwd=cwd,
+        env=environment() | settings,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.fixture
+def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    process = start("writer", cwd=folder)
+    assert process.stderr is not None
+    assert process.stderr.readline() == f"draining {folder}/pycrorm.db.spool into {URL}\n"
+    yield process
+    if process.poll() is None:
+        process.kill()
+    process.communicate()
+
+
+def left(process: subprocess.Popen[str], with_signal: int) -> list[str]:
+    """The lines it said until it left, with exit code 0, within the time it names."""
+    process.send_signal(with_signal)
+    _, errors = process.communicate(timeout=15)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    return errors.splitlines()
+
+
+@pytest.mark.parametrize("with_signal", [signal.SIGTERM, signal.SIGINT])
+def test_a_plan_beside_a_daemon_is_in_the_database_when_it_is_over(
+    folder: Path, daemon: subprocess.Popen[str], with_signal: int
+) -> None:
+    done = answer("run", "notes.py", "--writer", "daemon", cwd=folder)
+    assert [(each["number"], each["status"], each["nodes"]) for each in done["episodes"]] == [(1, "SUCCEEDED", 4)]
+    [appeared, ended, goodbye] = left(daemon, with_signal)
+    name = appeared.split()[1]
+    assert appeared == f"recorder {name} appeared"
+    assert ended == f"recorder {name} has ended; 11 events stored"
+    assert goodbye == "left after 11 events of 1 recorders"
+    assert [path for path in (folder / "pycrorm.db.spool").iterdir() if path.is_dir()] == []
+
+
+def test_who_writes_can_be_said_by_the_environment_and_without_a_daemon_nothing_is_lost(folder: Path) -> None:
+    process = start("run", "notes.py", cwd=folder, PYCRORM_WRITER="daemon")
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, output) == (0, "")
+    assert "11 events are safe in" in " ".join(errors.split())
+    assert "start `pycrorm writer`" in " ".join(errors.split())
+    assert not (folder / "pycrorm.db").exists()
+    document = answer("status", cwd=folder, code=3)
+    [recorder] = document["recorders"]
+    assert (recorder["alive"], recorder["drained"], document["daemon"]) == (False, "nobody", False)
+    assert "does not exist" in document["database"]
+    assert answer("writer", "--once", cwd=folder)["events_stored"] == 11
+    assert len(answer("episodes", cwd=folder)) == 1
+
+
+def test_a_second_daemon_is_one_line_and_exit_code_3(folder: Path, daemon: subprocess.Popen[str]) -> None:
+    done = pycrorm("writer", cwd=folder)
+    assert done.returncode == 3
+    assert one_line_of(done) == (
+        f"pycrorm: spool {folder}/pycrorm.db.spool: another `pycrorm writer` drains it already"
+    )
+    assert pycrorm("writer", "--once", cwd=folder).returncode == 0
+
+
+def test_a_plan_killed_beside_a_daemon_is_recovered_by_it(folder: Path, daemon: subprocess.Popen[str]) -> None:
+    plan = start("run", "notes.py:waits", "--writer", "daemon", cwd=folder)
+    assert plan.stdout is not None
+    assert plan.stdout.readline() == "waiting\n"
+    [recorder] = until(folder, lambda document: [r for r in document["recorders"] if r["folded"]])
+    assert (recorder["alive"], recorder["drained"]) == (True, "another")
+    assert recorder["synced"] == recorder["stored"] == recorder["folded"]
+    plan.kill()
+    plan.communicate()
+    until(folder, lambda document: not document["recorders"])
+    lines = left(daemon, signal.SIGTERM)
+    assert [line.split(" ", 2)[2] for line in lines[:4]] == [
+        "appeared",
+        f"died; {recorder['stored']} events stored",
+        "is dead: recovering what it left",
+        f"is recovered (1 episode LOST); {recorder['stored'] + 1} events stored",
+    ]
+    assert [each["status"] for each in answer("episodes", cwd=folder)] == ["LOST"]
+
+
+def until(folder: Path, wanted: Any) -> Any:
+    """What this finds in the status, as soon as it finds anything."""
+    deadline = time.monotonic() + 60
+    while True:
+        done = pycrorm("status", "--json", cwd=folder)
+        found = wanted(json.loads(done.stdout))
+        if found:
+            return found
+        assert time.monotonic() < deadline, done.stdout
+
+
+def test_a_writing_plan_of_its_own_is_left_alone(folder: Path, daemon: subprocess.Popen[str]) -> None:
+    plan = start("run", "notes.py:waits", cwd=folder)
+    assert plan.stdout is not None
+    assert plan.stdout.readline() == "waiting\n"
+    time.sleep(1.2)  # the daemon looks round twice
+    [recorder] = answer("status", cwd=folder)["recorders"]
+    assert (recorder["alive"], recorder["drained"], recorder["synced"]) == (True, "itself", None)
+    plan.send_signal(signal.SIGINT)
+    plan.communicate(timeout=60)
+    assert left(daemon, signal.SIGTERM) == ["left after 0 events of 0 recorders"]
+
+
+def test_status_says_what_is_stopped_and_how_far_the_tables_are_behind(folder: Path) -> None:
+    assert pycrorm("run", "notes.py", cwd=folder).returncode == 0
+    document = answer("status", cwd=folder)
+    assert (document["recorders"], document["episodes"], document["database"]) == ([], [], "ok")
+    assert "The tables show all that is stored." in pycrorm("status", cwd=folder).stdout
+    ask_to_change(f"sqlite:///{folder}/pycrorm.db", "UPDATE episode SET folded = 4")
+    [behind] = answer("status", cwd=folder)["episodes"]
+    assert (behind["head"], behind["folded"], behind["lag_events"]) == (10, 4, 6)
+    assert 0 < behind["lag_s"] < 300
+    ask_to_change(f"sqlite:///{folder}/pycrorm.db", "UPDATE episode SET parked = 'a column is in the way'")
+    [stopped] = answer("status", cwd=folder, code=1)["episodes"]
+    assert stopped["parked"] == "a column is in the way"
+    done = pycrorm("status", cwd=folder)
+    assert done.returncode == 1
+    assert one_line_of(done).endswith("is stopped: a column is in the way")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "line"),
+    [
+        (["writer", "--url", "sqlite://"], 2, "sqlite:// is gone with its process"),
+        (["status", "--url", "sqlite://"], 2, "sqlite:// is gone with its process"),
+        (["run", "notes.py", "--url", "sqlite://", "--writer", "daemon"], 2, "no daemon can write it"),
+        (["writer", "--url", "sqlite:////no/such/folder/x.db", "--spool", "s"], 3, "/no/such/folder"),
+        (["status", "--url", "sqlite:///none.db"], 3, "none.db does not exist"),
+    ],
+)
+def test_bad_input_is_one_line(folder: Path, arguments: list[str], code: int, line: str) -> None:
+    done = pycrorm(*arguments, cwd=folder)
+    assert done.returncode == code
+    assert line in one_line_of(done)
+
+
+def test_no_verb_shows_a_password(folder: Path) -> None:
+    url = "postgresql://robot:topsecret@127.0.0.1:1/memory?passfile=topsecret"
+    for verb in ("episodes", "status", "writer", "demo"):
+        done = pycrorm(verb, "--url", url, "--spool", "s", cwd=folder)
+        assert done.returncode == 3
+        assert "topsecret" not in done.stdout + done.stderr

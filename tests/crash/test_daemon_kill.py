@@ -1,0 +1,121 @@
+"""Daemons and plans killed with SIGKILL again and again: every step a plan did is remembered once and in its place."""
+
+import random
+import sqlite3
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.crash.robots import Lab
+from tests.databases import Server, server_in
+
+
+def kill_again_and_again(lab: Lab, *, robots: int, kills: int) -> None:
+    for robot in [lab.start_robot() for _ in range(robots)]:
+        robot.wait_until_it_walks()
+    for _ in range(kills):
+        lab.start_daemon()
+        if lab.rng.random() < 0.5:
+            lab.kill_robot()
+            lab.start_robot()
+        # Python takes a second to begin with; what comes before it drains anything is worth few of the kills.
+        time.sleep(0.7 + lab.rng.random() ** 2 * 1.5)
+        lab.kill_daemon()
+    lab.start_daemon()
+    lab.wait_for_log("draining")
+    lab.kill_robot()
+    lab.stop_robots()
+    assert lab.stop_daemon() == 0
+    lab.prove_that_everything_is_there_once_and_in_order()
+
+
+def test_daemons_and_plans_are_killed_and_every_step_is_there_once(database_url: str, tmp_path: Path) -> None:
+    lab = Lab(tmp_path, database_url, random.randrange(2**31))
+    try:
+        kill_again_and_again(lab, robots=3, kills=2)
+    finally:
+        lab.clear()
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("round_", range(5))
+def test_daemons_and_plans_are_killed_a_hundred_times(database_url: str, tmp_path: Path, round_: int) -> None:
+    lab = Lab(tmp_path, database_url, random.randrange(2**31))
+    try:
+        kill_again_and_again(lab, robots=5, kills=20)
+    finally:
+        lab.clear()
+
+
+@pytest.fixture
+def own_server() -> Iterator[Server]:
+    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder)) as running:
+        yield running
+
+
+def test_a_server_that_is_stopped_and_started_under_load_costs_nothing(own_server: Server, tmp_path: Path) -> None:
+    lab = Lab(tmp_path, own_server.new_database(), random.randrange(2**31))
+    try:
+        robots = [lab.start_robot() for _ in range(2)]
+        lab.start_daemon()
+        for robot in robots:
+            robot.wait_until_it_walks()
+        lab.wait_for_log("appeared")
+        own_server.stop()
+        lab.wait_for_log("the database is away")
+        own_server.start()
+        lab.wait_for_log("the database is back")
+        lab.stop_robots()
+        assert lab.stop_daemon() == 0
+        lab.prove_that_everything_is_there_once_and_in_order()
+    finally:
+        lab.clear()
+
+
+def test_a_file_that_another_program_locks_for_a_while_costs_nothing(tmp_path: Path) -> None:
+    lab = Lab(tmp_path, f"sqlite:///{tmp_path / 'memory.db'}", random.randrange(2**31))
+    try:
+        robot = lab.start_robot()
+        lab.start_daemon()
+        robot.wait_until_it_walks()
+        lab.wait_for_log("appeared")
+        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None, timeout=30)
+        other.execute("BEGIN EXCLUSIVE")
+        lab.wait_for_log("the database is away: sqlite:////")
+        other.execute("COMMIT")
+        other.close()
+        lab.wait_for_log("the database is back")
+        lab.stop_robots()
+        assert lab.stop_daemon() == 0
+        lab.prove_that_everything_is_there_once_and_in_order()
+    finally:
+        lab.clear()
+
+
+@pytest.mark.soak
+def test_two_daemons_of_two_spools_fold_into_one_server_without_hindering_each_other(
+    own_server: Server, tmp_path: Path
+) -> None:
+    url, seed = own_server.new_database(), random.randrange(2**31)
+    labs = [Lab(tmp_path / name, url, seed + number) for number, name in enumerate(("one", "two"))]
+    try:
+        for lab in labs:
+            lab.folder.mkdir()
+            lab.start_daemon()
+            for prefix in ("a", "b"):
+                lab.start_robot(f"{lab.folder.name}.{prefix}").wait_until_it_walks()
+        time.sleep(20)
+        for lab in labs:
+            lab.stop_robots()
+            assert lab.stop_daemon() == 0
+            assert "tables cannot" not in lab.log.read_text()
+            assert "away" not in lab.log.read_text()
+        labs[0].gone += labs[1].gone
+        labs[0].prove_that_everything_is_there_once_and_in_order()
+        assert [path.name for path in labs[1].spool.iterdir() if path.is_dir()] == []
+    finally:
+        for lab in labs:
+            lab.clear()

@@ -1,0 +1,87 @@
+"""The file `progress`: what one side says the other reads whole, or not at all."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.queue.progress import Drained, Note, Progress, Recorded
+
+SAID = Drained(7, 5, Note(given_up="refused", away="locked", stopped={"an episode": "why"}))
+
+
+def both(folder: Path) -> tuple[Progress, Progress]:
+    made = Progress.make(folder)
+    opened = Progress.open(folder, writing=True)
+    assert opened is not None
+    return made, opened
+
+
+def test_each_side_reads_what_the_other_said_last(tmp_path: Path) -> None:
+    recorder, drainer = both(tmp_path)
+    assert (drainer.recorded(), recorder.drained()) == (Recorded(0, closed=False), Drained(0, 0, Note()))
+    recorder.tell_recorded(Recorded(2**63, closed=True))
+    drainer.tell_drained(SAID)
+    assert drainer.recorded() == Recorded(2**63, closed=True)
+    assert recorder.drained() == SAID
+    drainer.tell_drained(Drained(8, 8))
+    assert recorder.drained() == Drained(8, 8, Note())
+
+
+def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_path: Path) -> None:
+    recorder, drainer = both(tmp_path)
+    recorder.tell_recorded(Recorded(1000, closed=False))
+    drainer.tell_drained(SAID)
+    before = (tmp_path / "progress").read_bytes()
+    recorder.tell_recorded(Recorded(2**40 + 77, closed=True))
+    drainer.tell_drained(Drained(2**40, 2**33, Note(given_up="another reason")))
+    after = (tmp_path / "progress").read_bytes()
+    changed = [place for place in range(len(after)) if before[place] != after[place]]
+    for place in changed:
+        torn = after[:place] + before[place:]
+        (tmp_path / "progress").write_bytes(torn)  # the same file: both sides have it open
+        reader = Progress.open(tmp_path, writing=False)
+        assert reader is not None
+        assert reader.recorded() in (Recorded(), Recorded(1000), Recorded(2**40 + 77, closed=True))
+        assert reader.drained() in (Drained(), SAID, Drained(2**40, 2**33, Note(given_up="another reason")))
+        reader.close()
+    (tmp_path / "progress").write_bytes(before)
+    assert (drainer.recorded(), recorder.drained()) == (Recorded(1000), SAID)
+    (tmp_path / "progress").write_bytes(before[:70] + b"\xff" + before[71:132] + b"\xff" + before[133:])
+    assert (drainer.recorded(), recorder.drained()) == (Recorded(1000), SAID)
+
+
+def test_a_file_that_is_cut_while_both_use_it_kills_nobody(tmp_path: Path) -> None:
+    recorder, drainer = both(tmp_path)
+    recorder.tell_recorded(Recorded(3))
+    drainer.tell_drained(SAID)
+    assert (drainer.recorded(), recorder.drained()) == (Recorded(3), SAID)
+    os.truncate(tmp_path / "progress", 0)
+    assert (drainer.recorded(), recorder.drained()) == (Recorded(3), SAID)
+    recorder.tell_recorded(Recorded(4))
+    assert drainer.recorded() == Recorded(4)
+
+
+@pytest.mark.parametrize("size", [0, 8, 16, 100, 4095])
+def test_a_short_file_and_one_of_another_format_are_as_good_as_none(tmp_path: Path, size: int) -> None:
+    assert Progress.open(tmp_path, writing=True) is None
+    Progress.make(tmp_path).close()
+    whole = (tmp_path / "progress").read_bytes()
+    assert len(whole) == 4096
+    (tmp_path / "progress").write_bytes(whole[:size])
+    assert Progress.open(tmp_path, writing=True) is None
+    (tmp_path / "progress").write_bytes(whole[:8] + b"\x02" + whole[9:])
+    assert Progress.open(tmp_path, writing=True) is None
+
+
+def test_a_note_that_is_too_long_is_cut_and_the_numbers_are_said(tmp_path: Path) -> None:
+    recorder, drainer = both(tmp_path)
+    stopped = {f"episode {number}": "é" * 10_000 for number in range(1000)}
+    drainer.tell_drained(Drained(9, 8, Note(given_up="ü" * 10_000, stopped=stopped)))
+    said = recorder.drained()
+    assert (said.stored, said.folded) == (9, 8)
+    assert said.note.given_up == "ü" * 300
+    assert said.note.stopped
+    assert set(said.note.stopped.values()) == {"é" * 300}
+    drainer.tell_drained(Drained(9, 8, Note(given_up="\U0001f916" * 10_000, away="\U0001f916" * 10_000)))
+    assert recorder.drained().note.given_up == "\U0001f916" * 300
