@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
+import os
+import signal
 import sqlite3
 import threading
 import warnings
@@ -20,9 +23,24 @@ __all__ = ["Server", "server_in", "ask", "ask_to_change"]
 class Server:
     """A running PostgreSQL server that is ours alone."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, handle: Any) -> None:
         self.folder: Final = folder
+        self._handle = handle
         self._numbers = itertools.count(1)
+
+    def kill(self) -> None:
+        """Every process of it dies at once, as when the machine's memory is full; `start` brings it back."""
+        postmaster = self._handle.get_postmaster_info().process
+        processes = [postmaster, *postmaster.children(recursive=True)]
+        for each in processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(each.pid, signal.SIGKILL)
+        for each in processes:
+            each.wait(10)
+
+    def start(self) -> None:
+        """Starts it again; returns when it answers."""
+        self._handle.ensure_postgres_running()
 
     def url(self, database: str = "postgres", *, user: str = "postgres", password: str = "") -> str:
         who = f"{user}:{password}" if password else user
@@ -44,7 +62,7 @@ def server_in(folder: Path) -> Iterator[Server]:
 
         server = get_server(str(folder))
     try:
-        yield Server(folder)
+        yield Server(folder, server)
     finally:
         server.cleanup()
 
