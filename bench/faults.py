@@ -1,6 +1,6 @@
 """What faults cost: each is made again and again, and what is found is compared with what was acknowledged.
 
-    python -m bench.faults               the long version: 10,000 kills, 2,000 power cuts, … about an hour
+    python -m bench.faults               the long version: 10,000 kills, 2,000 power cuts, … about two hours
     python -m bench.faults --quick       less than a minute
     python -m bench.faults --only power  the faults whose name holds this word
 
@@ -15,6 +15,7 @@ import random
 import sys
 import tempfile
 import time
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -99,7 +100,11 @@ def _made(fault: Fault, rounds: int, seed: int, folder: Path, progress: Progress
     place = Path(tempfile.mkdtemp(dir=folder))
     began = time.perf_counter()
     # Each with its own numbers, so that one fault alone goes as it did among the others.
-    outcome = fault.make(rounds, random.Random(f"{seed} {fault.name}"), place, lambda: progress.advance(bar))
+    try:
+        outcome = fault.make(rounds, random.Random(f"{seed} {fault.name}"), place, lambda: progress.advance(bar))
+    except Exception as error:  # noqa: BLE001  what a fault may bring out is for the table, and the others go on
+        traceback.print_exc()
+        outcome = Outcome(broke=f"{type(error).__name__}: {error}")
     took_s = time.perf_counter() - began
     progress.update(bar, total=outcome.rounds, completed=outcome.rounds)
     return outcome, took_s
@@ -117,6 +122,7 @@ def _tell(name: str, seed: int, outcome: Outcome, took_s: float) -> None:
         "misordered": outcome.misordered,
         "changed": outcome.changed,
         "told": outcome.told,
+        "broke": outcome.broke,
         "rounds_failed": outcome.rounds_failed[:20],
         "took_s": round(took_s, 1),
         "note": outcome.note,
@@ -145,7 +151,7 @@ def _table(outcomes: dict[str, tuple[Outcome, float]], seed: int) -> Table:
             outcome.changed,
             outcome.told,
         )
-        table.add_row(name, *(f"{each:,}" for each in numbers), outcome.note, style=bad)
+        table.add_row(name, *(f"{each:,}" for each in numbers), outcome.broke or outcome.note, style=bad)
     return table
 
 

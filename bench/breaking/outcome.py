@@ -27,6 +27,7 @@ class Outcome:
         misordered: found at another place of its episode than it was put at, or behind a gap.
         changed: found and never put, or put with other content.
         told: acknowledged, not found, and named one by one by a repair: damage, not a crash.
+        broke: an error that ended the rounds early.
         note: what else a reader should know.
     """
 
@@ -37,12 +38,13 @@ class Outcome:
     misordered: int = 0
     changed: int = 0
     told: int = 0
+    broke: str | None = None
     note: str = ""
     rounds_failed: list[int] = field(default_factory=list)
 
     @property
     def clean(self) -> bool:
-        return not (self.lost or self.duplicated or self.misordered or self.changed)
+        return not (self.lost or self.duplicated or self.misordered or self.changed or self.broke)
 
     def compare(
         self, acknowledged: Iterable[Event], found: Iterable[Event], *, put: Iterable[Event] = (), told: int = 0
