@@ -91,6 +91,7 @@ def _print(report: SpoolReport) -> None:
             "log": report.log_id or "none yet: nothing was ever drained from it",
             "recorders": str(len(report.recorders)),
             "aside": ", ".join(report.set_aside),
+            "half made or removed": ", ".join(report.unfinished),
         },
     )
     if report.recorders:

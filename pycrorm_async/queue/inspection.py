@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
@@ -19,10 +20,21 @@ from pycrorm_async.queue.scan import Kept, Survey, survey
 from pycrorm_async.queue.segment import segment_numbers, segment_path
 from pycrorm_async.queue.spool import RecorderFolder, Spool
 
-__all__ = ["SET_ASIDE", "SpoolReport", "RecorderReport", "SegmentReport", "OpenEpisode", "Damage", "inspect_spool"]
+__all__ = [
+    "SET_ASIDE",
+    "MENDED",
+    "SpoolReport",
+    "RecorderReport",
+    "SegmentReport",
+    "OpenEpisode",
+    "Damage",
+    "inspect_spool",
+]
 
-SET_ASIDE = ".damaged"
+SET_ASIDE: Final = ".damaged"
 """What `repair` adds to the name of a folder it has put aside."""
+MENDED: Final = f".mended{MAKING}"
+"""What it adds to that of the new one until it is whole."""
 
 _LOOKS = 20
 
@@ -108,6 +120,7 @@ class SpoolReport:
         log_id: id of the log of the database it belongs to; None if nobody drained it yet.
         recorders: oldest first.
         set_aside: folders that `repair` put aside.
+        unfinished: folders that were being made or removed when a process was killed; nothing is in them.
         strangers: what lies here and is not ours.
     """
 
@@ -115,6 +128,7 @@ class SpoolReport:
     log_id: str | None
     recorders: tuple[RecorderReport, ...]
     set_aside: tuple[str, ...]
+    unfinished: tuple[str, ...]
     strangers: tuple[str, ...]
 
 
@@ -127,6 +141,7 @@ def inspect_spool(path: Path) -> SpoolReport:
     recorders, log_id = spool.recorders(), spool.log_id()
     others = spool.strangers()
     aside = [each for each in others if is_set_aside(each)]
+    unfinished = [each for each in others if _is_unfinished(each)]
     if log_id is None and not recorders and not aside:
         raise SpoolUnavailable(path, "is not a spool: no recorder's folder is in it, and no note of a database")
     return SpoolReport(
@@ -134,18 +149,31 @@ def inspect_spool(path: Path) -> SpoolReport:
         log_id,
         tuple(inspect_recorder(each) for each in recorders),
         tuple(each.name for each in aside),
-        tuple(each.name for each in others if each not in aside),
+        tuple(each.name for each in unfinished),
+        tuple(each.name for each in others if each not in [*aside, *unfinished]),
     )
 
 
 def is_set_aside(path: Path) -> bool:
     """Whether `repair` put this folder aside."""
     name, suffix, number = path.name.partition(SET_ASIDE)
+    return _is_name(name) and bool(suffix) and (not number or number[1:].isdigit()) and path.is_dir()
+
+
+def _is_unfinished(path: Path) -> bool:
+    """A recorder's folder without its `alive`, the last file to go, or under the name it has before it is whole."""
+    name, suffix, rest = path.name.partition(".")
+    if not _is_name(name) or not path.is_dir():
+        return False
+    return f".{rest}" in (MAKING, MENDED) if suffix else not any(path.iterdir())
+
+
+def _is_name(name: str) -> bool:
     try:
         parse_episode_id(name)
     except ValueError:
         return False
-    return bool(suffix) and (not number or number[1:].isdigit()) and path.is_dir()
+    return True
 
 
 def inspect_recorder(recorder: RecorderFolder) -> RecorderReport:

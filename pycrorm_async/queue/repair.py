@@ -13,20 +13,17 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from pycrorm_async.errors import InternalError, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text, parse_episode_id
-from pycrorm_async.queue.folder import ALIVE, DRAIN, MAKING, available
-from pycrorm_async.queue.inspection import SET_ASIDE, Damage
+from pycrorm_async.queue.folder import ALIVE, DRAIN, available
+from pycrorm_async.queue.inspection import MENDED, SET_ASIDE, Damage
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.rescue import Range, Rescue, ranges
 from pycrorm_async.queue.scan import Survey, scan, survey
 from pycrorm_async.queue.segment import sync_folder
 
 __all__ = ["RepairReport", "GivenUp", "repair_folder", "finish_repairs"]
-
-MENDED: Final = ".mended" + MAKING
 
 
 @dataclass(frozen=True)

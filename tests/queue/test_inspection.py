@@ -145,8 +145,11 @@ def test_a_foreign_file_and_a_stranger_are_named(author: Author) -> None:
     (author.folder / "00000001.segment.tail").touch()
     (author.folder.parent / "readme").touch()
     (author.folder.parent / "photos.damaged").mkdir()
+    for name in ("01234567-0000-7000-8000-000000000000", "01234567-0000-7000-8000-000000000001.making"):
+        (author.folder.parent / name).mkdir()
     report = inspect_spool(author.folder.parent)
     assert report.strangers == ("photos.damaged", "readme")
+    assert [name[-8:] for name in report.unfinished] == ["00000000", "1.making"]
     assert report.recorders[0].foreign == ("notes.txt",)
     assert report.recorders[0].cut_off == ("00000001.segment.tail",)
     assert report.recorders[0].records == 1
