@@ -15,6 +15,8 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.append import append_batch
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from pycrorm_async.store.postgresql.tables import MIGRATIONS
@@ -97,6 +99,8 @@ async def test_a_migration_that_fails_leaves_the_log_as_it_was(database_url: str
 OPENER = """
 import asyncio, sys
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.append import append_batch
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -320,4 +324,27 @@ async def test_two_that_append_the_same_episodes_in_opposite_order_do_not_wait_i
     assert [each.head for each in await log.episodes()] == [21, 21]
     ask(database_url, "ALTER SYSTEM RESET deadlock_timeout")
     ask(database_url, "SELECT pg_reload_conf()")
+    await log.close()
+
+
+async def test_nothing_is_skipped_when_an_earlier_number_is_committed_later(database_url: str) -> None:
+    address = DatabaseAddress.parse(database_url)
+    log = await EventLog.open(address, create=True)
+    projector = Projector(log)
+    await projector.open()
+    slow = await log.engine.connect()
+    transaction = await slow.begin()
+    assert await append_batch(dialect_of(slow), slow, [started(1)]) == {}  # has its number, and is not committed
+    assert await log.append([started(2)]) == {}
+    rolled_back = await asyncpg.connect(database_url)
+    await rolled_back.execute("SELECT nextval('pycrorm.episode_number')")  # a number that nobody will have
+    await rolled_back.close()
+    assert await log.append([started(3)]) == {}
+    assert await projector.fold_behind() == 2
+    await transaction.commit()
+    await slow.close()
+    assert await projector.fold_behind() == 1
+    rows = ask(database_url, "SELECT number, head, folded FROM episode ORDER BY number")
+    assert rows == [(1, 1, 1), (2, 1, 1), (4, 1, 1)]
+    assert ask(database_url, "SELECT count(*) FROM memory.process_metadata") == [(3,)]
     await log.close()
