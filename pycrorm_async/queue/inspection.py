@@ -36,6 +36,8 @@ SET_ASIDE: Final = ".damaged"
 MENDED: Final = f".mended{MAKING}"
 """What it adds to that of the new one until it is whole."""
 
+_PROGRESS = "progress"
+"""How far another process has drained a living recorder's folder."""
 _LOOKS = 20
 
 
@@ -212,7 +214,7 @@ class _Count:
 def _looked_at(recorder: RecorderFolder, *, being_drained: bool) -> RecorderReport:
     folder = recorder.path
     count, (kept, damage, _) = _surveyed(folder, changing=recorder.alive or being_drained)
-    ours = {ALIVE, DRAIN, *(segment_path(folder, number).name for number in kept.numbers)}
+    ours = {ALIVE, DRAIN, _PROGRESS, *(segment_path(folder, number).name for number in kept.numbers)}
     others = sorted(each.name for each in folder.iterdir() if each.name not in ours)
     return RecorderReport(
         recorder.name,

@@ -27,7 +27,7 @@ from pycrorm_async.queue.segment import (
     segment_path,
 )
 
-__all__ = ["Kept", "Survey", "scan", "survey", "whole_frames"]
+__all__ = ["Kept", "Survey", "scan", "survey", "whole_frames", "checked_header"]
 
 _SALT_OFFSET = HEADER_BYTES - 8
 
@@ -114,7 +114,7 @@ class _Walk:
         """Goes through one segment; False if it does not go on where the one before ended."""
         path = segment_path(self._folder, number)
         buffer = path.read_bytes()
-        header = _header(path, buffer, recorder=self._recorder, number=number)
+        header = checked_header(path, buffer, recorder=self._recorder, number=number)
         if not self._bases:
             if header is None and number > 1:
                 raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are gone")
@@ -176,7 +176,8 @@ class _Walk:
         self._unsaid = self._unsaid[len(covered) :]
 
 
-def _header(path: Path, buffer: bytes, *, recorder: bytes, number: int) -> SegmentHeader | None:
+def checked_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
+    """The header of a segment; None if it was never begun, or torn. Raises `SpoolForeign` for one that is not ours."""
     written_in = format_of(buffer)
     if written_in is not None and written_in > FORMAT:
         raise SpoolForeign(f"{path} is in format {written_in} of a newer program; this one reads format {FORMAT}")
