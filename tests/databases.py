@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
+import os
+import signal
 import sqlite3
 import threading
 import warnings
@@ -46,6 +49,16 @@ class Server:
     def start(self) -> None:
         """Again, with the same databases."""
         self._server.ensure_postgres_running()
+
+    def kill(self) -> None:
+        """Every process of it dies at once, as when the machine's memory is full."""
+        postmaster = self._server.get_postmaster_info().process
+        processes = [postmaster, *postmaster.children(recursive=True)]
+        for each in processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(each.pid, signal.SIGKILL)
+        for each in processes:
+            each.wait(10)
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from typing import Any
 import typer
 from rich.logging import RichHandler
 
-from pycrorm_async.cli import demo, episodes, run, show, status, writer
+from pycrorm_async.cli import demo, episodes, run, show, spool, status, writer
 from pycrorm_async.cli.output import problem, stderr
 from pycrorm_async.errors import (
     CallerError,
@@ -90,6 +90,11 @@ _VERBS: dict[str, Callable[..., int | None]] = {
 }
 for _name, _verb in _VERBS.items():
     app.command(_name)(_told_in_a_line(_verb))
+
+_spool = typer.Typer(help="Look into the write-ahead queue's files, and mend damaged ones.", no_args_is_help=True)
+_spool.command("inspect")(_told_in_a_line(spool.inspect))
+_spool.command("repair")(_told_in_a_line(spool.repair))
+app.add_typer(_spool, name="spool")
 
 
 def main() -> None:

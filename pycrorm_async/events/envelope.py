@@ -7,11 +7,14 @@ database, always the same payload bytes.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = ["Heading", "Record"]
+__all__ = ["Heading", "Record", "LOST", "is_computed_end"]
+
+LOST: Final = b'{"status":"LOST"}'
+"""The payload of the end that recovery computes for an episode left open, version 1 of `EpisodeEnded` for ever."""
 
 
 class Heading(NamedTuple):
@@ -44,3 +47,8 @@ class Record(NamedTuple):
     wall_ns: int
     monotonic_ns: int
     payload: bytes
+
+
+def is_computed_end(record: Record) -> bool:
+    """Whether recovery made this end up: it says how far its folder knew, and not that nothing came after."""
+    return record.type == "EpisodeEnded" and record.payload == LOST

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Final
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.queue.folder import ALIVE, DRAIN, TAIL, available, remove_folder, write_safely
 from pycrorm_async.queue.frame import Buffer
@@ -19,10 +18,7 @@ from pycrorm_async.queue.reader import Reader
 from pycrorm_async.queue.scan import Kept, scan
 from pycrorm_async.queue.segment import CLOSES, segment_path, sync_folder
 
-__all__ = ["LOST", "RecoveredQueue", "open_dead"]
-
-LOST: Final = b'{"status":"LOST"}'
-"""The payload of a computed end, version 1 of `EpisodeEnded` for ever."""
+__all__ = ["RecoveredQueue", "open_dead"]
 
 
 def open_dead(folder: Path) -> RecoveredQueue | None:

@@ -6,7 +6,7 @@ once: that is damage and raises. Ordinary records behind the hole prove nothing,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ from pycrorm_async.queue.segment import (
     segment_path,
 )
 
-__all__ = ["Kept", "scan", "checked_header"]
+__all__ = ["Kept", "Survey", "scan", "survey", "whole_frames", "checked_header"]
 
 _SALT_OFFSET = HEADER_BYTES - 8
 
@@ -50,28 +50,54 @@ class Kept(NamedTuple):
     numbers: list[int]
 
 
+class Survey(NamedTuple):
+    """What is whole before the damage, if there is any.
+
+    Attributes:
+        kept: all that stands before the damage.
+        damage: where it begins and what it is, or None.
+        unsaid: the checksums of the last kept records, those that no commit frame covers.
+    """
+
+    kept: Kept
+    damage: SpoolDamaged | None
+    unsaid: tuple[int, ...]
+
+
 def scan(folder: Path, recorder: bytes) -> Kept:
     """Looks at every byte of the folder's segments once.
 
     Raises `SpoolDamaged` with file and offset, `SpoolForeign` for a segment of a newer format or another recorder, and
     `OSError`.
     """
-    numbers = segment_numbers(folder)
-    walk = _Walk(folder, recorder)
-    for number in numbers:
-        if not walk.enter(number):
-            break
-    kept = walk.kept(numbers)
-    _refuse_damage(folder, recorder, kept)
+    kept, damage, _ = survey(folder, recorder)
+    if damage is not None:
+        raise damage
     return kept
+
+
+def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] = lambda *_: None) -> Survey:
+    """What `scan` looks at, with damage as an answer. `seen` is told of each kept frame and its segment's number."""
+    numbers = segment_numbers(folder)
+    walk = _Walk(folder, recorder, seen)
+    damage: SpoolDamaged | None = None
+    try:
+        for number in numbers:
+            if not walk.enter(number):
+                break
+        _refuse_damage(folder, recorder, walk.kept(numbers))
+    except SpoolDamaged as found:
+        damage = found
+    return Survey(walk.kept(numbers), damage, walk.unsaid)
 
 
 class _Walk:
     """Goes from the oldest segment to the first hole."""
 
-    def __init__(self, folder: Path, recorder: bytes) -> None:
+    def __init__(self, folder: Path, recorder: bytes, seen: Callable[[int, Frame], None]) -> None:
         self._folder = folder
         self._recorder = recorder
+        self._seen = seen
         self._start = self._cut = Cursor(0, 0, 0)
         self._bases: dict[int, int] = {}
         self._open: dict[EpisodeId, Last] = {}
@@ -79,6 +105,10 @@ class _Walk:
 
     def kept(self, numbers: list[int]) -> Kept:
         return Kept(self._start, self._cut, self._bases, self._open, numbers)
+
+    @property
+    def unsaid(self) -> tuple[int, ...]:
+        return tuple(self._unsaid)
 
     def enter(self, number: int) -> bool:
         """Goes through one segment; False if it does not go on where the one before ended."""
@@ -109,12 +139,16 @@ class _Walk:
             else:
                 break
             self._cut = Cursor(number, self._cut.offset + frame.size, position)
+            self._seen(number, frame)
         return True
 
     def _keep(self, path: Path, frame: Frame) -> None:
+        if frame.kind == EVENT:
+            self._follow(path, frame)
         self._unsaid.append(frame.checksum)
-        if frame.kind != EVENT:
-            return
+
+    def _follow(self, path: Path, frame: Frame) -> None:
+        """The event is the next one of its episode."""
         episode = EpisodeId(frame.episode)
         before = self._open.get(episode)
         if frame.sequence != (before.sequence if before else 0) + 1:
@@ -133,14 +167,13 @@ class _Walk:
         if later < 0:
             raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was safe and is missing")
         covered = self._unsaid[: max(0, len(self._unsaid) - later)]
+        if len(covered) >= frame.sequence:  # else segments with records it covers are stored and gone
+            checksum = 0
+            for each in covered:
+                checksum = chain(each, checksum)
+            if len(covered) != frame.sequence or frame.payload != CHECKSUM.pack(checksum):
+                raise SpoolDamaged(path, self._cut.offset, "the records before are not those that were safe here")
         self._unsaid = self._unsaid[len(covered) :]
-        if len(covered) < frame.sequence:
-            return  # segments with records it covers are stored and gone
-        checksum = 0
-        for each in covered:
-            checksum = chain(each, checksum)
-        if len(covered) != frame.sequence or frame.payload != CHECKSUM.pack(checksum):
-            raise SpoolDamaged(path, self._cut.offset, "the records before are not those that were safe here")
 
 
 def checked_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
@@ -154,6 +187,19 @@ def checked_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) 
     return header
 
 
+def whole_frames(buffer: Buffer, start: int, salt: int) -> Iterator[tuple[int, Frame]]:
+    """Every frame from `start` on and its offset, whatever lies between them."""
+    salted = CHECKSUM.pack(salt)
+    end = start
+    found = buffer.find(salted, start)
+    while found >= 0:
+        offset = found - _SALT_OFFSET
+        if offset >= end and offset % 8 == 0 and (frame := decode(buffer, offset, salt)) is not None:
+            yield offset, frame
+            end = offset + frame.size
+        found = buffer.find(salted, max(found + 1, end))
+
+
 def _refuse_damage(folder: Path, recorder: bytes, kept: Kept) -> None:
     """Raises if anything behind the cut says that something in the hole was safe."""
     for number in kept.numbers:
@@ -161,24 +207,11 @@ def _refuse_damage(folder: Path, recorder: bytes, kept: Kept) -> None:
             continue
         path = segment_path(folder, number)
         start = kept.cut.offset if number == kept.cut.number else 0
-        for offset, frame in _commits(path.read_bytes(), start, salt_of(recorder, number)):
-            if frame.position > kept.cut.position:
+        for offset, frame in whole_frames(path.read_bytes(), start, salt_of(recorder, number)):
+            if frame.kind == COMMIT and frame.position > kept.cut.position:
                 raise SpoolDamaged(
                     segment_path(folder, kept.cut.number),
                     kept.cut.offset,
                     f"position {kept.cut.position + 1} is missing, and {path.name} says at byte {offset} that all up"
                     f" to position {frame.position} was safe",
                 )
-
-
-def _commits(buffer: bytes, start: int, salt: int) -> Iterator[tuple[int, Frame]]:
-    """Every commit frame from `start` on, whatever lies around it."""
-    salted = CHECKSUM.pack(salt)
-    found = buffer.find(salted, start)
-    while found >= 0:
-        offset = found - _SALT_OFFSET
-        if offset >= start and offset % 8 == 0 and buffer[offset] == COMMIT:
-            frame = decode(buffer, offset, salt)
-            if frame is not None:
-                yield offset, frame
-        found = buffer.find(salted, found + 1)

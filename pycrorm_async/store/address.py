@@ -34,7 +34,7 @@ _HARMLESS = frozenset({"host", "port", "user", "ssl"})
 
 _WHAT_WORKS = (
     "what works: sqlite:///memory.db (a file here), sqlite:////data/memory.db (a file by its absolute path),"
-    " sqlite:// (private, gone when closed)"
+    " sqlite:// (private, gone when closed), postgresql://user@host/database (a server)"
 )
 
 
@@ -60,8 +60,8 @@ class DatabaseAddress:
             case "sqlite":
                 return cls(parsed, _sqlite_path(parsed))
             case "postgresql":
-                if not parsed.database:
-                    raise UnknownUrl(f"a PostgreSQL URL names its database; {_WHAT_WORKS}")
+                if reason := postgresql.refusal(parsed):
+                    raise UnknownUrl(f"{reason}; {_WHAT_WORKS}")
                 return cls(parsed, None)
             case other:
                 raise UnknownUrl(f"{other}:// is not a database we know; {_WHAT_WORKS}")
@@ -126,8 +126,9 @@ class DatabaseAddress:
         return url.render_as_string()
 
     def __str__(self) -> str:
-        # Without the query as well: drivers take passwords there.
-        return self._url.set(query={}).render_as_string(hide_password=True)
+        # Without most of the query: drivers take passwords there.
+        shown = {name: value for name, value in self._url.query.items() if name in postgresql.WHERE}
+        return self._url.set(query=shown).render_as_string(hide_password=True).replace("%2F", "/")
 
     def __repr__(self) -> str:
         return f"DatabaseAddress({str(self)!r})"

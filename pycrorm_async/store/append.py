@@ -44,7 +44,7 @@ async def append_batch(
 
 
 def _left_out(batch: Sorted, episode: EpisodeId, done: Step) -> bool:
-    return len(done.fresh) + len(done.again) < len(batch.episodes[episode])
+    return len(done.fresh) + len(done.again) + done.known_better < len(batch.episodes[episode])
 
 
 async def _known(

@@ -3,6 +3,9 @@
 An episode's events are stored without a gap: the next one taken is always `head + 1`. One at or below that is a repeat,
 to be compared with what is stored. At the first record that cannot be taken the episode stops, for this batch, and the
 reason is kept; what came before it is stored, and other episodes are not touched.
+
+An end that recovery computed is no repeat: a folder that was damaged, or put back from a backup, may know less than was
+stored. It follows what the log has, and is left out if the log knows the end or waits for missing events.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from pycrorm_async.errors import DamageError
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.envelope import Record, is_computed_end
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.store.rows import EpisodeRow, StoredEvent
 
@@ -28,11 +31,15 @@ class Sorted:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one batch does to one episode: the row as it will be, the records to insert, those to compare."""
+    """What one batch does to one episode: the row as it will be, the records to insert, those to compare.
+
+    `known_better` counts the computed ends that are left out.
+    """
 
     after: EpisodeRow
     fresh: list[Record]
     again: list[Record] = field(default_factory=list)
+    known_better: int = 0
 
 
 class NoNumber(ValueError):
@@ -86,17 +93,23 @@ def _careful_step(records: Sequence[Record], known: EpisodeRow) -> Step:
     fresh: list[Record] = []
     again: list[Record] = []
     refused: str | None = None
+    known_better = 0
     expected = known.head + 1
     for record in records:
         if record.sequence < expected:
-            again.append(record)
-            continue
+            if not is_computed_end(record):
+                again.append(record)
+                continue
+            if known.ended_wall_ns is not None or known.refused is not None:
+                known_better += 1
+                continue
+            record = record._replace(sequence=expected)
         refused = _refusal(record, expected)
         if refused is not None:
             break
         fresh.append(record)
         expected += 1
-    return Step(_advanced(known, fresh, refused=refused), fresh, again)
+    return Step(_advanced(known, fresh, refused=refused), fresh, again, known_better)
 
 
 def _refusal(record: Record, expected: int) -> str | None:

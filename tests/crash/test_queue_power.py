@@ -8,7 +8,8 @@ program has recovered what it left.
 
 import os
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +17,13 @@ import pytest
 
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue import RecorderQueue, open_dead
 from pycrorm_async.queue.appender import Appender, Span
 from pycrorm_async.queue.frame import EVENT
 from pycrorm_async.queue.segment import Segment, salt_of
 from pycrorm_async.queue.syncer import Syncer
-from tests.queue.writing import RECORDER, SMALL, ended, lost, make, node, overwrite, record, recover, started
+from tests.queue.writing import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
 
 SECTOR = 512
 ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
@@ -36,13 +38,15 @@ class Machine:
         self.cuts: list[tuple[Path, int, int, int]] = []
         self._place = place
         self._rng = rng
-        self._sequences: dict[int, int] = {}
+        self.meanwhile: Callable[[], Heading] = node  # what other threads put
+        self.sequences: dict[EpisodeId, int] = {}
         self._safe: dict[Path, bytes] = {}
         self._since: dict[Path, list[bytes]] = {}
         self._deleted: list[tuple[Path, bytes]] = []
 
-    def put(self, number: int, heading: Heading, payload: bytes) -> None:
-        sequence = self._sequences[number] = self._sequences.get(number, 0) + 1
+    def put(self, heading: Heading, payload: bytes) -> None:
+        assert heading.episode is not None
+        sequence = self.sequences[heading.episode] = self.sequences.get(heading.episode, 0) + 1
         assert self.queue.put_nowait(heading, payload, reserved=True) == sequence
         self.put_so_far.append(record(len(self.put_so_far) + 1, heading, sequence, payload))
         path = self.queue._appender.begun[-1].path
@@ -51,7 +55,7 @@ class Machine:
     def put_meanwhile(self) -> None:
         """What other threads put while the sync thread takes its turn: nothing, a little, or what rolls a segment."""
         for size in self._rng.choice([[], [], [], [], [], [10], [3000], [10, 3000]]):
-            self.put(1, node(1), b"m" * size)
+            self.put(self.meanwhile(), b"m" * size)
 
     def synced(self, path: Path) -> None:
         self._safe[path], self._since[path] = path.read_bytes(), []
@@ -127,42 +131,51 @@ def spoil(folder: Path, position: int) -> None:
 
 
 @pytest.fixture
-def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> Iterator[Machine]:
-    monkeypatch.setattr(Syncer, "start", lambda self: None)
-    machine = Machine(tmp_path, random.Random(seed))
-    sync = Segment.sync
-
-    def watched(segment: Segment) -> None:
-        machine.cut()
-        machine.put_meanwhile()
-        sync(segment)
-        machine.synced(segment.path)
-        machine.put_meanwhile()
-        machine.cut()
-
-    begin_sync = Appender.begin_sync
-
-    def begun(appender: Appender) -> Span:
-        span = begin_sync(appender)
-        machine.put_meanwhile()
-        return span
-
-    monkeypatch.setattr(Segment, "sync", watched)
-    monkeypatch.setattr(Appender, "begin_sync", begun)
-    yield machine
-    machine.queue._appender.close()
-    machine.queue._reader.close()
+def machine(tmp_path: Path, seed: int) -> Iterator[Machine]:
+    with machine_on(tmp_path, random.Random(seed)) as running:
+        yield running
 
 
-@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(6, 200))])
-async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(machine: Machine, seed: int) -> None:
-    rng = random.Random(seed + 1000)
+@contextmanager
+def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
+    """A machine whose every sync is watched, with a cut before and after each."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Syncer, "start", lambda self: None)
+        machine = Machine(place, rng)
+        sync = Segment.sync
+
+        def watched(segment: Segment) -> None:
+            machine.cut()
+            machine.put_meanwhile()
+            sync(segment)
+            machine.synced(segment.path)
+            machine.put_meanwhile()
+            machine.cut()
+
+        begin_sync = Appender.begin_sync
+
+        def begun(appender: Appender) -> Span:
+            span = begin_sync(appender)
+            machine.put_meanwhile()
+            return span
+
+        patch.setattr(Segment, "sync", watched)
+        patch.setattr(Appender, "begin_sync", begun)
+        try:
+            yield machine
+        finally:
+            machine.queue._appender.close()
+            machine.queue._reader.close()
+
+
+async def live_through(machine: Machine, rng: random.Random) -> None:
+    """A life of a recorder: puts, syncs, what is stored and deleted, and power cuts at every step of it."""
     for number in (1, 2, 3):
-        machine.put(number, started(number), b"{}")
+        machine.put(started(number), b"{}")
     for _ in range(6):
         for _ in range(rng.randrange(5)):
             number = rng.choice([1, 1, 2])
-            machine.put(number, node(number), b"y" * rng.randrange(1500))
+            machine.put(node(number), b"y" * rng.randrange(1500))
         machine.cut()
         machine.turn()
         machine.cut()
@@ -171,10 +184,16 @@ async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(
             await machine.queue.acknowledge(batch[-1].position)
             machine.turn()
             machine.cut()
-        if rng.random() < 0.1 and machine._sequences[2] > 0:
-            machine.put(3, node(3), b"third")
-    machine.put(1, ended(1), b"{}")
+        if rng.random() < 0.1 and machine.sequences[episode(2)] > 0:
+            machine.put(node(3), b"third")
+    machine.put(ended(1), b"{}")
     machine.cut()
+
+
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(6, 200))])
+async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(machine: Machine, seed: int) -> None:
+    rng = random.Random(seed + 1000)
+    await live_through(machine, rng)
 
     assert len(machine.cuts) > 20
     for folder, synced, stored, count in machine.cuts:
@@ -199,14 +218,14 @@ async def test_what_a_recovery_gave_away_after_a_kill_is_given_again_after_a_pow
 ) -> None:
     rng = random.Random(seed + 2000)
     for number in (1, 2, 3):
-        machine.put(number, started(number), b"{}")
+        machine.put(started(number), b"{}")
     for _ in range(rng.randrange(3)):
         for _ in range(rng.randrange(5)):
-            machine.put(1, node(1), b"synced")
+            machine.put(node(1), b"synced")
         machine.turn()
     for _ in range(12):
         number = rng.choice([1, 1, 2])
-        machine.put(number, node(number), b"never synced" * rng.randrange(100))
+        machine.put(node(number), b"never synced" * rng.randrange(100))
     killed = machine.kill()
     safe: set[str] = set()
     fdatasync = os.fdatasync

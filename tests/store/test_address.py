@@ -38,6 +38,8 @@ def test_a_password_is_in_no_text_of_an_address() -> None:
     assert str(address) == "postgresql://robot:***@lab:5433/memory"
     assert repr(address) == "DatabaseAddress('postgresql://robot:***@lab:5433/memory')"
     assert not address.is_sqlite
+    by_socket = DatabaseAddress.parse("postgresql://robot:s3cret@/memory?host=/run/postgresql&passfile=s3cret")
+    assert str(by_socket) == "postgresql://robot:***@/memory?host=/run/postgresql"
 
 
 @pytest.mark.parametrize(
@@ -54,13 +56,19 @@ def test_a_password_is_in_no_text_of_an_address() -> None:
         ("sqlite:///", "'' is not a path"),
         ("sqlite:///:memory:", "':memory:' is not a path"),
         ("postgresql://u:s3cret@h", "a PostgreSQL URL names its database"),
+        ("postgresql://u:my@s3cret@h/db", "an @ in a password is written %40"),
+        ("postgresql://u:s3cret@h:99999/db", "a port is a number from 1 to 65535"),
+        ("postgresql://u:s3cret@/db?port=s3cret", "a port is a number from 1 to 65535"),
+        ("postgresql://u@h/db?s3cret=1", "a PostgreSQL URL takes the parameters host, port, password, passfile"),
+        ("postgresql://u@h/db?sslmode=s3cret", "sslmode is one of disable, allow, prefer, require, verify-ca"),
     ],
 )
 def test_another_url_is_refused_with_what_works_and_without_its_password(url: str, reason: str) -> None:
     with pytest.raises(UnknownUrl) as caught:
         DatabaseAddress.parse(url)
     message = str(caught.value)
-    assert message.startswith(f"{reason}; what works: sqlite:///memory.db")
+    assert message.startswith(reason)
+    assert "; what works: sqlite:///memory.db" in message
     assert "s3cret" not in message
 
 

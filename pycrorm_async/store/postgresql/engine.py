@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import URL
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 
-__all__ = ["make_engine", "LOG_SCHEMA", "TABLES_SCHEMA", "ANSWER_S_MAX"]
+__all__ = ["make_engine", "refusal", "WHERE", "LOG_SCHEMA", "TABLES_SCHEMA", "ANSWER_S_MAX"]
 
 LOG_SCHEMA = "pycrorm"
 """Where the log is."""
@@ -14,6 +14,33 @@ TABLES_SCHEMA = "memory"
 
 ANSWER_S_MAX = 60.0
 """A statement that takes longer counts as a server that is away."""
+
+
+WHERE = ("host", "port")
+"""The parameters of a URL that say where the server is, and so may be shown."""
+
+_PARAMETERS = (*WHERE, "password", "passfile", "sslmode", "target_session_attrs", "krbsrvname")
+_SSL_MODES = ("disable", "allow", "prefer", "require", "verify-ca", "verify-full")
+
+
+def refusal(url: URL) -> str | None:
+    """What is wrong with a PostgreSQL URL, without a word of it, which may be of a password; None if nothing is."""
+    if "@" in (url.host or ""):
+        return "an @ in a password is written %40"
+    if not url.database:
+        return "a PostgreSQL URL names its database"
+    ports = [url.port, *(_number(each) for each in url.normalized_query.get("port", ()))]
+    if any(port is not None and not 0 < port < 2**16 for port in ports):
+        return "a port is a number from 1 to 65535"
+    if not set(url.query) <= set(_PARAMETERS):
+        return f"a PostgreSQL URL takes the parameters {', '.join(_PARAMETERS)} and no other"
+    if not set(url.normalized_query.get("sslmode", ())) <= set(_SSL_MODES):
+        return f"sslmode is one of {', '.join(_SSL_MODES)}"
+    return None
+
+
+def _number(text: str) -> int:
+    return int(text) if text.isascii() and text.isdigit() else 0
 
 
 def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEngine:
@@ -30,9 +57,12 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
         "default_transaction_read_only": "on" if read_only else "off",
         "timezone": "UTC",
     }
+    # The driver has another name for what everybody else calls sslmode.
+    ssl = {"ssl": url.query["sslmode"]} if "sslmode" in url.query else {}
     return create_async_engine(
-        url.set(drivername="postgresql+asyncpg"),
+        url.set(drivername="postgresql+asyncpg").difference_update_query(["sslmode"]),
         connect_args={
+            **ssl,
             "timeout": busy_timeout_s,
             "command_timeout": ANSWER_S_MAX,
             "server_settings": settings,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import asyncpg
 from sqlalchemy.exc import DBAPIError, InterfaceError
 
@@ -52,7 +54,7 @@ def ours(error: Exception, database: str) -> PycrormError:
     if code.startswith(_AWAY):
         return DatabaseUnavailable(f"{database}: {text}")
     if not code or isinstance(error, InterfaceError):  # between us and the server: refused, reset, timed out, closed
-        return DatabaseUnavailable(f"{database}: {text or type(fault).__name__}")
+        return DatabaseUnavailable(f"{database}: {text}")
     return InternalError(f"{database}: {text}")
 
 
@@ -63,5 +65,11 @@ def _code(fault: BaseException) -> str:
 
 def _text(fault: BaseException) -> str:
     """What the driver said, in one line, without the names of its classes."""
-    cause = fault.__cause__ if isinstance(fault.__cause__, asyncpg.PostgresError) else fault
-    return " ".join(str(cause).split())
+    cause = fault.__cause__ if isinstance(fault.__cause__, asyncpg.PostgresError | OSError) else fault
+    if isinstance(cause, OSError) and cause.strerror is not None:
+        number = cause.errno or 0  # those of name look-ups are below zero
+        return f"cannot be reached: {os.strerror(number) if number > 0 else cause.strerror}"
+    said = " ".join(str(cause).split())
+    if isinstance(cause, TimeoutError):
+        return said or "no answer in time"
+    return said or type(cause).__name__

@@ -1,0 +1,195 @@
+"""The database and the way to it: lost replies, cut connections, a server killed under load, cancellation."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from urllib.parse import urlsplit
+
+from bench.breaking.outcome import Event, Outcome, Step
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.backoff import Backoff
+from pycrorm_async.writer.drain import Drain
+from tests.databases import Server, ask
+from tests.proxy import Proxy, proxy_before
+from tests.store.making import episode, run_of
+from tests.writer.ends import CountingFold, KeptSource
+
+__all__ = ["lost_replies", "cut_connections", "killed_servers", "cancelled_appends"]
+
+_QUICKLY = Backoff(first_s=0.002, longest_s=0.02)
+_BATCH = 100
+_STORED = (
+    "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY episode.number, sequence"
+)
+
+
+def _events(records: Sequence[Record]) -> list[Event]:
+    return [
+        (episode_text(each.episode), each.sequence, each.payload.decode())
+        for each in records
+        if each.episode is not None
+    ]
+
+
+def _found(url: str) -> list[Event]:
+    return [(name, sequence, payload) for name, sequence, payload in ask(url, _STORED)]
+
+
+def _interleaved(batches: int) -> list[Record]:
+    """Batches of two episodes."""
+    half = _BATCH // 2
+    records: list[Record] = []
+    for first in range(1, batches * half + 1, half):
+        for number in (1, 2):
+            records += run_of(episode(number), first, first + half - 1, position=len(records) + 1)
+    return records
+
+
+def _compared(outcome: Outcome, rounds: int, records: list[Record], url: str) -> None:
+    outcome.compare(_events(records), _found(url))
+    outcome.rounds += rounds - 1
+
+
+def lost_replies(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """Every COMMIT is done, and its reply is lost; then the batch is appended again."""
+
+    async def swallowed(rounds: int, step: Step, url: str, records: list[Record]) -> None:
+        async with proxy_before(server) as proxy:
+            log = await EventLog.open(_through(proxy, url), create=True)
+            for first in range(0, rounds * _BATCH, _BATCH):
+                proxy.swallow_reply_to(b"COMMIT")
+                with contextlib.suppress(DatabaseUnavailable):
+                    await log.append(records[first : first + _BATCH])
+                await log.append(records[first : first + _BATCH])
+                step()
+            assert proxy.faults == rounds
+            await log.close()
+
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        del rng, folder
+        outcome, url, records = Outcome(note="PostgreSQL behind a proxy"), server.new_database(), _interleaved(rounds)
+        asyncio.run(swallowed(rounds, step, url, records))
+        _compared(outcome, rounds, records, url)
+        return outcome
+
+    return run
+
+
+def cut_connections(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """A writer's connection ends after a random number of bytes, is reset or closed, again and again."""
+
+    async def drained(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> None:
+        async with proxy_before(server) as proxy:
+            log = await EventLog.open(_through(proxy, url), create=True, busy_timeout_s=2.0)
+            source = KeptSource(records, closed=True)
+            settings = Settings(batch_events_max=_BATCH)
+            drain = Drain(source, CountingFold(log), settings=settings, backoff=_QUICKLY)
+            running = asyncio.create_task(drain.run())
+            for _ in range(rounds):
+                retries = drain.state.retries
+                rng.choice((proxy.cut, proxy.reset, lambda: proxy.cut_after_bytes(rng.randrange(1, 40_000))))()
+                while drain.state.retries == retries and not running.done():  # noqa: ASYNC110
+                    await asyncio.sleep(0.001)
+                step()
+            await running
+            await log.close()
+
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        del folder
+        outcome, url = Outcome(note="PostgreSQL behind a proxy"), server.new_database()
+        records = _interleaved(rounds * 4)
+        asyncio.run(drained(rounds, rng, step, url, records))
+        _compared(outcome, rounds, records, url)
+        return outcome
+
+    return run
+
+
+def killed_servers(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """The server dies with all its processes while a writer appends, and comes back."""
+
+    async def drained(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> int:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True, busy_timeout_s=2.0)
+        source = KeptSource(records, closed=True)
+        drain = Drain(source, CountingFold(log), settings=Settings(batch_events_max=_BATCH), backoff=_QUICKLY)
+        running = asyncio.create_task(drain.run())
+        forgotten = 0
+        for round_ in range(1, rounds + 1):
+            while drain.state.appended < round_ * len(records) // (rounds + 1):  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+            await asyncio.sleep(rng.random() * 0.02)
+            await asyncio.to_thread(server.kill)
+            acknowledged = drain.state.acknowledged
+            await asyncio.to_thread(server.start)
+            [[count]] = await asyncio.to_thread(ask, url, "SELECT count(*) FROM event")
+            forgotten += max(0, acknowledged - count)
+            step()
+        await running
+        await log.close()
+        return forgotten
+
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        del folder
+        url, records = server.new_database(), _interleaved(rounds * 40)
+        outcome = Outcome(note="PostgreSQL: SIGKILL of every process of it")
+        outcome.lost += asyncio.run(drained(rounds, rng, step, url, records))
+        _compared(outcome, rounds, records, url)
+        return outcome
+
+    return run
+
+
+def cancelled_appends(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """An append is cancelled at its first await, its second, its third …, on SQLite and on PostgreSQL."""
+
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        del rng
+        outcome = Outcome()
+        awaits: list[int] = []
+        while outcome.rounds < rounds:
+            file = Path(tempfile.mkdtemp(dir=folder)) / "memory.db"
+            urls = (f"sqlite:///{file}", server.new_database())
+            awaits += [asyncio.run(_cancelled_everywhere(outcome, url, step)) for url in urls]
+        outcome.note = f"{min(awaits)} to {max(awaits)} awaits each time; whole batches or nothing"
+        return outcome
+
+    return run
+
+
+async def _cancelled_everywhere(outcome: Outcome, url: str, step: Step) -> int:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    known = at = 0
+    cancelled = True
+    while cancelled:
+        at += 1
+        batch = run_of(episode(1), known + 1, known + _BATCH)
+        appending = asyncio.create_task(log.append(batch))
+        awaited: list[object] = []
+        while len(awaited) < at and not appending.done():
+            waiter = getattr(appending, "_fut_waiter", None)
+            if waiter is not None and waiter not in awaited[-1:]:
+                awaited.append(waiter)
+            await asyncio.sleep(0)
+        appending.cancel()
+        await asyncio.wait([appending])
+        cancelled = appending.cancelled()
+        head = await log.append(batch[:1]) or (await log.episodes())[0].head  # nobody holds what it needs
+        known += _BATCH if head == known + _BATCH else 1
+        outcome.compare(_events(run_of(episode(1), 1, known)), _found(url))
+        step()
+    await log.close()
+    return at
+
+
+def _through(proxy: Proxy, url: str) -> DatabaseAddress:
+    return DatabaseAddress.parse(proxy.url(urlsplit(url).path.removeprefix("/")))

@@ -1,0 +1,67 @@
+"""What a fault cost: the truth that whoever made the events kept, against what was found in the end."""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+__all__ = ["Event", "Outcome", "Step"]
+
+Event = tuple[str, int, str]
+"""An episode, a sequence in it, and what the event says."""
+
+Step = Callable[[], None]
+"""Called after every round."""
+
+
+@dataclass
+class Outcome:
+    """Counts over all rounds of one fault.
+
+    Attributes:
+        rounds: how often the fault was made.
+        events: how many events had been acknowledged to whoever made them.
+        lost: acknowledged, and not found.
+        duplicated: found more than once.
+        misordered: found at another place of its episode than it was put at, or behind a gap.
+        changed: found and never put, or put with other content.
+        told: acknowledged, not found, and named one by one by a repair: damage, not a crash.
+        broke: an error that ended the rounds early.
+        note: what else a reader should know.
+    """
+
+    rounds: int = 0
+    events: int = 0
+    lost: int = 0
+    duplicated: int = 0
+    misordered: int = 0
+    changed: int = 0
+    told: int = 0
+    broke: str | None = None
+    note: str = ""
+    rounds_failed: list[int] = field(default_factory=list)
+
+    @property
+    def clean(self) -> bool:
+        return not (self.lost or self.duplicated or self.misordered or self.changed or self.broke)
+
+    def compare(
+        self, acknowledged: Iterable[Event], found: Iterable[Event], *, put: Iterable[Event] = (), told: int = 0
+    ) -> None:
+        """One round. `acknowledged` must be in `found`; more may be only of `put`, which was tried and not answered."""
+        sure, there = set(acknowledged), list(found)
+        count = Counter(there)
+        before = (self.lost, self.duplicated, self.misordered, self.changed)
+        self.rounds += 1
+        self.events += len(sure)
+        self.lost += max(0, len(sure - count.keys()) - told)
+        self.told += min(told, len(sure - count.keys()))
+        self.duplicated += sum(count.values()) - len(count)
+        self.changed += len(count.keys() - sure - set(put))
+        last: defaultdict[str, int] = defaultdict(int)
+        for episode, sequence, _ in there:
+            self.misordered += sequence not in (last[episode] + 1, last[episode])
+            last[episode] = sequence
+        if (self.lost, self.duplicated, self.misordered, self.changed) != before:
+            self.rounds_failed.append(self.rounds)

@@ -1,0 +1,192 @@
+"""The whole way from the queue to the log, with every fault at once, drawn from one seed.
+
+Real files, the real queue, writer and SQLite log; simulated are the moments: the sync thread takes its turns when the
+seed says so, the power fails between any two steps on a disk that forgets, the database is away, loses its reply, or
+the drain is cancelled. After each life another recorder begins and the dead folder is drained with the same faults.
+In the end everything that was synced before a cut is in the log once, and nothing that was never put.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from bench.breaking.files import events_of
+from bench.breaking.outcome import Event, Outcome, Step
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.events.envelope import LOST, Heading, Record
+from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.queue import open_dead
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.backoff import Backoff
+from pycrorm_async.writer.drain import Drain
+from tests.crash.test_queue_power import Machine, machine_on
+from tests.databases import ask
+from tests.writer.ends import CountingFold, Passing
+
+__all__ = ["simulated"]
+
+_AT_ONCE = Backoff(first_s=1e-6, longest_s=1e-6)
+_STORED = "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY number, sequence"
+
+
+class _Faulty(Passing):
+    """A log that is away, or commits and loses the reply, as chance says."""
+
+    def __init__(self, log: EventLog, rng: random.Random) -> None:
+        super().__init__(CountingFold(log))
+        self._rng = rng
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        what = self._rng.random()
+        if what < 0.2:
+            raise DatabaseUnavailable("away before anything was done")
+        answer = await super().append(records)
+        if what < 0.4:
+            raise DatabaseUnavailable("the reply was lost")
+        return answer
+
+
+class _Life:
+    """One recorder from its start to its death, and the truth about it."""
+
+    def __init__(self, machine: Machine, rng: random.Random, number: int) -> None:
+        self.machine = machine
+        self._rng = rng
+        self._number = number
+        self._episodes = 0
+        self._open: list[EpisodeId] = []
+        self._count = 0
+        self.given = 0
+        machine.meanwhile = self._node
+
+    def act(self) -> None:
+        """Puts a few events."""
+        for _ in range(self._rng.randrange(1, 6)):
+            if not self._open or (len(self._open) < 9 and self._rng.random() < 0.2):
+                self._episodes += 1
+                randomness = self._number.to_bytes(4) + self._episodes.to_bytes(6)
+                self._open.append(episode_id(1_700_000_000_000_000_000, randomness))
+                self._put(Heading(self._open[-1], "EpisodeStarted", 1))
+                continue
+            episode = self._rng.choice(self._open)
+            ends = len(self._open) > 1 and self._rng.random() < 0.15
+            self._put(Heading(episode, "EpisodeEnded" if ends else "NodeStarted", 1))
+            if ends:
+                self._open.remove(episode)
+
+    def _node(self) -> Heading:
+        return Heading(self._rng.choice(self._open), "NodeStarted", 1)
+
+    def _put(self, heading: Heading) -> None:
+        self._count += 1
+        self.machine.put(heading, b'{"n":%d,"x":"%s"}' % (self._count, b"x" * self._rng.randrange(900)))
+
+
+class _PowerFails(BaseException):
+    """The machine is dead from here on."""
+
+
+def _fails_at(machine: Machine, moment: int) -> None:
+    """The power fails at this one of the moments at which the machine would note what a cut leaves."""
+    cut, left = machine.cut, moment
+
+    def fails() -> None:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            cut()
+            raise _PowerFails
+
+    machine.cut = fails  # type: ignore[method-assign]
+
+
+async def _lived(machine: Machine, life: _Life, log: EventLog, rng: random.Random) -> tuple[Path, list[Event]]:
+    """Records, syncs and drains until the power fails; the folder as it is then found, and what had been promised."""
+    destination = _Faulty(log, rng)
+    _fails_at(machine, rng.randrange(1, 150))
+    with contextlib.suppress(_PowerFails):
+        while True:
+            await _step(machine, life, destination, rng)
+    [(folder, synced, _, _)] = machine.cuts
+    return folder, events_of(machine.put_so_far[:synced])
+
+
+async def _step(machine: Machine, life: _Life, destination: _Faulty, rng: random.Random) -> None:
+    queue = machine.queue
+    life.act()
+    machine.cut()
+    if rng.random() < 0.7:
+        machine.turn()
+    if queue.synced > life.given and rng.random() < 0.6:
+        batch = await queue.get_batch(events_max=rng.choice((1, 3, 50)), bytes_max=2**20, age_s_max=0.0)
+        life.given = batch[-1].position
+        stored = False
+        while not stored:
+            machine.cut()
+            with contextlib.suppress(DatabaseUnavailable):
+                await destination.append(batch)
+                stored = True
+        machine.cut()
+        await queue.acknowledge(life.given)
+        machine.turn()
+
+
+async def _drained(folder: Path, log: EventLog, rng: random.Random) -> None:
+    """What the next process does with the folder, cancelled and begun again at random."""
+    for attempt in range(30):
+        recovered = open_dead(folder)
+        assert recovered is not None
+        recovered.seal()
+        settings = Settings(batch_events_max=rng.choice((1, 5, 100)))
+        drain = Drain(recovered, _Faulty(log, rng), settings=settings, backoff=_AT_ONCE)
+        running = asyncio.create_task(drain.run())
+        if attempt < 29 and rng.random() < 0.5:
+            for _ in range(rng.randrange(40)):
+                await asyncio.sleep(0)
+            running.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await running
+        if recovered.stored == recovered.last:
+            recovered.remove()
+            return
+        recovered.release()
+
+
+def simulated(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    """So many memories, each with a few recorders that live, die and are recovered."""
+    outcome = Outcome(note="queue, disk, power, writer, lost replies, cancellation: one seed a memory")
+    for _ in range(rounds):
+        place = Path(tempfile.mkdtemp(dir=folder))
+        asyncio.run(_memory(outcome, place, random.Random(rng.random())))
+        shutil.rmtree(place)
+        step()
+    return outcome
+
+
+async def _memory(outcome: Outcome, place: Path, rng: random.Random) -> None:
+    url = f"sqlite:///{place}/memory.db"
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    sure: list[Event] = []
+    put: list[Event] = []
+    for number in range(1, rng.randrange(2, 4)):
+        with machine_on(place / str(number), rng) as machine:
+            life = _Life(machine, rng, number)
+            folder, promised = await _lived(machine, life, log, rng)
+            sure += promised
+            put += events_of(machine.put_so_far)
+            await _drained(folder, log, rng)
+    await log.close()
+    found = [
+        (name, sequence, payload.encode().hex())
+        for name, sequence, payload in ask(url, _STORED)
+        if payload.encode() != LOST
+    ]
+    outcome.compare(sure, found, put=put)

@@ -1,0 +1,148 @@
+"""`pycrorm spool`: what an operator sees of a spool's files, and what is stored after they were mended."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.queue.writing import overwrite
+
+PLAN = '''
+import itertools, os
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    index: int
+    async def perform(self):
+        return None
+
+async def forever(memory):
+    """Takes notes until killed; a dot says that one is safe."""
+    async with memory.episode(description="notes"):
+        for index in itertools.count():
+            await NoteActionPerformable(index).perform()
+            await memory.synced()
+            os.write(1, b".")
+'''
+
+
+@pytest.fixture
+def left(tmp_path: Path) -> Path:
+    """The spool that a killed plan left, its database unreachable from the start of the spool's life."""
+    (tmp_path / "notes.py").write_text(PLAN)
+    plan = subprocess.Popen(
+        [*COMMAND, "run", "notes.py:forever"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, bufsize=0
+    )
+    assert plan.stdout is not None
+    count = 0
+    while count < 200:
+        count += len(os.read(plan.stdout.fileno(), 1000))
+    plan.send_signal(signal.SIGKILL)
+    plan.wait()
+    plan.stdout.close()
+    return tmp_path / "pycrorm.db.spool"
+
+
+def segment(spool: Path) -> Path:
+    (found,) = [path for path in spool.rglob("00000001.segment") if path.parent.suffix == ""]
+    return found
+
+
+def test_a_killed_plans_spool_is_told_and_is_no_problem(left: Path) -> None:
+    document = answer("spool", "inspect", left, cwd=left.parent)
+    [recorder] = document["recorders"]
+    assert (recorder["alive"], recorder["damage"], recorder["refused"], recorder["first"]) == (False, None, None, 1)
+    assert recorder["types"]["NodeStarted"] >= 200
+    assert recorder["records"] == sum(recorder["types"].values())
+    assert len(recorder["open"]) == 1
+    assert document["log_id"]
+    shown = pycrorm("spool", "inspect", left, cwd=left.parent)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert recorder["name"] in shown.stdout
+    assert recorder["open"][0]["id"] in shown.stdout
+    whole = pycrorm("spool", "repair", left, cwd=left.parent)
+    assert (whole.returncode, whole.stdout, whole.stderr) == (0, "nothing is damaged\n", "")
+
+
+def test_a_damaged_spool_is_mended_and_what_is_whole_is_stored(left: Path) -> None:
+    path = segment(left)
+    content = path.read_bytes()
+    at = content.index(b'"index":150') if b'"index":150' in content else content.index(b"150", 20_000)
+    overwrite(path, at, b"#")
+    said = pycrorm("spool", "inspect", left, cwd=left.parent)
+    assert said.returncode == 4
+    line = one_line_of(said)
+    assert f"{path} is damaged at byte" in line
+    assert f"mend it with: pycrorm spool repair {left}" in line
+    refused = pycrorm("writer", "--once", cwd=left.parent)
+    assert refused.returncode == 4
+
+    document = answer("spool", "repair", left, cwd=left.parent, code=1)
+    [mended] = document["mended"]
+    assert Path(mended["set_aside"], path.name).read_bytes()[at : at + 1] == b"#"
+    assert len(mended["unreadable"]) == 1
+    [[first, last]] = mended["unreadable"]
+    assert first == last
+    assert (mended["kept"], mended["complete"], len(mended["given_up"])) == (first - 1, False, 1)
+
+    report = answer("writer", "--once", cwd=left.parent)
+    assert len(report["lost"]) == 1
+    nodes = answer("show", "last", cwd=left.parent)["tree"]
+    indices = [node["parameters"]["index"] for node in nodes if node["dtype"] == "NoteAction"]
+    assert indices == list(range(len(indices)))
+    assert 140 <= len(indices) <= 150
+    after = answer("spool", "inspect", left, cwd=left.parent)
+    assert (after["recorders"], after["set_aside"]) == ([], [Path(mended["set_aside"]).name])
+
+
+def test_a_mended_spool_says_what_to_do_next(left: Path) -> None:
+    overwrite(segment(left), 20_000, bytes(8))
+    done = pycrorm("spool", "repair", left, cwd=left.parent)
+    assert done.returncode == 1
+    assert done.stderr == f"Store what was kept with: pycrorm writer --once --url DATABASE --spool {left}\n"
+    lines = done.stdout.splitlines()
+    assert lines[0].endswith("from behind it are saved")
+    assert lines[1] == f"  as it was: {segment(left).parent}.damaged"
+    assert any(line.startswith("  given up: position ") for line in lines)
+
+
+def test_a_living_plans_spool_is_told_and_not_mended(tmp_path: Path) -> None:
+    (tmp_path / "notes.py").write_text(PLAN)
+    plan = subprocess.Popen(
+        [*COMMAND, "run", "notes.py:forever"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, bufsize=0
+    )
+    spool = tmp_path / "pycrorm.db.spool"
+    try:
+        assert plan.stdout is not None
+        assert plan.stdout.read(1) == b"."
+        plan.send_signal(signal.SIGSTOP)
+        document = answer("spool", "inspect", spool, cwd=tmp_path)
+        assert [each["alive"] for each in document["recorders"]] == [True]
+        overwrite(segment(spool), 300, bytes(64))
+        damaged = pycrorm("spool", "inspect", spool, cwd=tmp_path)
+        refused = pycrorm("spool", "repair", spool, cwd=tmp_path)
+    finally:
+        plan.kill()
+        plan.wait()
+        assert plan.stdout is not None
+        plan.stdout.close()
+    assert damaged.returncode == 4
+    assert "stop its process first" in one_line_of(damaged)
+    assert refused.returncode == 3
+    assert "its recorder is alive" in one_line_of(refused)
+
+
+@pytest.mark.parametrize("verb", ["inspect", "repair"])
+def test_what_is_no_spool_is_one_line(tmp_path: Path, verb: str) -> None:
+    (tmp_path / "photos").mkdir()
+    for name, reason in (("photos", "is not a spool"), ("none", "does not exist")):
+        done = pycrorm("spool", verb, name, cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (3, "")
+        assert reason in one_line_of(done)
+    nothing = pycrorm("spool", verb, cwd=tmp_path)
+    assert nothing.returncode == 2

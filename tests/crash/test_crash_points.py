@@ -1,0 +1,240 @@
+"""Killed at each step that touches the disk or the log, once and then once more: every event is stored once.
+
+A forked child does the work and dies, without a chance to tidy up, before or after the n-th of these steps; n goes
+through all of them. What it was told before is in a pipe.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+from collections.abc import Awaitable, Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import DatabaseError
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue import RecorderQueue, Spool, open_dead
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.drain import Drain
+from tests.databases import ask
+from tests.queue.writing import RECORDER, SMALL, STILL, Author, ended, episode, node, started
+from tests.writer.ends import CountingFold
+
+LIVE = replace(SMALL, sync_interval_ms=1, spool_bytes_max=64 * SMALL.segment_bytes)
+STEPS = {
+    os: ("open", "fsync", "fdatasync", "posix_fallocate", "truncate", "ftruncate"),
+    Path: ("rename", "replace", "unlink", "rmdir", "touch", "mkdir", "write_text"),
+    EventLog: ("append",),
+}
+STORED = "SELECT sequence, type, payload FROM event JOIN episode ON number = episode WHERE id = ? ORDER BY sequence"
+
+
+def dying_at(step: int, *, after: bool) -> None:
+    """From now on, in this process, the so-manieth step is the last, or the last but what follows it."""
+    done = 0
+
+    def counted(original: Callable[..., Any]) -> Callable[..., Any]:
+        def last(*arguments: Any, **options: Any) -> Any:
+            nonlocal done
+            done += 1
+            mine = done
+            if mine == step and not after:
+                os._exit(9)
+            answer = original(*arguments, **options)
+            if asyncio.iscoroutine(answer):
+                return finished(answer, mine)
+            if mine == step:
+                os._exit(9)
+            return answer
+
+        async def finished(answer: Awaitable[Any], mine: int) -> Any:
+            given = await answer
+            if mine == step:
+                os._exit(9)  # committed, and nobody heard of it
+            return given
+
+        return last
+
+    for of, names in STEPS.items():
+        for name in names:
+            setattr(of, name, counted(getattr(of, name)))
+
+
+def in_a_child(work: Callable[[Callable[..., None]], None], step: int, *, after: bool) -> tuple[bool, list[list[str]]]:
+    """Whether it came to its end, and what it said."""
+    mine, its = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(mine)
+        code = 1
+        with contextlib.suppress(BaseException):
+            dying_at(step, after=after)
+            work(partial(_say, its))
+            code = 0
+        os._exit(code)
+    os.close(its)
+    said = b""
+    while chunk := os.read(mine, 1 << 16):
+        said += chunk
+    os.close(mine)
+    _, status = os.waitpid(child, 0)
+    code = os.waitstatus_to_exitcode(status)
+    assert code in (0, 9), (step, after, code)
+    return code == 0, [line.split() for line in said.decode().splitlines()]
+
+
+def _say(pipe: int, *words: object) -> None:
+    os.write(pipe, (" ".join(map(str, words)) + "\n").encode())
+
+
+async def drained(url: str, queue: Any) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    settings = Settings(batch_events_max=4)
+    await Drain(queue, CountingFold(log), settings=settings).run()
+    await log.close()
+
+
+def recover_all(url: str, spool: Path) -> None:
+    """What the next process does with what it finds."""
+    for folder in Spool(spool).recorders():
+        recovered = open_dead(folder.path)
+        if recovered is not None:
+            recovered.seal()
+            asyncio.run(drained(url, recovered))
+            recovered.remove()
+
+
+def _recover_all(url: str, spool: Path, _say: object) -> None:
+    recover_all(url, spool)
+
+
+def stored(url: str, number: int) -> list[tuple[int, str, str]]:
+    return ask(url, STORED, (episode_text(episode(number)),))
+
+
+# --- recovery ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def left(tmp_path: Path) -> tuple[str, Path]:
+    """A dead folder of three segments with a torn tail, two episodes open and one ended, and a log without it."""
+    author = Author(tmp_path / "spool")
+    for number in (1, 2, 3):
+        author.put(started(number))
+    for index in range(10):
+        author.put(node(1 + index % 2), b'"%s"' % (b"x" * 800))
+        if index == 5:
+            author.sync()
+    author.put(ended(3))
+    path, offset, size = author.places[-1]
+    with path.open("rb+") as file:
+        file.seek(offset + size)
+        file.write(b"torn" * 20)
+    url = f"sqlite:///{tmp_path}/memory.db"
+    asyncio.run(_made(url))
+    return url, tmp_path
+
+
+async def _made(url: str) -> None:
+    await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
+
+
+def whole(url: str) -> None:
+    for number in (1, 2):
+        rows = stored(url, number)
+        assert [row[0] for row in rows] == [1, 2, 3, 4, 5, 6, 7]
+        assert [row[1] for row in rows] == ["EpisodeStarted", *["NodeStarted"] * 5, "EpisodeEnded"]
+        assert rows[-1][2] == '{"status":"LOST"}'
+    assert [row[1:] for row in stored(url, 3)] == [("EpisodeStarted", "{}"), ("EpisodeEnded", "{}")]
+
+
+def pairs() -> Iterator[tuple[int, int]]:
+    """Every first step alone, and each with a few seconds."""
+    for first in range(1, 60):
+        for second in (0, 1 + first * 3 % 30):
+            yield first, second
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_a_recovery_killed_at_any_step_and_the_next_one_too_stores_every_event_once(
+    left: tuple[str, Path], after: bool, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    _, prepared = left
+    ended_at: int | None = None
+    for first, second in pairs():
+        place = tmp_path_factory.mktemp("round")
+        shutil.copytree(prepared, place, dirs_exist_ok=True)
+        url, spool = f"sqlite:///{place}/memory.db", place / "spool"
+        done, _ = in_a_child(partial(_recover_all, url, spool), first, after=after)
+        if done and ended_at is None:
+            ended_at = first
+        if second:
+            in_a_child(partial(_recover_all, url, spool), second, after=not after)
+        recover_all(url, spool)
+        whole(url)
+        # Killed between the folder's last file and the folder itself, it may stay, empty.
+        assert [path for folder in spool.iterdir() for path in folder.iterdir()] == []
+        shutil.rmtree(place)
+        if ended_at is not None and first > ended_at:
+            break
+    assert ended_at is not None  # all of its steps were gone through
+    assert ended_at > 20
+
+
+# --- a living recorder ------------------------------------------------------------------------------------------
+
+
+def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
+    queue = RecorderQueue.create(spool, settings=LIVE, clock=STILL, recorder=RECORDER)
+
+    async def both() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+        settings = Settings(batch_events_max=4)
+        drain = asyncio.create_task(Drain(queue, CountingFold(log), settings=settings).run())
+        for number in (1, 2):
+            say("put", number, queue.put_nowait(started(number), b"{}"))
+        for index in range(14):
+            payload = b'"%d %s"' % (index, b"y" * 900)
+            say("put", 1 + index % 2, queue.put_nowait(node(1 + index % 2), payload))
+            await queue.synced_to()
+            say("synced", queue.synced)
+        say("put", 1, queue.put_nowait(ended(1), b"{}"))
+        queue.close()
+        with contextlib.suppress(DatabaseError):
+            await drain
+        await log.close()
+
+    asyncio.run(both())
+    queue.release()
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_a_recorder_and_its_writer_killed_at_any_step_lose_nothing_that_was_put(tmp_path: Path, after: bool) -> None:
+    done = False
+    step = 0
+    while not done:
+        step += 1
+        place = tmp_path / str(step)
+        place.mkdir()
+        url, spool = f"sqlite:///{place}/memory.db", place / "spool"
+        asyncio.run(_made(url))
+        done, said = in_a_child(partial(record_and_drain, url, spool), step, after=after)
+        recover_all(url, spool)
+        for number in (1, 2):
+            put = [int(line[2]) for line in said if line[:2] == ["put", str(number)]]
+            rows = [row for row in stored(url, number) if row[2] != '{"status":"LOST"}']
+            assert [row[0] for row in rows] == list(range(1, len(rows) + 1))
+            assert len(put) <= len(rows) <= len(put) + 1, (step, after)
+            texts = ["{}", *(f'"{index} {"y" * 900}"' for index in range(number - 1, 14, 2)), "{}"]
+            assert [row[2] for row in rows] == texts[: len(rows)]
+        assert [path.parent.name for path in spool.glob("*/alive") if not path.parent.name.endswith(".making")] == []
+    assert step > 40

@@ -1,0 +1,364 @@
+"""A damaged folder is mended: all that is whole can be drained, what is given up is told, nothing is overwritten."""
+
+import os
+import random
+import shutil
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.repair import RepairReport, finish_repairs, repair_folder
+from pycrorm_async.queue.scan import scan
+from tests.queue.writing import (
+    DECLARED,
+    RECORDER,
+    SMALL,
+    Author,
+    ended,
+    episode,
+    lost,
+    make,
+    node,
+    overwrite,
+    recover,
+    started,
+)
+
+ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
+LOST = b'{"status":"LOST"}'
+
+
+@pytest.fixture
+def author(spool: Path) -> Author:
+    return Author(spool, settings=ROOMY)
+
+
+def mended(folder: Path) -> RepairReport:
+    report = repair_folder(folder)
+    assert report is not None
+    return report
+
+
+def spoil(author: Author, position: int) -> None:
+    path, offset, _ = author.places[position - 1]
+    overwrite(path, offset + 70, b"#")
+
+
+def renumbered(records: list[Record]) -> list[Record]:
+    return [each._replace(position=index) for index, each in enumerate(records, start=1)]
+
+
+async def test_what_stands_behind_the_damage_is_saved_but_for_the_episode_that_misses_an_event(author: Author) -> None:
+    for heading in (
+        started(1),
+        started(2),
+        node(1),
+        node(2),
+        node(1),
+        DECLARED,
+        node(2),
+        ended(2),
+        node(1),
+        started(3),
+    ):
+        author.put(heading)
+    author.sync()
+    author.put(node(3), b"never synced")
+    spoil(author, 5)
+    report = mended(author.folder)
+    assert (report.kept, report.saved, report.unreadable, report.headless) == (4, 5, ((5, 5),), False)
+    [given_up] = report.given_up
+    assert (given_up.episode, given_up.kept_to) == (episode_text(episode(1)), 2)
+    assert (given_up.sequences, given_up.positions) == (((4, 4),), ((9, 9),))
+    assert not report.complete
+    kept = renumbered([each for each in author.records if each.position not in (5, 9)])
+    assert await recover(author.folder) == [*kept, lost(10, 1, 3), lost(11, 3, 3)]
+    assert repair_folder(author.folder) is None
+
+
+async def test_the_folder_as_it_was_is_put_aside_and_named(author: Author) -> None:
+    for heading in (started(), node(), node()):
+        author.put(heading)
+    author.sync()
+    spoil(author, 2)
+    (author.folder / "notes.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in author.folder.iterdir()}
+    report = mended(author.folder)
+    aside = author.folder.with_name(f"{author.folder.name}.damaged")
+    assert report.set_aside == str(aside)
+    assert {path.name: path.read_bytes() for path in aside.iterdir()} == before | {"drain": b""}
+    path, offset, _ = author.places[1]
+    assert (report.damage.file, report.damage.offset) == (str(aside / path.name), offset)
+    assert [each.name for each in Spool(author.folder.parent).recorders()] == [author.folder.name]
+    with pytest.raises(SpoolDamaged):
+        scan(aside, RECORDER)
+
+
+async def test_a_second_damage_is_put_aside_under_a_name_of_its_own(author: Author) -> None:
+    for heading in (started(1), started(2), *[node(1)] * 3, node(2)):
+        author.put(heading)
+    author.sync()
+    spoil(author, 4)
+    assert mended(author.folder).set_aside.endswith(".damaged")
+    overwrite(author.folder / "00000001.segment", author.places[1][1] + 70, b"#")
+    again = mended(author.folder)
+    assert again.set_aside.endswith(".damaged.2")
+    assert await recover(author.folder) == [
+        *renumbered([each for each in author.records if each.position in (1, 3)]),
+        lost(3, 1, 3),
+    ]
+
+
+async def test_a_missing_file_costs_what_was_in_it_and_no_more(author: Author) -> None:
+    author.put(started(1))
+    for _ in range(3):
+        author.put(node(1), b"x" * 900)
+    author.put(started(2))
+    for _ in range(6):
+        author.put(node(2), b"y" * 900)
+    author.sync()
+    gone = author.segments[1]
+    missing = [index for index, (path, _, _) in enumerate(author.places, start=1) if path == gone]
+    gone.unlink()
+    report = mended(author.folder)
+    assert report.unreadable == ((missing[0], missing[-1]),)
+    assert missing[0] == 6
+    assert await recover(author.folder) == [*author.records[:5], lost(6, 1, 5), lost(7, 2, 2)]
+    assert [each.sequences[-1][1] for each in report.given_up] == [7]
+
+
+async def test_records_that_are_whole_are_kept_when_only_their_commit_contradicts_them(author: Author) -> None:
+    author.put(started())
+    author.put(node(), b"one")
+    span = author.appender.begin_sync()
+    author.appender.append_commit(span._replace(checksum=span.checksum ^ 1))
+    author.put(node(), b"two")
+    report = mended(author.folder)
+    assert (report.kept, report.saved, report.complete) == (2, 1, True)
+    assert await recover(author.folder) == [*author.records, lost(4, 1, 4)]
+
+
+async def test_the_first_files_header_unreadable_costs_nothing(author: Author) -> None:
+    for heading in (started(1), node(1), started(2), ended(1)):
+        author.put(heading)
+    author.sync()
+    overwrite(author.segments[0], 20, b"#")
+    report = mended(author.folder)
+    assert (report.kept, report.saved, report.complete) == (0, 4, True)
+    assert await recover(author.folder) == [*author.records, lost(5, 2, 2)]
+
+
+async def test_a_header_unreadable_when_the_files_before_are_stored_and_gone_costs_the_ends_it_alone_knew(
+    author: Author,
+) -> None:
+    author.put(started(1))
+    author.put(started(2))
+    for _ in range(6):
+        author.put(node(1), b"x" * 900)
+    author.sync()
+    left = [
+        each for each, (path, _, _) in zip(author.records, author.places, strict=True) if path != author.segments[0]
+    ]
+    author.segments[0].unlink()
+    overwrite(author.segments[1], 60, b"#")
+    report = mended(author.folder)
+    assert (report.headless, report.unreadable, report.given_up, report.complete) == (True, (), (), False)
+    records = await recover(author.folder)
+    assert records[:-1] == left
+    assert records[-1] == lost(9, 1, 8)
+
+
+async def test_a_repaired_folder_that_is_damaged_again_says_so(author: Author) -> None:
+    for heading in (started(1), started(2), *[node(1)] * 3, *[node(2)] * 3):
+        author.put(heading)
+    author.sync()
+    spoil(author, 3)
+    mended(author.folder)
+    for number in (1, 2):
+        path = author.folder / f"{number:08d}.segment"
+        before = path.read_bytes()
+        overwrite(path, 56 + 70 + (64 if number == 2 else 0), b"#")
+        with pytest.raises(SpoolDamaged):
+            scan(author.folder, RECORDER)
+        path.write_bytes(before)
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------
+
+
+def test_a_whole_folder_is_left_as_it_is(author: Author) -> None:
+    author.put(started())
+    author.sync()
+    author.put(node(), b"torn away")
+    overwrite(author.places[1][0], author.places[1][1] + 70, b"#")  # an ordinary torn tail is no damage
+    before = author.segments[0].read_bytes()
+    assert repair_folder(author.folder) is None
+    assert author.segments[0].read_bytes() == before
+    assert [path.name for path in author.folder.parent.iterdir()] == [author.folder.name]
+
+
+def test_a_living_recorder_and_one_that_is_drained_are_refused(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    with pytest.raises(SpoolUnavailable, match="its recorder is alive"):
+        repair_folder(queue.folder)
+    queue.release()
+    draining = FileLock.take(queue.folder / "drain")
+    assert draining is not None
+    with pytest.raises(SpoolUnavailable, match="is being drained: stop that first"):
+        repair_folder(queue.folder)
+    draining.release()
+    assert repair_folder(queue.folder) is None
+
+
+def test_a_newer_format_is_refused_and_nothing_is_changed(author: Author) -> None:
+    author.put(started())
+    author.sync()
+    overwrite(author.segments[0], 8, b"\x02")
+    with pytest.raises(SpoolForeign, match="is in format 2 of a newer program"):
+        repair_folder(author.folder)
+    assert [path.name for path in author.folder.parent.iterdir()] == [author.folder.name]
+
+
+@pytest.fixture
+def nobody() -> Iterator[Path]:
+    """A folder that this process cannot write into while the test runs."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        root = os.geteuid() == 0
+        yield Path(folder)
+        if root:
+            os.seteuid(0)
+        Path(folder).chmod(0o755)
+
+
+def test_a_folder_that_may_only_be_read_is_one_line_and_stays_as_it_is(nobody: Path) -> None:
+    author = Author(nobody)
+    for heading in (started(), node(), node()):
+        author.put(heading)
+    author.sync()
+    spoil(author, 2)
+    before = author.segments[0].read_bytes()
+    for path in (author.folder / "alive", *author.segments):
+        path.chmod(0o666)
+    author.folder.chmod(0o777)
+    nobody.chmod(0o555)
+    if os.geteuid() == 0:
+        os.seteuid(65534)
+    with pytest.raises(SpoolUnavailable, match="Permission denied") as refused:
+        repair_folder(author.folder)
+    assert "\n" not in str(refused.value)
+    assert author.segments[0].read_bytes() == before
+
+
+# --- killed -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("killed_at", range(40))
+async def test_a_repair_killed_at_any_step_is_done_by_the_next_one(
+    author: Author, killed_at: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    author.put(started(1))
+    author.put(started(2))
+    for _ in range(4):
+        author.put(node(1), b"x" * 900)
+        author.put(node(2), b"y" * 900)
+    author.sync()
+    spoil(author, 6)
+    spool = author.folder.parent
+    steps = 0
+
+    def counted(step: Callable[..., Any]) -> Callable[..., Any]:
+        def may_die(*arguments: Any, **options: Any) -> Any:
+            nonlocal steps
+            steps += 1
+            if steps > killed_at:
+                raise KeyboardInterrupt
+            return step(*arguments, **options)
+
+        return may_die
+
+    for of, name in ((os, "link"), (os, "fsync"), (os, "open"), (Path, "rename"), (Path, "replace"), (Path, "open")):
+        monkeypatch.setattr(of, name, counted(getattr(of, name)))
+    # What a kill leaves is not tidied up.
+    monkeypatch.setattr(shutil, "rmtree", lambda *_, **__: None)
+    done = False
+    try:
+        repair_folder(author.folder)
+        done = True
+    except KeyboardInterrupt:
+        pass
+    monkeypatch.undo()
+    finish_repairs(spool)
+    repair_folder(author.folder)
+    kept = renumbered([each for each in author.records if each.position not in (6, 8, 10)])
+    assert await recover(author.folder) == [*kept, lost(8, 1, 6), lost(9, 2, 3)]
+    assert sorted(path.name for path in spool.iterdir()) == [author.folder.name, f"{author.folder.name}.damaged"]
+    assert done or killed_at < 39
+
+
+# --- anywhere ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [*range(60), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(60, 600))])
+async def test_whatever_is_spoilt_every_record_is_drained_or_told(tmp_path: Path, seed: int) -> None:
+    rng = random.Random(seed)
+    author = Author(tmp_path / "spool", settings=ROOMY)
+    open_now: set[int] = set()
+    for number in range(1, rng.randrange(3, 7)):
+        author.put(started(number))
+        open_now.add(number)
+        for _ in range(rng.randrange(12)):
+            author.put(node(rng.choice(sorted(open_now))), b"z" * rng.randrange(1200))
+            if rng.random() < 0.3:
+                author.sync()
+        if rng.random() < 0.4:
+            author.put(ended(number))
+            open_now.discard(number)
+    author.sync()
+    hits = rng.choice([1, 1, 1, 2, 5])
+    for _ in range(hits):
+        path = rng.choice(author.segments)
+        content = bytearray(path.read_bytes())
+        at = rng.randrange(len(content.rstrip(b"\0")))
+        if at in range(8, 12):  # the format's number: that is another program's file, and refused
+            continue
+        content[at] ^= 1 << rng.randrange(8)
+        path.write_bytes(content)
+    report = repair_folder(author.folder)
+    records = [each for each in await recover(author.folder) if each.payload != LOST]
+    if report is None:  # nothing was hit, or the last commit frame, which is no more than a torn tail then
+        assert records == author.records[: len(records)]
+        assert len(records) == len(author.records) or hits > 1
+        return
+    # Told: every position is kept, unreadable, or given up by name.
+    unreadable = {position for first, last in report.unreadable for position in range(first, last + 1)}
+    dropped = {
+        position for each in report.given_up for first, last in each.positions for position in range(first, last + 1)
+    }
+    assert unreadable & dropped == set()
+    kept = [each for each in author.records if each.position not in unreadable | dropped]
+    if hits > 1:  # records at the very end, and the only commit frame that spoke of them
+        kept = kept[: len(records)]
+    assert records == renumbered(kept)
+    assert (report.kept + report.saved) == len(kept)
+    # Whatever of an episode is kept has no gap, and only an episode that misses an event gives something up.
+    sequences: defaultdict[bytes | None, list[int]] = defaultdict(list)
+    for each in kept:
+        sequences[each.episode].append(each.sequence)
+    assert all(numbers == list(range(1, len(numbers) + 1)) for numbers in sequences.values())
+    missing = {each.episode for each in author.records if each.position in unreadable}
+    assert {each.episode for each in author.records if each.position in dropped} <= missing
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    recovered.release()

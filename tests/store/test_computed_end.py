@@ -1,0 +1,60 @@
+"""An end that recovery computed says only how far its folder knew: a log that knows more keeps what it knows."""
+
+from __future__ import annotations
+
+import pytest
+
+from pycrorm_async.errors import LogDamaged
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.store.log import EventLog
+from tests.databases import ask
+from tests.store.making import episode, record, run_of
+
+EVENTS = "SELECT sequence, type, payload FROM event ORDER BY sequence"
+HEADS = "SELECT head, ended_wall_ns, refused FROM episode"
+
+
+def lost(sequence: int) -> Record:
+    """The computed end behind that many events."""
+    return record(episode(1), sequence + 1, kind="EpisodeEnded", payload=b'{"status":"LOST"}', wall_ns=50 + sequence)
+
+
+async def test_it_follows_what_the_log_has_when_the_folder_had_less(log: EventLog, database_url: str) -> None:
+    await log.append(run_of(episode(1), 1, 5))
+    for _ in range(2):  # a mended folder, drained twice
+        assert await log.append([*run_of(episode(1), 1, 2), lost(2)]) == {}
+        assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4, 5, 6]
+        assert ask(database_url, EVENTS)[-1] == (6, "EpisodeEnded", '{"status":"LOST"}')
+        assert ask(database_url, HEADS) == [(6, 52, None)]
+
+
+async def test_it_is_left_out_when_the_log_knows_the_end(log: EventLog, database_url: str) -> None:
+    whole = [*run_of(episode(1), 1, 5), record(episode(1), 6, kind="EpisodeEnded", payload=b'{"status":"SUCCEEDED"}')]
+    await log.append(whole)
+    assert await log.append([*run_of(episode(1), 1, 3), lost(3)]) == {}
+    assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4, 5, 6]
+    assert ask(database_url, HEADS)[0][0] == 6
+
+
+async def test_where_the_folder_knows_as_much_it_is_stored_once_as_ever(log: EventLog, database_url: str) -> None:
+    for _ in range(2):
+        assert await log.append([*run_of(episode(1), 1, 3), lost(3)]) == {}
+    assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4]
+
+
+async def test_any_other_event_under_a_number_that_is_taken_is_damage_still(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 5))
+    with pytest.raises(LogDamaged):
+        await log.append([record(episode(1), 3, kind="EpisodeEnded", payload=b'{"status":"FAILED"}')])
+    with pytest.raises(LogDamaged):
+        await log.append([*run_of(episode(1), 1, 1), record(episode(1), 2, payload=b"{}"), lost(2)])
+
+
+async def test_a_log_that_waits_for_missing_events_waits_on(log: EventLog, database_url: str) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    refused = await log.append(run_of(episode(1), 6, 7))
+    assert refused == {episode(1): "events 4 to 5 did not arrive before event 6"}
+    assert await log.append([*run_of(episode(1), 1, 2), lost(2)]) == {}
+    assert ask(database_url, HEADS) == [(3, None, "events 4 to 5 did not arrive before event 6")]
+    assert await log.append(run_of(episode(1), 4, 7)) == {}
+    assert ask(database_url, HEADS) == [(7, None, None)]

@@ -1,0 +1,188 @@
+"""What keeps PostgreSQL from being used is one line that names the database, says why, and shows no password."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import traceback
+from urllib.parse import urlsplit
+
+import pytest
+
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.postgresql import dialect
+from tests.databases import Server, ask
+from tests.store.making import episode, run_of
+
+SECRET = "s3cr et/@#?&:%"
+WRITTEN = "s3cr%20et%2F%40%23%3F%26%3A%25"
+GUARDED = "local all guarded scram-sha-256\n"
+
+
+@pytest.fixture
+def guarded(server: Server) -> str:
+    """A database that asks the user `guarded` for the password."""
+    rules = server.folder / "pg_hba.conf"
+    if not rules.read_text().startswith(GUARDED):
+        rules.write_text(GUARDED + rules.read_text())
+        url = server.url()
+        ask(url, f"CREATE ROLE guarded LOGIN PASSWORD '{SECRET}'")
+        ask(url, "SELECT pg_reload_conf()")
+    database = urlsplit(server.new_database()).path.removeprefix("/")
+    ask(server.url(), f"GRANT CREATE ON DATABASE {database} TO guarded")
+    return database
+
+
+async def refused(
+    url: str, caplog: pytest.LogCaptureFixture, *, create: bool = True, busy_timeout_s: float = 2.0
+) -> PycrormError:
+    """The error that opening raises: one line, no password in it, in what caused it, nor in any log."""
+    caplog.set_level(logging.DEBUG)
+    with pytest.raises(PycrormError) as caught:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=create, busy_timeout_s=busy_timeout_s)
+        await log.close()
+    told = "".join(traceback.format_exception(caught.value)) + caplog.text + repr(caught.value.__dict__)
+    assert "s3cr" not in told
+    assert "\n" not in str(caught.value)
+    return caught.value
+
+
+async def test_the_right_password_opens_whatever_characters_it_has(server: Server, guarded: str) -> None:
+    address = DatabaseAddress.parse(server.url(guarded, user="guarded", password=WRITTEN))
+    log = await EventLog.open(address, create=True)
+    await log.append(run_of(episode(1), 1, 3))
+    assert [each.head for each in await log.episodes()] == [3]
+    await log.close()
+
+
+@pytest.mark.parametrize("password", ["s3cr-wrong", ""])
+async def test_a_wrong_password(server: Server, guarded: str, password: str, caplog: pytest.LogCaptureFixture) -> None:
+    error = await refused(server.url(guarded, user="guarded", password=password), caplog)
+    assert type(error) is DatabaseUnavailable
+    assert str(error).endswith('password authentication failed for user "guarded"')
+    assert f"@/{guarded}?host={server.folder}: " in str(error)
+
+
+async def test_who_is_not_known_or_may_not_log_in(server: Server, caplog: pytest.LogCaptureFixture) -> None:
+    error = await refused(server.url(user="stranger", password="s3cr"), caplog)
+    assert str(error).endswith('role "stranger" does not exist')
+    error = await refused(server.url(user="pg_monitor", password="s3cr"), caplog)
+    assert str(error).endswith('role "pg_monitor" is not permitted to log in')
+
+
+@pytest.mark.parametrize("create", [True, False])
+async def test_no_such_database(server: Server, create: bool, caplog: pytest.LogCaptureFixture) -> None:
+    error = await refused(server.url("nothing", password="s3cr"), caplog, create=create)
+    assert type(error) is DatabaseUnavailable
+    assert str(error).endswith('database "nothing" does not exist')
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        ("postgresql://ada:s3cr@/memory?host=/tmp/no/server", "cannot be reached: No such file or directory"),
+        ("postgresql://ada:s3cr@127.0.0.1:1/memory", "cannot be reached: Connection refused"),
+        ("postgresql://ada:s3cr@no-such-host.invalid/memory", "no-such-host.invalid/memory: cannot be reached: "),
+    ],
+)
+async def test_no_server_there(place: str, reason: str, caplog: pytest.LogCaptureFixture) -> None:
+    error = await refused(place, caplog)
+    assert type(error) is DatabaseUnavailable
+    assert reason in str(error)
+    assert str(error).startswith("postgresql://ada:***@")
+
+
+async def test_something_else_than_a_server_there(caplog: pytest.LogCaptureFixture) -> None:
+    async def other(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+        writer.close()
+
+    listening = await asyncio.start_server(other, "127.0.0.1", 0)
+    port = listening.sockets[0].getsockname()[1]
+    error = await refused(f"postgresql://ada:s3cr@127.0.0.1:{port}/memory", caplog)
+    assert type(error) is DatabaseUnavailable
+    listening.close()
+    await listening.wait_closed()
+
+
+async def test_a_server_that_says_nothing_is_not_waited_for_longer_than_allowed(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"postgresql://ada:s3cr@127.0.0.1:{silent.getsockname()[1]}/memory"
+        error = await refused(url, caplog, busy_timeout_s=0.2)
+    assert type(error) is DatabaseUnavailable
+    assert str(error).endswith("no answer in time")
+
+
+async def test_a_server_too_old(
+    server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = server.new_database()
+    [[version]] = ask(url, "SELECT current_setting('server_version_num')::int / 10000")
+    # A real server of today's version, looked at by a program that needs the next one.
+    monkeypatch.setattr(dialect, "_SERVER_MIN", (version + 1) * 10_000)
+    error = await refused(url, caplog)
+    assert type(error) is DatabaseUnavailable
+    assert str(error).endswith(f"PostgreSQL 14 or newer is needed, this is {version}")
+    assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname IN ('pycrorm', 'memory')") == [(0,)]
+
+
+async def test_a_user_without_rights(server: Server, guarded: str, caplog: pytest.LogCaptureFixture) -> None:
+    url = server.url(guarded)
+    ask(url, f"REVOKE CREATE ON DATABASE {guarded} FROM guarded")
+    theirs = server.url(guarded, user="guarded", password=WRITTEN)
+    error = await refused(theirs, caplog)
+    assert str(error).endswith(f"permission denied for database {guarded}")
+    await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
+    for create in (True, False):
+        error = await refused(theirs, caplog, create=create)
+        assert type(error) is DatabaseUnavailable
+        assert str(error).endswith("permission denied for schema pycrorm")
+
+
+@pytest.mark.parametrize("create", [True, False])
+async def test_a_schema_of_another_program_is_left_alone(
+    server: Server, create: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = server.new_database()
+    ask(url, "CREATE SCHEMA pycrorm")
+    ask(url, "CREATE TABLE pycrorm.bookmarks (url text)")
+    error = await refused(url, caplog, create=create)
+    assert type(error) is DatabaseForeign
+    assert str(error).endswith("has a schema 'pycrorm' of another program: it has no pycrorm_log")
+    assert ask(url, "SELECT relname FROM pg_class WHERE relnamespace = 'pycrorm'::regnamespace AND relkind = 'r'") == [
+        ("bookmarks",)
+    ]
+
+
+async def test_a_log_of_a_newer_version_is_refused(server: Server, caplog: pytest.LogCaptureFixture) -> None:
+    url = server.new_database()
+    await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
+    ask(url, "UPDATE pycrorm.pycrorm_log SET format = 99")
+    for create in (True, False):
+        error = await refused(url, caplog, create=create)
+        assert type(error) is DatabaseForeign
+        assert "its format is 99, this version knows 1" in str(error)
+
+
+async def test_no_connection_left(server: Server, caplog: pytest.LogCaptureFixture) -> None:
+    url = server.new_database()
+    database = urlsplit(url).path.removeprefix("/")
+    ask(server.url(), f"ALTER DATABASE {database} CONNECTION LIMIT 0")
+    ask(server.url(), "CREATE ROLE guest LOGIN")
+    error = await refused(server.url(database, user="guest"), caplog)
+    assert type(error) is DatabaseUnavailable
+    assert str(error).endswith(f'too many connections for database "{database}"')
+
+
+async def test_a_reader_is_told_where_there_is_no_memory_yet_and_makes_nothing(
+    server: Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = server.new_database()
+    error = await refused(url, caplog, create=False)
+    assert str(error).endswith("holds no memory yet: record one with `pycrorm run` or `pycrorm demo`")
+    assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname = 'pycrorm'") == [(0,)]
