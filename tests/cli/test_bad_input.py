@@ -118,7 +118,6 @@ def folder(tmp_path: Path) -> Path:
         (["run", "plans.py:sync"], 2, "plans.py:sync is not an async function: write `async def sync()`"),
         (["run", "plans.py:greedy"], 2, "plans.py:greedy takes memory, world: a plan takes the memory, or nothing"),
         (["run", "types.py"], 2, "types.py has the name of a module of Python's own or one in use"),
-        (["writer"], 2, "--once"),
         (["writer", "--once", "--url", "sqlite://"], 2, "nothing to recover"),
         (["run", "plans.py", "--spool", "plans.py"], 3, "plans.py"),
     ],
