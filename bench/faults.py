@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import signal
 import sys
 import tempfile
 import time
@@ -75,6 +76,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=None, help="of all random choices; printed in every line")
     parser.add_argument("--only", default="", help="the faults whose name holds this word")
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the server and the folders go then too
     seed = arguments.seed if arguments.seed is not None else random.SystemRandom().randrange(2**31)
     console = Console(stderr=True)
     if not console.is_terminal:
