@@ -22,6 +22,7 @@ class Composable:
     """
 
     __slots__ = ()
+    __array_ufunc__ = None  # an array of numbers times a plan would be an array of plans
 
     def __add__(self, other: Composable) -> Sequential:
         """This one, then the other."""

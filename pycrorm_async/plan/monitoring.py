@@ -34,8 +34,8 @@ class Monitor(Expression):
     asked for is no failure: what comes after the monitor goes on. What a plan does in `finally` is performed.
 
     Args:
-        condition: asked in the plan's own loop, so it must be quick, or async; what it raises interrupts too, and is
-            raised. An `asyncio.Event` interrupts when it is set.
+        condition: asked in the plan's own loop, so it must be quick; an async one is awaited before each node, so it
+            must be quick too. What it raises interrupts, and is raised. An `asyncio.Event` interrupts when it is set.
         interval_s: how often it is asked; it is asked before each node that starts inside besides.
 
     Attributes:

@@ -67,8 +67,8 @@ async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_every_verb_the_readme_names_exists(tmp_path: Path) -> None:
     verbs = set(re.findall(r"^pycrorm (\w+)", README, re.MULTILINE))
-    assert verbs == {"demo", "run", "episodes", "show", "writer"}
+    assert verbs == {"demo", "run", "episodes", "show", "writer", "status", "spool"}
     for verb in sorted(verbs):
         done = pycrorm(verb, "--help", cwd=tmp_path)
         assert done.returncode == 0
-        assert "--url" in done.stdout
+        assert ("repair" if verb == "spool" else "--url") in done.stdout
