@@ -132,7 +132,7 @@ def _one_line(failure: BaseException | None) -> str | None:
     own = [
         frame
         for frame in frames
-        if "pycrorm_async" not in Path(frame.filename).parts and not frame.filename.startswith(library)
+        if "pycrorm_async" not in Path(frame.filename).parts and not frame.filename.startswith((library, "<"))
     ]
     where = f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
     message = " ".join(message_of(failure).split())

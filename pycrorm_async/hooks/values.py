@@ -244,7 +244,10 @@ def _in_force(meant: ObjectDesignator, references: References) -> ObjectReferenc
 
 
 def _maybe_pose(value: Any) -> PoseValue | None:
-    pose = value.pose
+    try:
+        pose = value.pose
+    except Exception:  # noqa: BLE001  a part of what was removed, a link that is not there: `perform` says so itself
+        return None
     return _pose(pose, None, _NOBODY) if pose is not None else None
 
 

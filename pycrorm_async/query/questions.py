@@ -42,7 +42,7 @@ class EpisodeSummary:
     Attributes:
         number, id: its number in this database, its UUID.
         duration_ns: from its first to its last event; None while it runs.
-        nodes: of its task tree, the root included; `failed` of them ended otherwise than well.
+        nodes: of its task tree, the root included; `failed` of them failed, raised an error or were lost.
         simulated: it was thought through in a copy of the world, and nothing of it happened.
         thought_by: who thought it, as far as that is known.
     """
@@ -118,10 +118,10 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
 def _overview() -> Select[*tuple[Any, ...]]:
     node, episode = TaskTreeNode, ProcessMetaData
     thinker, thinking = aliased(ProcessMetaData), aliased(TaskTreeNode)
-    ended_well = node.status.in_([TaskStatus.SUCCEEDED, TaskStatus.RUNNING])
+    ended_badly = node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST])
     of_it = node.process_metadata_id == episode.id
     nodes = select(func.count()).where(of_it).scalar_subquery()
-    failed = select(func.count()).where(of_it, ~ended_well).scalar_subquery()
+    failed = select(func.count()).where(of_it, ended_badly).scalar_subquery()
     thinking_id = thinker.id * row_id(1, 0, SLOT_NODE) + episode.thought_by_node * row_id(0, 1, SLOT_NODE)
     return (
         select(

@@ -227,10 +227,13 @@ async def test_motions_at_the_same_time_each_have_the_state_they_ended_in(rig: R
 
     with rig.episode(), ChosenRobot("mine", Robot(drive)):
         await asyncio.gather(first(), NavigateActionPerformable(Pose([0, 2, 0])).perform())
+    # A channel is written where it differs from what was: the state at a moment is what was written last before it.
+    state: dict[str, float] = {}
     ends: dict[int, dict[str, float]] = {}
     for each in samples(rig):
         assert each.node is not None
-        ends.setdefault(each.node, {}).update(each.channels)
+        state |= each.channels
+        ends[each.node] = dict(state)
     one, two = (ends[node] for node in sorted(ends))
     assert one["base.x"] == 1.0
     assert (two["base.x"], two["base.y"]) == (1.0, 2.0)

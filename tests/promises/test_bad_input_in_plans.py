@@ -91,6 +91,12 @@ async def removed(scene: Lab) -> None:
     await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
 
 
+async def opened_a_part_of_what_was_removed(scene: Lab) -> None:
+    lid = ObjectPart("lid", scene.milk)
+    scene.milk.remove()
+    await OpenActionPerformable(lid, Arms.LEFT).perform()
+
+
 async def located(location: Any) -> object:
     return location.resolve()
 
@@ -169,6 +175,13 @@ CASES = {
         "milk is not an object of the world",
         ["milk"],
         ("PickUpAction",),
+    ),
+    "a part of an object that was removed": Case(
+        opened_a_part_of_what_was_removed,
+        "PerceptionObjectNotInWorld",
+        "milk is not an object of the world",
+        ["milk"],
+        ("OpenAction",),
     ),
     "an object that is only believed": Case(
         lambda _: PickUpActionPerformable(
