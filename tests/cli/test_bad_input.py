@@ -74,6 +74,10 @@ async def twins():
     await NoteActionPerformable("a").perform()
     await NoteAction().perform()
 
+async def list_for_a_pose():
+    await NoteActionPerformable("a").perform()
+    NavigateActionPerformable([0.6, 0.4, 0])
+
 async def two_episodes(memory):
     async with memory.episode(description="outer"):
         await NoteActionPerformable("a").perform()
@@ -140,6 +144,7 @@ def test_a_call_that_cannot_be_carried_out_is_one_line(
         ("nan_in_a_pose", "NavigateAction.target_location cannot be recorded: the pose holds", "ERROR"),
         ("unrecordable", "NoteAction.weight cannot be recorded: a str stands where a float was declared", "ERROR"),
         ("reserved", "BadActionPerformable cannot be declared: field 'robot_state' has a reserved name", "ERROR"),
+        ("list_for_a_pose", "expected Pose, got list [0.6, 0.4, 0] (plans.py:", "ERROR"),
         ("twins", "plans.NoteActionPerformable is 'NoteAction' already", "ERROR"),
         ("two_episodes", "is open in this task already", "ERROR"),
     ],
