@@ -1,16 +1,18 @@
-"""The tables of one generation and the views in front of them: made when missing, grown when types are declared.
+"""The tables of a generation and the views in front of them: made when missing, grown when types are declared.
 
-`pycrorm_generation` notes for the projection which generation people see, its layout, and a revision that counts its
-changes: who folds has read it before and finds in its own transaction that it still holds. Everything here runs in the
-caller's transaction, tables and views too.
+`pycrorm_generation` notes which generation people see (`tables`) and which one is being made beside it
+(`tables/making`) or waits to be dropped (`tables/gone/6`): its number, its layout, and a revision that counts the
+changes. Who folds has read the note before, and holds it in its own transaction: nobody shows another generation
+meanwhile. Everything here runs in the caller's transaction, tables and views too.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeAlias
 
 import msgspec
-from sqlalchemy import text
+from sqlalchemy import Integer, Text, column, delete, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, Index
 
@@ -28,11 +30,33 @@ from pycrorm_async.projections.tables import (
 from pycrorm_async.projections.views import view_text
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["Generation", "PROJECTION", "PROJECTION_VERSION", "current_generation", "make_generation", "grow"]
+__all__ = [
+    "Generation",
+    "Hold",
+    "PROJECTION_VERSION",
+    "SHOWN",
+    "MAKING",
+    "GONE",
+    "current_generation",
+    "noted",
+    "all_noted",
+    "note",
+    "forget",
+    "make_generation",
+    "make_empty",
+    "grow_tables",
+    "show",
+]
 
-PROJECTION = "tables"
 PROJECTION_VERSION = 3
 """Counts what the fold means: tables of an older version must be rebuilt."""
+
+SHOWN = "tables"
+MAKING = "tables/making"
+GONE = "tables/gone/"
+
+Hold: TypeAlias = Literal["share", "change"]
+"""Until the transaction ends nobody else changes the note; with `change`, nobody else holds it either."""
 
 _NOTES = "pycrorm_generation"
 _CREATE = f"""
@@ -43,74 +67,126 @@ CREATE TABLE IF NOT EXISTS {_NOTES} (
  revision INTEGER NOT NULL,
  layout TEXT NOT NULL,
  views TEXT NOT NULL)"""
-_SELECT = text(
-    f"SELECT version, generation, revision, layout, views FROM {_NOTES} WHERE projection = :projection"  # noqa: S608
-)
 _UPSERT = text(f"""
 INSERT INTO {_NOTES} (projection, version, generation, revision, layout, views)
 VALUES (:projection, :version, :generation, :revision, :layout, :views)
 ON CONFLICT (projection) DO UPDATE SET version = excluded.version, generation = excluded.generation,
  revision = excluded.revision, layout = excluded.layout, views = excluded.views""")  # noqa: S608
+_notes = table(
+    _NOTES,
+    column("projection", Text()),
+    column("version", Integer()),
+    column("generation", Integer()),
+    column("revision", Integer()),
+    column("layout", Text()),
+    column("views", Text()),
+)
 
 
 @dataclass(frozen=True)
 class Generation:
-    """The tables people see: number, how often they changed, what they hold, and the SQL of every view by name."""
+    """Number, how often it changed, what it holds, the SQL of every view by name, and which fold made it."""
 
     number: int
     revision: int
     layout: Layout
     views: dict[str, str]
+    version: int = PROJECTION_VERSION
 
 
-async def current_generation(connection: AsyncConnection) -> Generation | None:
+async def current_generation(connection: AsyncConnection, *, hold: Hold | None = None) -> Generation | None:
     """What people see now; None in a memory without tables. Raises `DatabaseForeign` for another version's."""
-    if not await dialect_of(connection).has_table(connection, _NOTES):
-        return None
-    found = (await connection.execute(_SELECT, {"projection": PROJECTION})).first()
-    if found is None:
-        return None
-    if found.version != PROJECTION_VERSION:
+    found = await noted(connection, SHOWN, hold=hold)
+    if found is not None and found.version != PROJECTION_VERSION:
         raise DatabaseForeign(
             f"the tables were made by version {found.version} of the fold, this is version {PROJECTION_VERSION}:"
             + (" use a newer pycrorm" if found.version > PROJECTION_VERSION else " run `pycrorm rebuild`")
         )
-    return Generation(
-        number=found.generation,
-        revision=found.revision,
-        layout=msgspec.json.decode(found.layout, type=Layout),
-        views=msgspec.json.decode(found.views, type=dict[str, str]),
-    )
+    return found
+
+
+async def noted(connection: AsyncConnection, name: str, *, hold: Hold | None = None) -> Generation | None:
+    """The generation under that name, of whatever version."""
+    if not await dialect_of(connection).has_table(connection, _NOTES):
+        return None
+    asked = select(_notes).where(_notes.c.projection == name)
+    if hold is not None:  # SQLite has no row locks, and needs none: who writes there is alone
+        asked = asked.with_for_update(read=hold == "share")
+    found = (await connection.execute(asked)).first()
+    return None if found is None else _generation(found)
+
+
+async def all_noted(connection: AsyncConnection) -> dict[str, Generation]:
+    """Every generation there is, by the name it is noted under."""
+    if not await dialect_of(connection).has_table(connection, _NOTES):
+        return {}
+    rows = await connection.execute(select(_notes).order_by(_notes.c.projection))
+    return {row.projection: _generation(row) for row in rows}
+
+
+def _generation(row: Any) -> Generation:
+    try:
+        layout = msgspec.json.decode(row.layout, type=Layout)
+    except msgspec.DecodeError:  # another version's, of which the number is enough
+        layout = Layout()
+    views = msgspec.json.decode(row.views, type=dict[str, str])
+    return Generation(row.generation, row.revision, layout, views, row.version)
+
+
+async def note(connection: AsyncConnection, name: str, generation: Generation) -> None:
+    """Notes it under that name, in place of what was noted there."""
+    values = {
+        "projection": name,
+        "version": generation.version,
+        "generation": generation.number,
+        "revision": generation.revision,
+        "layout": msgspec.json.encode(generation.layout).decode(),
+        "views": msgspec.json.encode(generation.views).decode(),
+    }
+    await connection.execute(_UPSERT, values)
+
+
+async def forget(connection: AsyncConnection, name: str) -> None:
+    """Nothing is noted under that name afterwards."""
+    await connection.execute(delete(_notes).where(_notes.c.projection == name))
 
 
 async def make_generation(connection: AsyncConnection, number: int) -> Generation:
-    """Makes the tables every memory has, in a generation of this number. Nobody sees them before `grow`."""
+    """Makes the tables every memory has, in a generation of this number. Nobody sees them before `show`."""
     await dialect_of(connection).make_place(connection)
     await connection.exec_driver_sql(_CREATE)
     for name, columns in CORE.items():
-        await _make_table(connection, name, columns, number)
+        await make_empty(connection, name, columns, number)
     return Generation(number, 0, Layout(), {})
 
 
-async def grow(connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-    """Makes what this layout has more than the generation, and the views anew that are different now."""
+async def grow_tables(connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
+    """Makes what this layout has more than the generation; its views stay as they are."""
     for name, columns in layout.leaves.items():
         present = generation.layout.leaves.get(name)
         if present is None:
-            await _make_table(connection, name, {"id": "key", **columns}, generation.number)
+            await make_empty(connection, name, {"id": "key", **columns}, generation.number)
         else:
             await _add_columns(connection, name, columns, present, generation.number)
+    return replace(generation, revision=generation.revision + 1, layout=layout)
+
+
+async def show(connection: AsyncConnection, generation: Generation) -> Generation:
+    """Puts views in front of its tables, in place of those of whatever was shown before."""
+    before = await noted(connection, SHOWN, hold="change")
+    layout = generation.layout
     views = {
         name: view_text(meaning, connection.dialect)
         for name, meaning in public_views(layout, generation.number).items()
     } | layout.user_views
-    await dialect_of(connection).replace_views(connection, generation.views, views)
-    grown = replace(generation, revision=generation.revision + 1, layout=layout, views=views)
-    await _note(connection, grown)
-    return grown
+    await dialect_of(connection).replace_views(connection, before.views if before else {}, views)
+    shown = replace(generation, views=views)
+    await note(connection, SHOWN, shown)
+    return shown
 
 
-async def _make_table(connection: AsyncConnection, name: str, columns: dict[str, Storage], generation: int) -> None:
+async def make_empty(connection: AsyncConnection, name: str, columns: dict[str, Storage], generation: int) -> None:
+    """Makes one table of a generation, and its indexes."""
     table = make_table(name, columns, generation)
     await connection.execute(CreateTable(table))
     for index in sorted(table.indexes, key=lambda each: str(each.name)):
@@ -125,26 +201,13 @@ async def _add_columns(
     generation: int,
 ) -> None:
     table = make_table(name, {"id": "key", **columns}, generation)
-    quoted = connection.dialect.identifier_preparer.quote(physical_name(name, generation))
-    for column in columns.keys() - present.keys():
-        definition = CreateColumn(table.c[column]).compile(dialect=connection.dialect)
-        await connection.exec_driver_sql(f"ALTER TABLE {quoted} ADD COLUMN {definition}")
-        if column in indexed(name, columns):
-            named = index_name(name, column, generation)
+    for new in columns.keys() - present.keys():
+        definition = CreateColumn(table.c[new]).compile(dialect=connection.dialect)
+        await dialect_of(connection).add_column(connection, physical_name(name, generation), str(definition))
+        if new in indexed(name, columns):
+            named = index_name(name, new, generation)
             await connection.execute(CreateIndex(_index_named(table.indexes, named)))
 
 
 def _index_named(indexes: set[Index], name: str) -> Index:
     return next(each for each in indexes if each.name == name)
-
-
-async def _note(connection: AsyncConnection, generation: Generation) -> None:
-    noted = {
-        "projection": PROJECTION,
-        "version": PROJECTION_VERSION,
-        "generation": generation.number,
-        "revision": generation.revision,
-        "layout": msgspec.json.encode(generation.layout).decode(),
-        "views": msgspec.json.encode(generation.views).decode(),
-    }
-    await connection.execute(_UPSERT, noted)

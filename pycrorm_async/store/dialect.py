@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 
 __all__ = ["Dialect", "Birth", "Found", "Migrations", "Progress", "RowRefused"]
 
@@ -90,7 +91,9 @@ class Dialect(Protocol):
 
     async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
 
-    async def behind(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
+    async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
+        """By number, those that follow number `after`."""
+        ...
 
     async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
 
@@ -98,7 +101,9 @@ class Dialect(Protocol):
         self, connection: AsyncConnection, number: int, *, after: int, limit: int
     ) -> list[StoredEvent]: ...
 
-    async def unfolded(self, connection: AsyncConnection, limit: int) -> list[StoredEvent]: ...
+    async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
+        """The events of each span, in the order of the spans."""
+        ...
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]: ...
 
@@ -120,10 +125,30 @@ class Dialect(Protocol):
         """Whether there is a table of that name among them."""
         ...
 
+    async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
+        """Gives up soon where a reader is in the way, so that nobody waits behind the two for long."""
+        ...
+
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
-        """Name and SQL of each. A view may stand on those before it in `after`."""
+        """Name and SQL of each. A view may stand on those before it in `after`. Who reads the old ones goes on."""
+        ...
+
+    async def sweep(self, connection: AsyncConnection) -> None:
+        """Takes away the views that were replaced, unless somebody reads them or stands on them. Waits for nobody."""
+        ...
+
+    async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:
+        """Deletes rows of a table that is to be dropped; False if dropping it takes no longer now than it must."""
+        ...
+
+    async def drop(self, connection: AsyncConnection, table: str) -> None:
+        """Gives up soon where somebody is in the way; refuses where a view of somebody else stands on it."""
+        ...
+
+    def claim(self, engine: AsyncEngine) -> AbstractAsyncContextManager[bool]:
+        """Whether nobody else makes tables anew here; then nobody can until the context is left or the process dies."""
         ...
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:

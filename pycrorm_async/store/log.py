@@ -19,12 +19,12 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseUnavailable, PycrormError
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import append_batch
 from pycrorm_async.store.dialect import Dialect
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent, share_out
 from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
 from pycrorm_async.store.sqlite.engine import BEGIN
 
@@ -126,15 +126,26 @@ class EventLog:
         async with self._reading() as connection:
             return await self._dialect.events(connection, number, after=after, limit=limit)
 
-    async def unfolded(self, limit: int = 10_000) -> list[StoredEvent]:
-        """What the tables do not show yet, by episode and sequence, at most `limit`; nothing of parked episodes."""
+    async def spans(self, spans: Sequence[Span]) -> list[StoredEvent]:
+        """The events of each span, in the order of the spans."""
         async with self._reading() as connection:
-            return await self._dialect.unfolded(connection, limit)
+            return await self._dialect.spans(connection, spans)
+
+    async def unfolded(self, limit: int = 10_000, *, after: int = 0) -> list[StoredEvent]:
+        """What the tables do not show yet, at most `limit` events, some of each episode; nothing of parked episodes.
+
+        Begins with the episodes that follow number `after`, and with the first one when there are none.
+        """
+        async with self._reading() as connection:
+            behind = await self._dialect.behind(connection, after=after, limit=limit)
+            if not behind and after:
+                behind = await self._dialect.behind(connection, after=0, limit=limit)
+            return await self._dialect.spans(connection, share_out(behind, limit))
 
     async def behind(self) -> list[EpisodeRow]:
         """The episodes of which the tables do not show all; without the parked ones."""
         async with self._reading() as connection:
-            return await self._dialect.behind(connection)
+            return await self._dialect.behind(connection, after=0, limit=EPISODE_NUMBER_MAX)
 
     async def stopped(self) -> list[EpisodeRow]:
         """The episodes that the log refused something of, or that are parked; the rows say why."""

@@ -1,10 +1,11 @@
-"""What the log gives back: an event as it is stored, and the state of an episode."""
+"""What the log gives back: an event as it is stored, and the state of an episode; and what is asked for at once."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
-__all__ = ["StoredEvent", "EpisodeRow"]
+__all__ = ["StoredEvent", "EpisodeRow", "Span", "share_out"]
 
 
 class StoredEvent(NamedTuple):
@@ -41,3 +42,32 @@ class EpisodeRow(NamedTuple):
     ended_wall_ns: int | None = None
     refused: str | None = None
     parked: str | None = None
+
+
+class Span(NamedTuple):
+    """The events of an episode from the one that follows sequence `after` to sequence `last`."""
+
+    number: int
+    after: int
+    last: int
+
+
+_SHARE_MIN = 1_000
+"""So much of an episode is read at once even if many wait: rows that lie together are read and written together."""
+
+
+def share_out(behind: Sequence[EpisodeRow], limit: int) -> list[Span]:
+    """What of these episodes is read next, at most `limit` events: something of each, so that none waits for long.
+
+    >>> share_out([EpisodeRow(1, "", head=90_000, folded=0, started_wall_ns=0)], 100)
+    [Span(number=1, after=0, last=100)]
+    """
+    share = max(limit // len(behind), _SHARE_MIN) if behind else 0
+    spans: list[Span] = []
+    for each in behind:
+        count = min(each.head - each.folded, share, limit)
+        if count <= 0:
+            break
+        spans.append(Span(each.number, each.folded, each.folded + count))
+        limit -= count
+    return spans

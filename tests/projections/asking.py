@@ -28,7 +28,7 @@ _KINDS = {"sqlite": {"table": "'table'", "view": "'view'"}, "postgresql": {"tabl
 _NAMED = {
     "sqlite": "SELECT name FROM sqlite_master WHERE type IN ({}) ORDER BY name",
     "postgresql": "SELECT relname FROM pg_class JOIN pg_namespace AS place ON place.oid = relnamespace"
-    " WHERE nspname IN ('memory', 'pycrorm') AND relkind IN ({}) ORDER BY relname",
+    " WHERE nspname IN ('memory', 'memory_tables', 'pycrorm') AND relkind IN ({}) ORDER BY relname",
 }
 
 

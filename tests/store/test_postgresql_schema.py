@@ -138,7 +138,7 @@ def test_eight_processes_that_open_a_new_database_at_once_agree_on_one_log_and_o
     ids = {output.strip() for output, _ in told}
     assert len(ids) == 1
     assert ask(url, "SELECT id FROM pycrorm_log") == [(ids.pop(),)]
-    assert ask(url, "SELECT count(*) FROM memory.pycrorm_generation") == [(1,)]
+    assert ask(url, "SELECT count(*) FROM memory_tables.pycrorm_generation") == [(1,)]
 
 
 # --- roles ------------------------------------------------------------------------------------------------------

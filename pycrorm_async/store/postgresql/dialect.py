@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager
+from typing import Any, NamedTuple
 
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress, RowRefused
 from pycrorm_async.store.postgresql import faults, tables
 from pycrorm_async.store.postgresql import statements as sql
-from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA
-from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
+from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 
 __all__ = ["PostgreSQL"]
 
@@ -85,8 +85,8 @@ class PostgreSQL:
     async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES)
 
-    async def behind(self, connection: AsyncConnection) -> list[EpisodeRow]:
-        return await _rows(EpisodeRow, connection, sql.SELECT_BEHIND)
+    async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_BEHIND, after, limit)
 
     async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, sql.SELECT_STOPPED)
@@ -94,8 +94,8 @@ class PostgreSQL:
     async def events(self, connection: AsyncConnection, number: int, *, after: int, limit: int) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
 
-    async def unfolded(self, connection: AsyncConnection, limit: int) -> list[StoredEvent]:
-        return await _rows(StoredEvent, connection, sql.SELECT_UNFOLDED, limit)
+    async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_SPANS, *_arrays(spans, 3))
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
@@ -116,26 +116,69 @@ class PostgreSQL:
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
         return bool((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).scalar_one())
 
+    async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        await connection.exec_driver_sql(tables.WAIT_BRIEFLY)
+        await connection.exec_driver_sql(f"ALTER TABLE {quote(table)} ADD COLUMN {definition}")
+        await connection.exec_driver_sql(tables.WAIT_AS_EVER)
+
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
-        """All of them, because views stand on views; readers wait for the few ms, and see all old or all new."""
+        """All of them, made aside and put in place by renaming: to replace a view it would have to be locked, and so
+        to wait for every reader in a transaction, with every new reader waiting behind."""
         if before == after:
             return
+        found = await connection.exec_driver_sql(tables.IN_VIEWS_SCHEMA, (list(before),))
+        strangers = list(found.scalars())
+        if strangers:
+            raise DatabaseError(
+                f"{VIEWS_SCHEMA}.{strangers[0]} is not of the memory, and the schema {VIEWS_SCHEMA} is made anew with"
+                " every change: move it to another schema"
+            )
         quote = connection.dialect.identifier_preparer.quote
-        if before:
-            await connection.exec_driver_sql(f"DROP VIEW {', '.join(map(quote, before))} CASCADE")
-        for name, text in after.items():
-            await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
+        for statement in tables.NEW_VIEWS_SCHEMA:
+            await connection.exec_driver_sql(statement)
+        await _execute(connection, *(f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()))
+        for statement in tables.SHOW_NEW_VIEWS_SCHEMA:
+            await connection.exec_driver_sql(statement)
+
+    async def sweep(self, connection: AsyncConnection) -> None:
+        for schema, views in await _rows(_Gone, connection, tables.GONE_SCHEMAS):
+            try:
+                async with connection.begin_nested():
+                    await connection.exec_driver_sql(tables.WAIT_FOR_NOBODY)
+                    if views:
+                        await connection.exec_driver_sql(f"DROP VIEW {', '.join(views)}")
+                    await connection.exec_driver_sql(f"DROP SCHEMA {schema}")
+            except DBAPIError:
+                continue  # somebody reads them, or stands on them: next time
+
+    async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:  # noqa: ARG002
+        return False  # dropping deletes files, whatever is in them
+
+    async def drop(self, connection: AsyncConnection, table: str) -> None:
+        await connection.exec_driver_sql(tables.WAIT_FOR_NOBODY)
+        name = connection.dialect.identifier_preparer.quote(table)
+        await connection.exec_driver_sql(f"DROP TABLE IF EXISTS {TABLES_SCHEMA}.{name}")
+
+    @asynccontextmanager
+    async def claim(self, engine: AsyncEngine) -> AsyncIterator[bool]:
+        async with engine.connect() as connection:
+            # No transaction stays open, which would be ended for idling; the lock is the session's.
+            connection = await connection.execution_options(isolation_level="AUTOCOMMIT")
+            claimed = bool((await connection.exec_driver_sql(tables.CLAIM)).scalar_one())
+            try:
+                yield claimed
+            finally:
+                if claimed:
+                    await connection.exec_driver_sql(tables.RELEASE)
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
         quote = connection.dialect.identifier_preparer.quote
         # Also where a connection may only read: a temporary view is nobody else's.
         await connection.exec_driver_sql("SET TRANSACTION READ WRITE")
-        driver = (await connection.get_raw_connection()).driver_connection
-        assert driver is not None
-        # One message for all of them, instead of one each.
-        await driver.execute("; ".join(f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()))
+        await _execute(connection, *(f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()))
 
     async def insert_rows(
         self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
@@ -158,6 +201,20 @@ class PostgreSQL:
 
     def ours(self, error: Exception, name: str) -> PycrormError:
         return faults.ours(error, name)
+
+
+class _Gone(NamedTuple):
+    """A schema of views that were replaced."""
+
+    schema: str
+    views: list[str] | None
+
+
+async def _execute(connection: AsyncConnection, *statements: str) -> None:
+    """One message for all of them, instead of one each."""
+    driver = (await connection.get_raw_connection()).driver_connection
+    assert driver is not None
+    await driver.execute("; ".join(statements))
 
 
 async def _copy(

@@ -5,12 +5,14 @@ from __future__ import annotations
 from sqlalchemy import URL
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 
-__all__ = ["make_engine", "refusal", "WHERE", "LOG_SCHEMA", "TABLES_SCHEMA", "ANSWER_S_MAX"]
+__all__ = ["make_engine", "refusal", "WHERE", "LOG_SCHEMA", "TABLES_SCHEMA", "VIEWS_SCHEMA", "ANSWER_S_MAX"]
 
 LOG_SCHEMA = "pycrorm"
 """Where the log is."""
-TABLES_SCHEMA = "memory"
-"""Where the tables and views made from it are."""
+TABLES_SCHEMA = "memory_tables"
+"""Where the tables made from it are, generation beside generation."""
+VIEWS_SCHEMA = "memory"
+"""Where the views in front of them are: what people read. Replaced as a whole."""
 
 ANSWER_S_MAX = 60.0
 """A statement that takes longer counts as a server that is away."""
@@ -50,7 +52,7 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
     """
     settings = {
         "application_name": "pycrorm",
-        "search_path": f"{TABLES_SCHEMA}, {LOG_SCHEMA}",
+        "search_path": f"{TABLES_SCHEMA}, {VIEWS_SCHEMA}, {LOG_SCHEMA}",  # what is made without a schema is a table
         "synchronous_commit": "on",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
         "lock_timeout": f"{int(busy_timeout_s * 1000)}",
         "idle_in_transaction_session_timeout": "60000",

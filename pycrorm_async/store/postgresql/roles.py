@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from pycrorm_async.store.postgresql.engine import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql.engine import TABLES_SCHEMA as TABLES
+from pycrorm_async.store.postgresql.engine import VIEWS_SCHEMA as VIEWS
 
 __all__ = ["GRANTS"]
 
@@ -32,9 +33,11 @@ BEGIN
             EXECUTE format('CREATE ROLE %I NOLOGIN', name);
         END IF;
     END LOOP;
+    EXECUTE format('GRANT CREATE ON DATABASE %I TO pycrorm_folder', current_database());
     EXECUTE 'ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder';
+    EXECUTE 'ALTER SCHEMA {VIEWS} OWNER TO pycrorm_folder';
     FOR name IN SELECT oid::regclass FROM pg_class
-        WHERE relnamespace = '{TABLES}'::regnamespace AND relkind IN ('r', 'v', 'm') LOOP
+        WHERE relnamespace IN ('{TABLES}'::regnamespace, '{VIEWS}'::regnamespace) AND relkind IN ('r', 'v', 'm') LOOP
         EXECUTE format('ALTER TABLE %s OWNER TO pycrorm_folder', name);
     END LOOP;
 END $$"""  # noqa: S608
@@ -44,16 +47,18 @@ _APPENDING = "pycrorm_recorder, pycrorm_folder"
 
 GRANTS: tuple[str, ...] = (
     _MADE,
-    f"REVOKE ALL ON SCHEMA {LOG}, {TABLES} FROM PUBLIC",
+    f"REVOKE ALL ON SCHEMA {LOG}, {TABLES}, {VIEWS} FROM PUBLIC",
     f"GRANT USAGE ON SCHEMA {LOG} TO {_READING}",
     f"GRANT SELECT ON ALL TABLES IN SCHEMA {LOG} TO {_READING}",
     f"GRANT INSERT ON {LOG}.event, {LOG}.episode, {LOG}.pycrorm_declaration TO {_APPENDING}",
     f"GRANT UPDATE (head, ended_wall_ns, refused) ON {LOG}.episode TO {_APPENDING}",
     f"GRANT USAGE ON SEQUENCE {LOG}.episode_number TO {_APPENDING}",
     f"GRANT UPDATE (folded, parked) ON {LOG}.episode TO pycrorm_folder",
-    f"GRANT USAGE ON SCHEMA {TABLES} TO pycrorm_reader",
+    f"GRANT USAGE ON SCHEMA {TABLES}, {VIEWS} TO pycrorm_reader",
     f"GRANT SELECT ON ALL TABLES IN SCHEMA {TABLES} TO pycrorm_reader",
-    # What the folder makes later: tables of new types, and views, which are made anew with each of them.
-    f"ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder IN SCHEMA {TABLES} GRANT SELECT ON TABLES TO pycrorm_reader",
+    f"GRANT SELECT ON ALL TABLES IN SCHEMA {VIEWS} TO pycrorm_reader",
+    # What the folder makes later: tables, and the schema of the views, which is made anew with each change of them.
+    "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT USAGE ON SCHEMAS TO pycrorm_reader",
+    "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT SELECT ON TABLES TO pycrorm_reader",
 )
 """Statements for the owner of the database, in order; each may be run again."""

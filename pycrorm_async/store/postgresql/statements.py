@@ -15,7 +15,7 @@ __all__ = [
     "SELECT_BEHIND",
     "SELECT_STOPPED",
     "SELECT_EVENTS",
-    "SELECT_UNFOLDED",
+    "SELECT_SPANS",
     "SELECT_DECLARATIONS",
     "ADVANCE_FOLDED",
     "PARK",
@@ -53,16 +53,22 @@ SELECT {_EPISODE} FROM pycrorm.episode WHERE id = ANY ($1::text[]) ORDER BY numb
 
 SELECT_EPISODE_BY_ID = f"SELECT {_EPISODE} FROM pycrorm.episode WHERE id = $1"
 SELECT_EPISODES = f"SELECT {_EPISODE} FROM pycrorm.episode ORDER BY number"
-SELECT_BEHIND = f"SELECT {_EPISODE} FROM pycrorm.episode WHERE folded < head AND parked IS NULL ORDER BY number"
+SELECT_BEHIND = f"""
+SELECT {_EPISODE} FROM pycrorm.episode
+WHERE folded < head AND parked IS NULL AND number > $1 ORDER BY number LIMIT $2"""
 SELECT_STOPPED = f"""
 SELECT {_EPISODE} FROM pycrorm.episode WHERE refused IS NOT NULL OR parked IS NOT NULL ORDER BY number"""
 
 SELECT_EVENTS = f"""
 SELECT {_EVENT} FROM pycrorm.event WHERE episode = $1 AND sequence > $2 ORDER BY sequence LIMIT $3"""
 
-SELECT_UNFOLDED = f"""
-SELECT {_EVENT} FROM pycrorm.episode JOIN pycrorm.event ON event.episode = number AND event.sequence > folded
-WHERE folded < head AND parked IS NULL ORDER BY number, event.sequence LIMIT $1"""
+# LATERAL, so that each span is read by the key, however much there is.
+SELECT_SPANS = f"""
+SELECT event.* FROM unnest($1::bigint[], $2::bigint[], $3::bigint[])
+WITH ORDINALITY AS span (number, after, last, place) CROSS JOIN LATERAL (
+    SELECT {_EVENT} FROM pycrorm.event
+    WHERE episode = span.number AND sequence > span.after AND sequence <= span.last ORDER BY sequence
+) AS event ORDER BY span.place, event.sequence"""
 
 SELECT_DECLARATIONS = "SELECT convert_to(payload, 'UTF8') FROM pycrorm.pycrorm_declaration ORDER BY ordinal"
 

@@ -5,13 +5,71 @@ from __future__ import annotations
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 from pycrorm_async.store.postgresql.engine import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql.engine import TABLES_SCHEMA as TABLES
+from pycrorm_async.store.postgresql.engine import VIEWS_SCHEMA as VIEWS
 
-__all__ = ["MIGRATIONS", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT", "SERVER_VERSION", "ALONE"]
+__all__ = [
+    "MIGRATIONS",
+    "TABLE_NAMES",
+    "HAS_TABLE",
+    "READ_LOG",
+    "INSERT_LOG",
+    "SET_FORMAT",
+    "SERVER_VERSION",
+    "ALONE",
+    "CLAIM",
+    "RELEASE",
+    "WAIT_BRIEFLY",
+    "WAIT_FOR_NOBODY",
+    "WAIT_AS_EVER",
+    "IN_VIEWS_SCHEMA",
+    "NEW_VIEWS_SCHEMA",
+    "SHOW_NEW_VIEWS_SCHEMA",
+    "GONE_SCHEMAS",
+]
 
 SERVER_VERSION = "SELECT current_setting('server_version_num')::int"
 
 ALONE = "SELECT pg_advisory_xact_lock(7266203370152417861)"
 """The number says who we are: the first letters of our name as a number. IF NOT EXISTS alone races."""
+CLAIM = "SELECT pg_try_advisory_lock(7266203370152417862)"
+RELEASE = "SELECT pg_advisory_unlock(7266203370152417862)"
+
+# Less than deadlock_timeout: whoever changes tables is the one who gives up, never a reader.
+WAIT_BRIEFLY = "SET LOCAL lock_timeout = '300ms'"
+WAIT_FOR_NOBODY = "SET LOCAL lock_timeout = '20ms'"
+WAIT_AS_EVER = "SET LOCAL lock_timeout TO DEFAULT"
+
+_NEW = f"{VIEWS}_new"
+
+IN_VIEWS_SCHEMA = f"""
+SELECT coalesce(relname, objid::text) FROM pg_namespace
+JOIN pg_depend ON refclassid = 'pg_namespace'::regclass AND refobjid = pg_namespace.oid
+LEFT JOIN pg_class ON classid = 'pg_class'::regclass AND pg_class.oid = objid
+WHERE nspname = '{VIEWS}' AND (relname = ANY ($1::text[])) IS NOT TRUE
+AND classid <> 'pg_default_acl'::regclass"""  # noqa: S608
+"""What is in the schema of the views beside these."""
+
+NEW_VIEWS_SCHEMA = (
+    f"CREATE SCHEMA {_NEW}",
+    f"SET LOCAL search_path = {_NEW}, {TABLES}, {LOG}",
+)
+SHOW_NEW_VIEWS_SCHEMA = (
+    f"""
+DO $$
+BEGIN
+    IF to_regnamespace('{VIEWS}') IS NOT NULL THEN
+        EXECUTE format('ALTER SCHEMA {VIEWS} RENAME TO %I', '{VIEWS}_gone_' || pg_current_xact_id());
+    END IF;
+END $$""",
+    f"ALTER SCHEMA {_NEW} RENAME TO {VIEWS}",
+    "SET LOCAL search_path TO DEFAULT",
+)
+
+GONE_SCHEMAS = f"""
+SELECT quote_ident(nspname), array_agg(format('%I.%I', nspname, relname)) FILTER (WHERE relkind = 'v')
+FROM pg_namespace LEFT JOIN pg_class ON relnamespace = pg_namespace.oid
+WHERE starts_with(nspname, '{VIEWS}_gone_') AND pg_has_role(nspowner, 'USAGE') GROUP BY nspname"""  # noqa: S608
+"""Schemas of views that were replaced, and the views in them."""
 
 _LOG = f"""
 CREATE TABLE {LOG}.pycrorm_log (

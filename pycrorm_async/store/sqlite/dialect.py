@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from itertools import accumulate, chain
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -13,9 +14,10 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress, RowRefused
-from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
+from pycrorm_async.store.sqlite.claim import claim
 from pycrorm_async.store.sqlite.engine import BEGIN
 
 __all__ = ["SQLite"]
@@ -88,8 +90,8 @@ class SQLite:
     async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES)
 
-    async def behind(self, connection: AsyncConnection) -> list[EpisodeRow]:
-        return await _rows(EpisodeRow, connection, sql.SELECT_BEHIND)
+    async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_BEHIND, after, limit)
 
     async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, sql.SELECT_STOPPED)
@@ -97,8 +99,8 @@ class SQLite:
     async def events(self, connection: AsyncConnection, number: int, *, after: int, limit: int) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
 
-    async def unfolded(self, connection: AsyncConnection, limit: int) -> list[StoredEvent]:
-        return await _rows(StoredEvent, connection, sql.SELECT_UNFOLDED, limit)
+    async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
+        return await _rows(StoredEvent, connection, sql.SELECT_SPANS, _json(spans))
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
@@ -119,6 +121,10 @@ class SQLite:
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
         return (await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).first() is not None
 
+    async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        await connection.exec_driver_sql(f"ALTER TABLE {quote(table)} ADD COLUMN {definition}")
+
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
@@ -129,6 +135,24 @@ class SQLite:
         for name, text in after.items():
             if before.get(name) != text:
                 await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
+
+    async def sweep(self, connection: AsyncConnection) -> None:
+        """What was replaced is gone; who reads it has a snapshot."""
+
+    async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:
+        # To drop a full table would hold the one write lock for seconds.
+        quoted = connection.dialect.identifier_preparer.quote(table)
+        some = f"SELECT rowid FROM {quoted} LIMIT {rows_max}"  # noqa: S608
+        deleted = await connection.exec_driver_sql(f"DELETE FROM {quoted} WHERE rowid IN ({some})")  # noqa: S608
+        return deleted.rowcount == rows_max
+
+    async def drop(self, connection: AsyncConnection, table: str) -> None:
+        await connection.exec_driver_sql(f"DROP TABLE IF EXISTS {connection.dialect.identifier_preparer.quote(table)}")
+
+    @asynccontextmanager
+    async def claim(self, engine: AsyncEngine) -> AsyncIterator[bool]:
+        with claim(Path(f"{engine.url.database}-rebuild")) as claimed:
+            yield claimed
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
         quote = connection.dialect.identifier_preparer.quote

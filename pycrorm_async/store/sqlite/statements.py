@@ -20,7 +20,7 @@ __all__ = [
     "SELECT_BEHIND",
     "SELECT_STOPPED",
     "SELECT_EVENTS",
-    "SELECT_UNFOLDED",
+    "SELECT_SPANS",
     "SELECT_DECLARATIONS",
     "ADVANCE_FOLDED",
     "PARK",
@@ -61,14 +61,16 @@ _EPISODE = "number, id, head, folded, started_wall_ns, ended_wall_ns, refused, p
 
 SELECT_EPISODES_BY_ID = f"SELECT {_EPISODE} FROM episode WHERE id IN (SELECT value FROM json_each(?))"
 SELECT_EPISODES = f"SELECT {_EPISODE} FROM episode ORDER BY number"
-SELECT_BEHIND = f"SELECT {_EPISODE} FROM episode WHERE folded < head AND parked IS NULL ORDER BY number"
+SELECT_BEHIND = f"""
+SELECT {_EPISODE} FROM episode WHERE folded < head AND parked IS NULL AND number > ? ORDER BY number LIMIT ?"""
 SELECT_STOPPED = f"SELECT {_EPISODE} FROM episode WHERE refused IS NOT NULL OR parked IS NOT NULL ORDER BY number"
 
 SELECT_EVENTS = f"SELECT {_EVENT} FROM event WHERE episode = ? AND sequence > ? ORDER BY sequence LIMIT ?"
 
-SELECT_UNFOLDED = f"""
-SELECT {_EVENT} FROM episode JOIN event ON event.episode = number AND event.sequence > folded
-WHERE folded < head AND parked IS NULL ORDER BY number, event.sequence LIMIT ?"""
+# CROSS JOIN is how SQLite is told to begin with the spans.
+SELECT_SPANS = f"""
+SELECT {_EVENT} FROM json_each(?) AS span CROSS JOIN event ON event.episode = span.value->>0
+AND event.sequence > span.value->>1 AND event.sequence <= span.value->>2 ORDER BY span.key, event.sequence"""
 
 SELECT_DECLARATIONS = "SELECT CAST(payload AS BLOB) FROM pycrorm_declaration ORDER BY ordinal"
 

@@ -1,0 +1,173 @@
+"""Folds batches of events into a generation: rows and progress in one transaction, or neither.
+
+Reading and folding hold no lock. The write transaction then checks that both the tables and the progress are as they
+were taken to be; if somebody else was quicker it is rolled back, and the events are read again. So any number may fold
+one memory, and none of them ever shows an event twice or half. Which generation it is and where its progress is noted
+is the `Goal`'s: of what people see (`projector`), or of what is made beside it (`rebuild`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
+from typing import Protocol
+
+from sqlalchemy.exc import DBAPIError
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.errors import DatabaseError
+from pycrorm_async.projections.fold import CannotFold, fold
+from pycrorm_async.projections.generations import Generation, Hold
+from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.parameters import Designators
+from pycrorm_async.projections.rows import Rows
+from pycrorm_async.projections.union import unite
+from pycrorm_async.projections.write import write_rows
+from pycrorm_async.store.dialect import Progress, RowRefused
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.rows import StoredEvent
+
+__all__ = ["Folding", "Goal", "Folded", "folded"]
+
+
+class Goal(Protocol):
+    """A generation that is folded into. Everything happens in the caller's transaction."""
+
+    async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
+        """As it is now, and stays until the transaction ends."""
+        ...
+
+    async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation: ...
+
+    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
+        """False if one of the episodes is not where it was believed to be: then nothing may be committed."""
+        ...
+
+    async def park(self, connection: AsyncConnection, number: int, reason: str) -> None: ...
+
+
+@dataclass(frozen=True)
+class Folded:
+    """A batch after the fold: its rows, (episode, folded before, folded now) of each episode, and why some stop."""
+
+    rows: Rows
+    steps: list[Progress]
+    parked: dict[int, str]
+
+
+@dataclass(frozen=True)
+class _Types:
+    """What the declarations that were read make of the generation's layout."""
+
+    payloads: list[bytes]
+    revision: int
+    layout: Layout
+    designators: Designators
+
+
+class Folding:
+    """Folds events of one log into one goal. `generation` is how it was when last looked at."""
+
+    def __init__(self, log: EventLog, goal: Goal, generation: Generation) -> None:
+        self._log = log
+        self._goal = goal
+        self.generation = generation
+        self._types: _Types | None = None
+
+    async def batch(self, events: Sequence[StoredEvent]) -> int:
+        """How many of them are folded now: fewer if an episode was parked, none if somebody else was quicker.
+
+        An event that cannot be folded parks its episode with the reason; what came before it is written, and the others
+        go on.
+        """
+        types = await self._types_now()
+        done = folded(events, types.designators)
+        try:
+            async with self._log.engine.begin() as connection:
+                written = await self._write(connection, done, types)
+                if written is None:
+                    await connection.rollback()
+                    return 0
+            self.generation = written
+        except RowRefused as refusal:
+            return await self._apart(events, refusal)
+        return sum(now - before for _, before, now in done.steps)
+
+    async def batch_in(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> bool:
+        """The same in the caller's transaction, which must not be committed if it says False or raises `RowRefused`."""
+        types = await self._types_now()
+        return await self._write(connection, folded(events, types.designators), types) is not None
+
+    async def _write(self, connection: AsyncConnection, done: Folded, types: _Types) -> Generation | None:
+        """The generation written to; None if the tables or the progress are not what the fold took them to be."""
+        growing = types.layout != self.generation.layout
+        if growing:
+            await dialect_of(connection).alone(connection)
+        generation = await self._goal.generation(connection, "change" if growing else "share")
+        if generation.revision != types.revision:
+            self.generation = generation
+            return None
+        if growing:
+            try:
+                generation = await self._goal.grow(connection, generation, types.layout)
+            except DBAPIError as error:
+                if "already exists" not in str(error.orig):
+                    raise
+                raise DatabaseError(
+                    f"{self._log.address}: {error.orig}, and the memory needs that name: rename yours, then flush again"
+                ) from error
+        if not await self._goal.advance(connection, done.steps):
+            return None
+        await write_rows(connection, done.rows, generation.number)
+        for number, reason in done.parked.items():
+            await self._goal.park(connection, number, reason)
+        return generation
+
+    async def _types_now(self) -> _Types:
+        """Read after the events: a declaration is stored before the first event that needs it."""
+        payloads = await self._log.declarations()
+        types = self._types
+        if types is None or types.revision != self.generation.revision or types.payloads != payloads:
+            layout, accepted, refused = unite(self.generation.layout, payloads)
+            types = _Types(payloads, self.generation.revision, layout, Designators(accepted, refused))
+            self._types = types
+        return types
+
+    async def _apart(self, events: Sequence[StoredEvent], refusal: RowRefused) -> int:
+        """The database refused a row of this batch: find the episode it belongs to, and park that one."""
+        episodes = [list(each) for _, each in groupby(events, key=attrgetter("number"))]
+        if len(episodes) > 1:
+            return sum([await self.batch(each) for each in episodes])
+        if len(events) > 1:
+            # Halves, so that all that comes before the event is shown.
+            middle = len(events) // 2
+            count = await self.batch(events[:middle])
+            return count + (await self.batch(events[middle:]) if count == middle else 0)
+        async with self._log.engine.begin() as connection:
+            reason = f"event {events[0].sequence}: the database refuses it: {refusal}"
+            await self._goal.park(connection, events[0].number, reason)
+        return 0
+
+
+def folded(events: Sequence[StoredEvent], designators: Designators) -> Folded:
+    """These events, those of an episode together and in order, as rows."""
+    rows, steps, parked = Rows(), [], {}
+    for number, episode in groupby(events, key=attrgetter("number")):
+        first = last = None
+        for event in episode:
+            if first is None:
+                first = last = event.sequence - 1
+            if number in parked:
+                continue
+            try:
+                fold(event, designators, rows)
+                last = event.sequence
+            except CannotFold as reason:
+                parked[number] = f"event {event.sequence}: {reason}"
+        assert first is not None
+        assert last is not None
+        steps.append((number, first, last))
+    return Folded(rows, steps, parked)

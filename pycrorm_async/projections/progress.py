@@ -1,0 +1,108 @@
+"""How far a generation that is being made has come: one row for each episode, in a table that goes with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sqlalchemy import TableClause, bindparam, column, or_, select, table, text, update
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.projections.tables import Storage, physical_name
+from pycrorm_async.store.dialect import Progress, RowRefused
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.rows import EpisodeRow
+
+__all__ = ["TABLE", "COLUMNS", "behind", "late", "total", "advance", "park", "carry_over"]
+
+TABLE = "pycrorm_progress"
+COLUMNS: dict[str, Storage] = {"id": "key", "folded": "integer", "parked": "text"}
+"""The episode's number, the last sequence that is in the tables, and why no more is."""
+
+
+async def behind(
+    connection: AsyncConnection, generation: int, *, after: int, limit: int, share: tuple[int, int] = (0, 1)
+) -> list[EpisodeRow]:
+    """Of the episodes that follow number `after`, those that the log has more of; only the n-th of every m of them."""
+    found = await connection.execute(
+        text(f"""
+SELECT number, episode.id, head, coalesce(progress.folded, 0), started_wall_ns
+FROM episode LEFT JOIN {physical_name(TABLE, generation)} AS progress ON progress.id = number
+WHERE number > :after AND head > coalesce(progress.folded, 0) AND progress.parked IS NULL
+AND number % :many = :part ORDER BY number LIMIT :limit"""),  # noqa: S608
+        {"after": after, "part": share[0], "many": share[1], "limit": limit},
+    )
+    return [EpisodeRow(*row) for row in found]
+
+
+async def late(connection: AsyncConnection, generation: int, *, limit: int) -> list[EpisodeRow]:
+    """The episodes of which people see more than is in this generation; their `head` is what people see."""
+    found = await connection.execute(
+        text(f"""
+SELECT number, episode.id, episode.folded, coalesce(progress.folded, 0), started_wall_ns
+FROM episode LEFT JOIN {physical_name(TABLE, generation)} AS progress ON progress.id = number
+WHERE episode.folded > coalesce(progress.folded, 0) AND progress.parked IS NULL ORDER BY number LIMIT :limit"""),  # noqa: S608
+        {"limit": limit},
+    )
+    return [EpisodeRow(*row) for row in found]
+
+
+async def total(connection: AsyncConnection, generation: int) -> int:
+    """How many events are in it."""
+    found = await connection.execute(
+        text(f"SELECT coalesce(sum(folded), 0) FROM {physical_name(TABLE, generation)}")  # noqa: S608
+    )
+    return int(found.scalar_one())
+
+
+async def advance(connection: AsyncConnection, generation: int, steps: Sequence[Progress]) -> bool:
+    """Notes (episode number, folded before, folded now) of each episode; False if one of them is not there any more."""
+    name, dialect = physical_name(TABLE, generation), dialect_of(connection)
+    progress = _table(generation)
+    asked = select(progress.c.id, progress.c.folded).where(progress.c.id.in_([number for number, _, _ in steps]))
+    found = await connection.execute(asked.order_by(progress.c.id).with_for_update())
+    there: dict[int, int] = {row.id: row.folded for row in found}
+    if any(there.get(number, 0) != before for number, before, _ in steps):
+        return False
+    new = [(number, now, None) for number, _, now in steps if number not in there]
+    grown = [(number, now) for number, _, now in steps if number in there]
+    try:
+        if new:
+            await dialect.insert_rows(connection, name, tuple(COLUMNS), new)
+    except RowRefused:
+        return False
+    if grown:
+        await dialect.update_rows(connection, name, {"id": "bigint", "folded": "bigint"}, grown)
+    return True
+
+
+async def park(connection: AsyncConnection, generation: int, number: int, reason: str) -> None:
+    """Stops an episode, with the reason."""
+    await connection.execute(
+        text(
+            f"INSERT INTO {physical_name(TABLE, generation)} (id, folded, parked) VALUES (:number, 0, :reason)"  # noqa: S608
+            " ON CONFLICT (id) DO UPDATE SET parked = excluded.parked"
+        ),
+        {"number": number, "reason": reason},
+    )
+
+
+async def carry_over(connection: AsyncConnection, generation: int) -> None:
+    """What `episode` says of every episode is afterwards what this generation shows."""
+    episode = table("episode", column("number"), column("folded"), column("parked"))
+    progress = _table(generation)
+    different = or_(episode.c.folded != progress.c.folded, episode.c.parked.is_distinct_from(progress.c.parked))
+    found = await connection.execute(
+        select(episode.c.number, progress.c.folded, progress.c.parked)
+        .join_from(episode, progress, progress.c.id == episode.c.number)
+        .where(different)
+        .order_by(episode.c.number)  # as everybody takes them, so that nobody waits in a circle
+        .with_for_update(of=episode)
+    )
+    changes = [{"key": number, "now": folded, "why": parked} for number, folded, parked in found]
+    if changes:
+        change = update(episode).where(episode.c.number == bindparam("key"))
+        await connection.execute(change.values(folded=bindparam("now"), parked=bindparam("why")), changes)
+
+
+def _table(generation: int) -> TableClause:
+    return table(physical_name(TABLE, generation), *map(column, COLUMNS))

@@ -1,0 +1,32 @@
+"""Who makes tables anew says so with a lock on a file beside the database, which is gone when it is done."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["claim"]
+
+
+@contextmanager
+def claim(path: Path) -> Iterator[bool]:
+    """Whether this file could be locked; it is until the context is left or the process dies."""
+    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    try:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            yield False
+            return
+        if not (path.exists() and path.stat().st_ino == os.fstat(file).st_ino):
+            yield False  # who had it took it away between our two steps
+            return
+        try:
+            yield True
+        finally:
+            path.unlink(missing_ok=True)
+    finally:
+        os.close(file)
