@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
 import socket
 import struct
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
+from typing import NoReturn
 from urllib.parse import quote
 
 from tests.databases import Server
@@ -24,13 +27,14 @@ _CHUNK = 1 << 16
 class Proxy:
     """Listens on TCP; every connection to it is one to the server.
 
-    `connections` counts those made so far, `faults` the faults that came to pass.
+    `connections` counts those made so far, `faults` the armed faults that came to pass.
     """
 
     def __init__(self, server_socket: Path) -> None:
         self.port = 0
         self.connections = 0
         self.faults = 0
+        self.made: Counter[str] = Counter()
         self.chunk_bytes = _CHUNK
         self._server_socket = server_socket
         self._refusing = False
@@ -88,6 +92,43 @@ class Proxy:
 
     def _arm(self, said: bytes, act: Callable[[_Link], None]) -> None:
         self._pattern, self._seen = said, act
+
+    # --- faults of every kind ---------------------------------------------------------------------------------
+
+    async def trouble(self, rng: random.Random, *, pause_s: float) -> NoReturn:
+        """One fault after the other, so long apart on average, until it is cancelled. `made` counts them."""
+        lasting: dict[str, Callable[[], None]] = {
+            "stall": self.stall,
+            "refuse": self.refuse,
+            "dribble": lambda: self.dribble(rng.randrange(16, 512)),
+        }
+        at_once: dict[str, Callable[[], None]] = {
+            "cut": self.cut,
+            "reset": self.reset,
+            "lose the request to commit": lambda: self.cut_before(b"COMMIT"),
+            "lose the reply to a commit": lambda: self.swallow_reply_to(b"COMMIT"),
+            "cut inside": lambda: self.cut_after_bytes(rng.randrange(1, 40_000)),
+        }
+        try:
+            while True:
+                await asyncio.sleep(rng.random() * 2 * pause_s)
+                kind, begin = rng.choice([*lasting.items(), *at_once.items()])
+                self.made[kind] += 1
+                begin()
+                if kind in lasting:
+                    await asyncio.sleep(rng.random() * 2 * pause_s)
+                    if rng.random() < 0.5:
+                        self.reset()
+                    self.heal()
+        finally:
+            self.heal()
+
+    def heal(self) -> None:
+        """No fault now and none to come."""
+        self._pattern = self._budget = None
+        self._refusing = False
+        self.chunk_bytes = _CHUNK
+        self.flow()
 
     # --- what a link asks -------------------------------------------------------------------------------------
 

@@ -22,7 +22,7 @@ from typing import Any
 import typer
 from rich.logging import RichHandler
 
-from pycrorm_async.cli import demo, episodes, rebuild, run, show, spool, status, writer
+from pycrorm_async.cli import copy, demo, episodes, events, rebuild, run, show, spool, status, writer
 from pycrorm_async.cli.output import problem, stderr
 from pycrorm_async.errors import (
     CallerError,
@@ -85,6 +85,8 @@ _VERBS: dict[str, Callable[..., int | None]] = {
     "run": run.run,
     "episodes": episodes.episodes,
     "show": show.show,
+    "events": events.events,
+    "copy": copy.copy,
     "writer": writer.writer,
     "status": status.status,
     "rebuild": rebuild.rebuild,

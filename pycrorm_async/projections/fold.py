@@ -16,6 +16,7 @@ from pycrorm_async.events.happenings import (
     EVENT_TYPES,
     EpisodeEnded,
     EpisodeStarted,
+    Happening,
     JointsMoved,
     LocationResolved,
     NodeEnded,
@@ -35,21 +36,26 @@ from pycrorm_async.projections.rows import EpisodeEnd, NodeEnd, Row, Rows
 from pycrorm_async.projections.values import CannotFold, json_text, microseconds, pose_columns, row
 from pycrorm_async.store.rows import StoredEvent
 
-__all__ = ["fold", "CannotFold"]
+__all__ = ["fold", "happening_of", "CannotFold"]
 
 
 def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
     """Adds what this event means to `rows`. Raises `CannotFold`, and then has added nothing."""
+    happening = happening_of(event)
+    _FOLDS[event.type](event, happening, designators, rows)
+
+
+def happening_of(event: StoredEvent) -> Happening:
+    """What happened, of an event of an episode: for every fold there is. Raises `CannotFold`."""
     shape = EVENT_TYPES.get(event.type)
     if shape is None or event.type not in _FOLDS:
         raise CannotFold(f"{event.type} is not an event this version knows")
     if event.version != shape.version:
         raise CannotFold(f"{event.type} has version {event.version}, this version knows {shape.version}")
     try:
-        happening = decode(event.type, event.payload)
+        return decode(event.type, event.payload)
     except msgspec.DecodeError as error:
         raise CannotFold(f"{event.type} cannot be decoded: {error}") from None
-    _FOLDS[event.type](event, happening, designators, rows)
 
 
 # --- episodes -------------------------------------------------------------------------------------------------

@@ -11,10 +11,10 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
-from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.orm import Designator, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.store.naming import number_named
 
 __all__ = ["EpisodeSummary", "NodeSummary", "Thinker", "episodes", "episode_named", "task_tree"]
 
@@ -146,18 +146,9 @@ async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummar
     question = select(ProcessMetaData.id, ProcessMetaData.uuid, ProcessMetaData.simulated).order_by(ProcessMetaData.id)
     known = (await connection.execute(question)).all()
     real = [each.id for each in known if not each.simulated]
-    # A short one is a number; a long one may be the beginning of an id that happens to have no letter.
-    if name == "last" and real:
-        found = real[-1:]
-    elif name.isdecimal() and any(each.id == int(name) for each in known):
-        found = [int(name)]
-    else:
-        found = [each.id for each in known if len(name) >= 4 and each.uuid.startswith(name.lower())]
-    if len(found) > 1:
-        raise UnknownEpisode(f"{len(found)} episodes have an id that begins with {name!r}: give more of it")
-    if not found:
-        raise UnknownEpisode(f"there is no episode {name!r} (`pycrorm episodes` lists the {len(real)} there are)")
-    return (await episodes(connection, found[0]))[0]
+    ids = {each.id: each.uuid for each in known}
+    number = real[-1] if name == "last" and real else number_named(name, ids, listed=len(real))
+    return (await episodes(connection, number))[0]
 
 
 async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummary]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import DatabaseUnavailable, PycrormError
+from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, PycrormError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
@@ -29,6 +29,9 @@ from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_e
 from pycrorm_async.store.sqlite.engine import BEGIN
 
 __all__ = ["EventLog"]
+
+_PAGE_EVENTS = 250
+"""Few enough for a page to be small in memory also when each of them is as large as an event can be."""
 
 
 class EventLog:
@@ -115,16 +118,32 @@ class EventLog:
         async with self._reading() as connection:
             return await self._dialect.episodes(connection)
 
+    async def episode(self, episode: EpisodeId) -> EpisodeRow | None:
+        """How far an episode is here; None if nothing of it is stored."""
+        async with self._reading() as connection:
+            return await self._dialect.episode(connection, episode_text(episode))
+
     async def episode_number(self, episode: EpisodeId) -> int | None:
         """The number of an episode here; None if nothing of it is stored."""
-        async with self._reading() as connection:
-            found = await self._dialect.episode(connection, episode_text(episode))
+        found = await self.episode(episode)
         return found.number if found is not None else None
 
     async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[StoredEvent]:
         """The events of an episode that follow sequence `after`, at most `limit`."""
         async with self._reading() as connection:
             return await self._dialect.events(connection, number, after=after, limit=limit)
+
+    async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[list[StoredEvent]]:
+        """The same up to the episode's head, a few at a time. Raises `LogDamaged` at the first that is missing."""
+        while after < episode.head:
+            limit = min(_PAGE_EVENTS, episode.head - after)
+            page = await self.events(episode.number, after=after, limit=limit)
+            whole = [event for sequence, event in enumerate(page, after + 1) if event.sequence == sequence]
+            if whole:
+                yield whole
+            after += len(whole)
+            if len(whole) < limit:
+                raise LogDamaged(episode.id, after + 1, f"is missing in {self.address}")
 
     async def spans(self, spans: Sequence[Span]) -> list[StoredEvent]:
         """The events of each span, in the order of the spans."""

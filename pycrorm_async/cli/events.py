@@ -1,0 +1,76 @@
+"""`pycrorm events EPISODE`: the log of an episode, a line of JSON for each event."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from datetime import UTC, datetime
+from typing import Annotated
+
+import msgspec
+import typer
+
+from pycrorm_async.adoption import shared_address
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.waiting import note_what_waits
+from pycrorm_async.errors import CallerError, LogDamaged
+from pycrorm_async.events.happenings import EVENT_TYPES
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.naming import episode_named
+from pycrorm_async.store.rows import StoredEvent
+
+__all__ = ["events"]
+
+
+def events(
+    episode: Annotated[str, typer.Argument(help="Its number, its id, or the first digits of its id; `last`.")],
+    after: Annotated[int, typer.Option(min=0, metavar="SEQUENCE", help="Only what follows this event.")] = 0,
+    kind: Annotated[
+        list[str] | None, typer.Option("--type", help="Only events of this type; again for another.")
+    ] = None,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,  # noqa: ARG001  it is JSON anyway
+) -> None:
+    """Print what is in the log of an episode, a JSON object a line, in the order it happened."""
+    kinds = frozenset(kind or EVENT_TYPES)
+    unknown = sorted(kinds - EVENT_TYPES.keys())
+    if unknown:
+        raise CallerError(f"there is no event {unknown[0]!r}; there are {', '.join(sorted(EVENT_TYPES))}")
+    try:
+        asyncio.run(_print(url, episode, after, kinds if kind else None))
+        sys.stdout.flush()
+    except BrokenPipeError:  # who reads has enough, as `head` has
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return
+    note_what_waits(url, spool)
+
+
+async def _print(url: str, episode: str, after: int, kinds: frozenset[str] | None) -> None:
+    log = await EventLog.open(shared_address(url), create=False)
+    try:
+        row = await episode_named(log, episode)
+        async for page in log.pages(row, after=after):
+            shown = [each for each in page if kinds is None or each.type in kinds]
+            sys.stdout.buffer.write(b"".join(_line(row.id, each) for each in shown))
+    finally:
+        await log.close()
+
+
+def _line(episode: str, event: StoredEvent) -> bytes:
+    try:
+        msgspec.json.decode(event.payload)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
+    seconds, nanoseconds = divmod(event.wall_ns, 10**9)
+    line = {
+        "sequence": event.sequence,
+        "type": event.type,
+        "version": event.version,
+        "time": f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{nanoseconds:09}Z",
+        "wall_ns": event.wall_ns,
+        "monotonic_ns": event.monotonic_ns,
+        "payload": msgspec.Raw(event.payload),
+    }
+    return msgspec.json.encode(line) + b"\n"

@@ -1,0 +1,323 @@
+"""Sixteen robots on two machines, one database, and a network between that fails in every way, all the time.
+
+Robots and daemons are killed meanwhile. What the robots say that they did is the oracle; what the database holds is
+read by a connection that knows nothing of the memory.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+import os
+import random
+import signal
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import AsyncExitStack, suppress
+from pathlib import Path
+from typing import Any, NoReturn
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.commands import pycrorm
+from tests.crash.chores import LANES, do_chores
+from tests.crash.forked import Forked
+from tests.crash.robots import Lab
+from tests.databases import Server, ask
+from tests.proxy import Proxy, proxy_before
+
+ROBOTS_A_MACHINE = 8
+
+
+class Robot:
+    """A robot's process and the name it has in the memory; `killed` if it did not come to its end."""
+
+    def __init__(self, url: str, spool: Path, name: str, seed: int) -> None:
+        self.forked = Forked(do_chores, url, str(spool), name, seed, 0.1)
+        self.name = name
+        self.killed = False
+
+    def kill(self) -> None:
+        self.forked.kill()
+        self.killed = True
+
+    @property
+    def said(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.forked.said]
+
+
+class Machine:
+    """A spool, its daemon, the way from there to the server, and the robots."""
+
+    def __init__(self, folder: Path, proxy: Proxy, database: str, rng: random.Random) -> None:
+        folder.mkdir()
+        self.proxy = proxy
+        self.lab = Lab(folder, proxy.url(database), rng.randrange(2**31))  # of which only the daemon is used
+        self.rng = rng
+        self.robots: list[Robot] = []
+
+    def start_robot(self) -> Robot:
+        name = f"{self.lab.folder.name}.{len(self.robots)}"
+        robot = Robot(self.lab.url, self.lab.spool, name, self.rng.randrange(2**31))
+        self.robots.append(robot)
+        return robot
+
+    def living(self) -> list[Robot]:
+        return [robot for robot in self.robots if not robot.killed]
+
+    async def keep_a_daemon(self) -> NoReturn:
+        """As a service manager does: whenever it has gone, it is started again."""
+        while True:
+            self.lab.start_daemon()
+            assert self.lab.daemon is not None
+            code = await asyncio.to_thread(self.lab.daemon.wait)
+            assert code in (3, -signal.SIGKILL), self.lab.log.read_text()  # 3: the database was away when it began
+            await asyncio.sleep(0.1)
+
+    async def kill_and_replace(self) -> None:
+        await asyncio.to_thread(self.rng.choice(self.living()).kill)
+        await asyncio.to_thread(self.start_robot().forked.wait_for_its_first_words)
+
+    def folders(self) -> list[str]:
+        """Of recorders, which go when all in them is stored."""
+        return [path.name for path in self.lab.spool.iterdir() if path.is_dir()]
+
+    def clear(self) -> None:
+        for robot in self.living():
+            with suppress(ValueError):  # it has ended by itself
+                robot.forked.process.kill()
+        self.lab.clear()
+
+
+async def work(machines: list[Machine], rng: random.Random, seconds: float) -> None:
+    """Everything happens at once, for so long; then the network is whole, and the daemons have time to do the rest."""
+    async with asyncio.TaskGroup() as tasks:
+        keepers = [tasks.create_task(machine.keep_a_daemon()) for machine in machines]
+        for machine in machines:
+            for robot in [machine.start_robot() for _ in range(ROBOTS_A_MACHINE)]:
+                await asyncio.to_thread(robot.forked.wait_for_its_first_words)
+            await asyncio.to_thread(machine.lab.wait_for_log, "appeared")
+        troubles = [tasks.create_task(machine.proxy.trouble(rng, pause_s=0.25)) for machine in machines]
+        await kill_now_and_then(machines, seconds)
+        living = [robot for machine in machines for robot in machine.living()]
+        for robot in living:
+            robot.forked.tell_to_stop()
+        for robot in living:
+            assert await asyncio.to_thread(robot.forked.wait) == 0, robot.name
+        for trouble in troubles:
+            trouble.cancel()
+        async with asyncio.timeout(60):
+            while any(machine.folders() for machine in machines):  # noqa: ASYNC110
+                await asyncio.sleep(0.05)
+        for keeper in keepers:
+            keeper.cancel()
+    for machine in machines:
+        assert await asyncio.to_thread(machine.lab.stop_daemon) == 0, machine.lab.log.read_text()
+
+
+async def kill_now_and_then(machines: list[Machine], seconds: float) -> None:
+    """A robot of each machine and one daemon, again and again."""
+    deadline = asyncio.get_running_loop().time() + seconds
+    for machine in itertools.cycle(machines):
+        await asyncio.sleep(min(seconds / 4, 10.0))
+        for each in machines:
+            await each.kill_and_replace()
+        machine.lab.kill_daemon()
+        if asyncio.get_running_loop().time() > deadline:
+            return
+
+
+@pytest.mark.parametrize("seconds", [8.0, pytest.param(600.0, marks=pytest.mark.soak)])
+async def test_sixteen_robots_and_two_daemons_behind_a_failing_network_lose_and_double_nothing(
+    server: Server, tmp_path: Path, seconds: float
+) -> None:
+    seed = int(os.environ.get("PYCRORM_TEST_SEED") or random.SystemRandom().randrange(2**31))
+    print(f"seed {seed}: PYCRORM_TEST_SEED={seed} takes it again")
+    rng = random.Random(seed)
+    url = server.new_database()
+    async with AsyncExitStack() as stack:
+        machines: list[Machine] = []
+        for name in ("east", "west"):
+            proxy = await stack.enter_async_context(proxy_before(server))
+            machines.append(Machine(tmp_path / name, proxy, urlsplit(url).path.removeprefix("/"), rng))
+            stack.callback(machines[-1].clear)
+        await work(machines, rng, seconds)
+        for machine in machines:
+            print(dict(machine.proxy.made), machine.proxy.connections, "connections")
+            assert len(machine.proxy.made) >= 6
+            assert machine.proxy.connections > 10
+            log = machine.lab.log.read_text()
+            assert "Traceback" not in log
+            assert "tables cannot" not in log
+            done = await asyncio.to_thread(
+                pycrorm, "writer", "--once", "--json", "--url", url, "--spool", machine.lab.spool, cwd=tmp_path
+            )
+            assert done.returncode == 0, done.stderr
+            assert json.loads(done.stdout)["events_stored"] == 0
+        robots = [robot for machine in machines for robot in machine.robots]
+        assert sum(not robot.killed for robot in robots) == 2 * ROBOTS_A_MACHINE
+        assert sum(robot.killed for robot in robots) >= 4
+        told = await asyncio.to_thread(Told, url)
+        for robot in robots:
+            compare(robot, told)
+        compare_all(robots, told)
+
+
+# --- what the database says ---------------------------------------------------------------------------------------
+
+
+class Told:
+    """What the database holds, by the names the robots gave: its log, and its tables."""
+
+    def __init__(self, url: str) -> None:
+        self.heads = ask(url, "SELECT number, head, folded, refused, parked FROM episode ORDER BY number")
+        self.episodes: dict[str, tuple[str, str | None]] = {}
+        self.descriptions = Counter[str]()
+        for description, status, failure in ask(url, "SELECT description, status, failure_type FROM process_metadata"):
+            self.episodes[description] = status, failure
+            self.descriptions[description] += 1
+        self.log: defaultdict[str, list[tuple[str, int | None, str | None]]] = defaultdict(list)
+        self.sequences: defaultdict[int, list[int]] = defaultdict(list)
+        self._read_log(url)
+        self.nodes = ask(
+            url,
+            "SELECT coalesce(step.episode, carry.episode), coalesce(step.number, carry.number),"
+            " node.dtype, node.status, parent.number, parent.kind, node.failure_message, node.end_ns IS NOT NULL,"
+            " carry.weight, carry.hand, carry.slips, x, y, z, node.id"
+            " FROM task_tree_node node LEFT JOIN step_action step ON step.id = node.id"
+            " LEFT JOIN carry_action carry ON carry.id = node.id LEFT JOIN pose ON pose.id = carry.there_id"
+            " LEFT JOIN (SELECT above.id, number, above.kind FROM task_tree_node above"
+            " LEFT JOIN carry_action ON carry_action.id = above.id) parent ON parent.id = node.parent_id"
+            " WHERE node.kind = 'action' ORDER BY node.id",
+        )
+        self.words: defaultdict[int, list[str]] = defaultdict(list)
+        for node, text in ask(url, "SELECT node_id, text FROM parameter_item ORDER BY node_id, field, position"):
+            self.words[node].append(text)
+        self.counts = {
+            table: ask(url, f"SELECT count(*) FROM {table}")[0][0]
+            for table in (
+                "process_metadata task_tree_node step_action carry_action pose parameter_item"
+                " object object_removal attachment joint_change location_resolution location_candidate detection"
+                " state_sample"
+            ).split()
+        }
+
+    def _read_log(self, url: str) -> None:
+        """What each event says, in the order of their numbers: (what, which chore, how it ended)."""
+        names: dict[int, str] = {}
+        numbers: dict[tuple[int, int], int | None] = {}
+        rows = ask(url, "SELECT episode, sequence, type, payload FROM event ORDER BY episode, sequence")
+        for episode, sequence, kind, text in rows:
+            payload = json.loads(text)
+            self.sequences[episode].append(sequence)
+            if kind == "EpisodeStarted":
+                names[episode] = payload["description"]
+                numbers[episode, 2] = None  # the root
+            elif kind == "NodeStarted" and payload["kind"] != "root":
+                number = numbers[episode, sequence] = payload["parameters"]["number"]
+                self.log[names[episode]].append(("began", number, None))
+            elif kind == "NodeEnded" and payload["node"] != 2:
+                self.log[names[episode]].append(("ended", numbers[episode, payload["node"]], payload["status"]))
+            elif kind in ("NodeStarted", "NodeEnded", "EpisodeEnded"):
+                self.log[names[episode]].append((kind, None, payload.get("status")))
+            else:
+                raise AssertionError((kind, payload))
+
+    def nodes_of(self, robot: Robot) -> Iterator[tuple[Any, ...]]:
+        return (row for row in self.nodes if row[0].startswith(f"{robot.name}."))
+
+
+# --- the proof ----------------------------------------------------------------------------------------------------
+
+
+def compare(robot: Robot, told: Told) -> None:
+    """All that this robot did is there once, in its order and with its values; one it was killed in did one more."""
+    said = robot.said
+    opened = [line["opened"] for line in said if "opened" in line]
+    closed = {line["closed"] for line in said if "closed" in line}
+    there = [name for name in told.episodes if name.startswith(f"{robot.name}.")]
+    assert set(opened) <= set(there)
+    assert len(there) <= len(opened) + robot.killed * LANES  # opened, and not said before it was killed
+    if not robot.killed:
+        assert closed == set(there)
+        assert said[-1] == {"faults": 0}
+    assert all(told.episodes[name] == ("SUCCEEDED", None) for name in closed)
+    unsaid = 0
+    for name in there:
+        did = [
+            ("began", line["began"], None) if "began" in line else ("ended", line["ended"], line["how"])
+            for line in said
+            if line.get("episode") == name
+        ]
+        events = told.log[name]
+        assert events[0] == ("NodeStarted", None, None) or (not did and robot.killed)
+        inside = [each for each in events if each[0] in ("began", "ended")]
+        assert inside[: len(did)] == did
+        unsaid += len(inside) - len(did)
+        if name in closed:
+            ends = [("NodeEnded", None, "SUCCEEDED"), ("EpisodeEnded", None, "SUCCEEDED")]
+            assert events == [("NodeStarted", None, None), *did, *ends]
+        else:
+            assert events[-1][0] == "EpisodeEnded"
+            assert events[-1][2] in ("LOST", "SUCCEEDED")  # it may have ended, and not said so before it was killed
+            assert told.episodes[name][0] == events[-1][2]
+    assert unsaid <= robot.killed
+    compare_rows(robot, told)
+
+
+def compare_rows(robot: Robot, told: Told) -> None:
+    said = robot.said
+    began = {(line["episode"], line["began"]): line for line in said if "began" in line}
+    ended = {(line["episode"], line["ended"]): line["how"] for line in said if "ended" in line}
+    rows = {}
+    for episode, number, *rest in told.nodes_of(robot):
+        assert (episode, number) not in rows
+        rows[episode, number] = rest
+    assert set(began) <= set(rows)
+    assert len(rows) <= len(began) + robot.killed
+    carried = 0  # steps belong to the carrying before them
+    for (episode, number), row in rows.items():
+        dtype, status, parent, above, message, has_end, weight, hand, slips, x, y, z, node = row
+        how = ended.get((episode, number))
+        if how is None:
+            assert robot.killed
+            assert status == "LOST" or has_end  # its end was written, and not said
+        else:
+            assert (status, has_end) == (how, True)
+        assert message == (f"slipped at {number}" if status == "FAILED" else None)
+        if dtype == "CarryAction":
+            carried = number
+            assert (parent, above) == (None, "root")
+            assert status == "LOST" or slips is (status == "FAILED")
+        else:
+            assert (dtype, parent, above) == ("StepAction", carried, "action")
+        line = began.get((episode, number))
+        if line is not None:
+            assert dtype == {"step": "StepAction", "carry": "CarryAction"}[line["what"]]
+            values = {"weight": weight, "hand": hand, "there": [x, y, z], "words": told.words.get(node, [])}
+            assert values == line.get("told", {"weight": None, "hand": None, "there": [None] * 3, "words": []})
+
+
+def compare_all(robots: list[Robot], told: Told) -> None:
+    """Nothing is there but what the robots did, and the tables show all of the log."""
+    assert all(head == folded and refused is None and parked is None for _, head, folded, refused, parked in told.heads)
+    assert {number: list(range(1, head + 1)) for number, head, *_ in told.heads} == told.sequences
+    assert set(told.descriptions.values()) == {1}
+    assert {name.rsplit(".", 2)[0] for name in told.descriptions} <= {robot.name for robot in robots}
+    roots = sum(event[0] == "NodeStarted" for events in told.log.values() for event in events)
+    began = Counter(row[2] for row in told.nodes)
+    words = sum(len(each) for each in told.words.values())
+    rows = {
+        "process_metadata": len(told.episodes),
+        "task_tree_node": roots + len(told.nodes),
+        "step_action": began["StepAction"],
+        "carry_action": began["CarryAction"],
+        "pose": began["CarryAction"],
+        "parameter_item": words,
+    }
+    assert told.counts == {table: rows.get(table, 0) for table in told.counts}
+    done = sum("ended" in line for robot in robots for line in robot.said)
+    print(f"{len(told.episodes)} episodes, {done} chores and steps said done, {sum(rows.values())} rows")
+    assert done > 1000, "too little was done to prove anything"

@@ -1,0 +1,131 @@
+"""What a memory holds, in a form that compares across databases: read with plain SQL, past every class of ours.
+
+The number of an episode belongs to its database, and so do the ids of rows, which are made of it. Here an episode is
+its UUID and a row (UUID, sequence, slot), wherever an id stands. NULL is left out: a table that another episode's
+declaration has given one column more holds the same.
+
+>>> differences(tables_of("sqlite:///merged.db"), united(tables_of("sqlite:///a.db"), tables_of("sqlite:///b.db")))
+[]
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from tests.databases import ask
+
+__all__ = ["Tables", "Logs", "tables_of", "logs_of", "declarations_of", "united", "differences"]
+
+Key: TypeAlias = tuple[Any, ...]
+Tables: TypeAlias = dict[str, dict[Key, dict[str, Any]]]
+"""By table and by key what is in the columns. The key of most is one (UUID, sequence, slot)."""
+Logs: TypeAlias = dict[str, list[tuple[Any, ...]]]
+"""By UUID (sequence, type, version, wall ns, monotonic ns, payload) of every event."""
+
+_KEYS = {
+    "parameter_item": ("node_id", "field", "position"),
+    "joint_change": ("id", "joint"),
+    "location_candidate": ("resolution_id", "position"),
+    "detection": ("id", "position"),
+    "state_sample": ("id", "channel"),
+}
+_OF_EPISODES = ("process_metadata", "simulated_episode")
+_IDS = ("key", "row", "pose", "object")
+"""What the layout calls a column of ids, of the tables that designator types brought."""
+
+_COLUMNS_SQLITE = """
+SELECT each.name, part.name FROM sqlite_master AS each JOIN pragma_table_info(each.name) AS part
+WHERE each.type = 'table' ORDER BY each.name, part.cid"""
+_COLUMNS_POSTGRESQL = """
+SELECT table_name::text, column_name::text FROM information_schema.columns JOIN information_schema.tables
+USING (table_schema, table_name) WHERE table_schema = 'memory' AND table_type = 'BASE TABLE'
+ORDER BY table_name, ordinal_position"""
+
+
+def tables_of(place: str | Path) -> Tables:
+    """The rows of the tables people see now, those without rows left out. `place` is a URL, or a SQLite file's path."""
+    episodes = dict(ask(place, "SELECT number, id FROM episode"))
+    [(generation, layout)] = ask(place, "SELECT generation, layout FROM pycrorm_generation")
+    leaves = json.loads(layout)["leaves"]
+    columns: dict[str, list[str]] = {}
+    on_server = str(place).startswith("postgresql:")
+    for physical, column in ask(place, _COLUMNS_POSTGRESQL if on_server else _COLUMNS_SQLITE):
+        name, mark, number = physical.rpartition("__")
+        if mark and number == str(generation):
+            columns.setdefault(name, []).append(column)
+    found = {name: _rows(place, name, generation, each, leaves.get(name), episodes) for name, each in columns.items()}
+    return {name: rows for name, rows in found.items() if rows}
+
+
+def _rows(
+    place: str | Path,
+    name: str,
+    generation: int,
+    columns: list[str],
+    leaf: Mapping[str, str] | None,
+    episodes: Mapping[int, str],
+) -> dict[Key, dict[str, Any]]:
+    keys = _KEYS.get(name, ("id",))
+    listed = ", ".join(f'"{column}"' for column in columns)
+    rows: dict[Key, dict[str, Any]] = {}
+    for values in ask(place, f'SELECT {listed} FROM "{name}__{generation}"'):
+        row = {
+            column: _portable(name, column, leaf, value, episodes)
+            for column, value in zip(columns, values, strict=True)
+            if value is not None
+        }
+        key = tuple(row.pop(column) for column in keys)
+        assert key not in rows, f"{name} has two rows {key}"
+        rows[key] = row
+    return rows
+
+
+def _portable(name: str, column: str, leaf: Mapping[str, str] | None, value: Any, episodes: Mapping[int, str]) -> Any:
+    if column == "process_metadata_id" or (name in _OF_EPISODES and column == "id"):
+        return episodes[value]
+    is_id = column == "id" or leaf[column] in _IDS if leaf is not None else column == "id" or column.endswith("_id")
+    if not is_id:
+        return value
+    number, rest = divmod(value, 2**31)
+    return (episodes[number], *divmod(rest, 2**5))
+
+
+def logs_of(place: str | Path) -> Logs:
+    """Every event of every episode, in the order of its episode."""
+    found: Logs = {}
+    for identity, *event in ask(
+        place,
+        "SELECT id, sequence, type, version, wall_ns, monotonic_ns, payload FROM episode JOIN event ON episode = number"
+        " ORDER BY number, sequence",
+    ):
+        found.setdefault(identity, []).append(tuple(event))
+    return found
+
+
+def declarations_of(place: str | Path) -> set[tuple[str, str]]:
+    """Fingerprint and payload of every designator type that the log knows."""
+    return {(name, payload) for name, payload in ask(place, "SELECT fingerprint, payload FROM pycrorm_declaration")}
+
+
+def united(*memories: Tables) -> Tables:
+    """What a memory must hold that holds all of these. What two of them have under one key must be the same."""
+    whole: Tables = {}
+    for tables in memories:
+        for name, rows in tables.items():
+            there = whole.setdefault(name, {})
+            for key, row in rows.items():
+                assert there.setdefault(key, row) == row, f"{name} {key}: {there[key]} and {row}"
+    return whole
+
+
+def differences(one: Tables, other: Tables) -> list[str]:
+    """A line for each row that only one of them has, or that they have differently; none if they hold the same."""
+    return [
+        f"{name} {key}: {one.get(name, {}).get(key)} and {other.get(name, {}).get(key)}"
+        for name in sorted(one.keys() | other.keys())
+        for key in sorted(one.get(name, {}).keys() | other.get(name, {}).keys(), key=repr)
+        if one.get(name, {}).get(key) != other.get(name, {}).get(key)
+    ]
