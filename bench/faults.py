@@ -1,10 +1,16 @@
 """What faults cost: each is made again and again, and what is found is compared with what was acknowledged.
 
-    python -m bench.faults               the long version: 10,000 kills, 2,000 power cuts, … about two hours
+    python -m bench.faults               the long version: 10,000 kills, 500 power cuts on a real disk, … half an hour
     python -m bench.faults --quick       less than a minute
     python -m bench.faults --only power  the faults whose name holds this word
+    python -m bench.faults --report faults.md --seed 7     a table there, and every line of numbers in faults.jsonl;
+                                                           called again it goes on where it was interrupted
 
-Prints one JSON line a fault; the table is on stderr. Exit code 1 if anything was lost, doubled, misordered or changed.
+Prints one JSON line a fault; progress and the table are on stderr. Exit code 1 if anything was lost, doubled,
+misordered or changed, 130 when interrupted.
+
+A long run is made in slices, each with random numbers of its own: `--only NAME --slice 7 --seed S` makes one of them
+again. The report keeps what each slice found.
 """
 
 from __future__ import annotations
@@ -12,21 +18,23 @@ from __future__ import annotations
 import argparse
 import json
 import random
+import shlex
 import signal
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bench.breaking import databases, files, processes, simulation
+from bench.breaking import databases, files, machine, processes, robots, simulation
 from bench.breaking.outcome import Outcome, Step
+from bench.breaking.report import Report, Slice, summed
 from pycrorm_async.store.private import usual_place
 from tests.databases import Server, server_in
 
@@ -34,102 +42,136 @@ Make = Callable[[int, random.Random, Path, Step], Outcome]
 
 
 class Fault(NamedTuple):
-    """A fault, how to make it, and how often: in the quick version and in the long one."""
+    """A fault, how to make it, how often in the quick version and in the long one, and how often in one slice."""
 
     name: str
     make: Make
     quick: int
     long: int
+    slice: int
 
 
-def faults_on(server: Server, folder: Path) -> list[Fault]:
-    """All of them; `server` is killed by one."""
+def faults_on(server: Server) -> list[Fault]:
+    """All of them; `server` is killed by some."""
+
+    def on_the_server(_: Path) -> str:
+        return server.new_database()
+
+    def on_a_file(folder: Path) -> str:
+        return f"sqlite:///{folder}/killed.db"
+
     return [
-        Fault("kill -9 of a recorder", processes.killed_recorders, 25, 10_000),
-        Fault("kill -9 of an appender, SQLite", processes.killed_appenders(f"sqlite:///{folder}/killed.db"), 8, 500),
-        Fault(
-            "kill -9 of an appender, PostgreSQL",
-            processes.killed_appenders(server.new_database()),
-            6,
-            300,
-        ),
-        Fault("torn write at every byte", files.torn_writes, 300, 10**9),
-        Fault("flipped bit", files.flipped_bits, 150, 10**9),
-        Fault("power cut", files.power_cuts, 60, 2_000),
-        Fault("failed sync", files.failed_syncs, 20, 1_000),
-        Fault("disk full", files.full_disk, 3, 100),
-        Fault("clock jumps", files.clock_jumps, 20, 1_000),
-        Fault("fork", processes.forks, 10, 500),
-        Fault("exit with a full queue", processes.exits_with_a_full_queue, 6, 300),
-        Fault("second opener", processes.second_openers, 4, 200),
-        Fault("lost COMMIT reply", databases.lost_replies(server), 40, 2_000),
-        Fault("cut connection", databases.cut_connections(server), 25, 1_000),
-        Fault("cancelled append", databases.cancelled_appends(server), 30, 2_000),
-        Fault("killed server", databases.killed_servers(server), 2, 50),
-        Fault("all of it at random, simulated", simulation.simulated, 15, 2_000),
+        Fault("kill -9 of a recorder", processes.killed_recorders, 40, 10_000, 500),
+        Fault("kill -9 of an appender, SQLite", processes.killed_appenders(on_a_file), 8, 500, 50),
+        Fault("kill -9 of an appender, PostgreSQL", processes.killed_appenders(on_the_server), 6, 300, 50),
+        Fault("kill -9 of a plan and its writer", robots.killed_plans, 6, 500, 50),
+        Fault("kill -9 of the daemon, SQLite", robots.killed_daemons(None), 3, 200, 20),
+        Fault("kill -9 of the daemon, PostgreSQL", robots.killed_daemons(server), 3, 200, 20),
+        Fault("torn write at every byte", files.torn_writes, 300, 20_000, 2_000),
+        Fault("flipped bit", files.flipped_bits, 150, 80_000, 80_000),
+        Fault("power cut, simulated disk", files.power_cuts, 60, 5_000, 500),
+        Fault("power cut, real disk", machine.power_cuts, 4, 500, 25),
+        Fault("failed sync", files.failed_syncs, 20, 1_000, 1_000),
+        Fault("disk full, spool", files.full_disk, 3, 100, 100),
+        Fault("disk full, database", databases.full_disks, 5, 500, 100),
+        Fault("clock jumps", files.clock_jumps, 20, 1_000, 1_000),
+        Fault("fork", processes.forks, 10, 500, 500),
+        Fault("exit with a full queue", processes.exits_with_a_full_queue, 6, 300, 100),
+        Fault("second opener", processes.second_openers, 4, 200, 100),
+        Fault("lost COMMIT reply", databases.lost_replies(server), 40, 2_000, 500),
+        Fault("cut connection", databases.cut_connections(server), 25, 1_000, 250),
+        Fault("cancelled append", databases.cancelled_appends(server), 30, 2_000, 500),
+        Fault("locked database", databases.locked_files, 10, 500, 100),
+        Fault("stopped server", databases.ended_servers(server, killed=False), 2, 50, 10),
+        Fault("killed server", databases.ended_servers(server, killed=True), 2, 50, 10),
+        Fault("all of it at random, simulated", simulation.simulated, 15, 1_000, 100),
     ]
 
 
+def slices_of(fault: Fault, *, quick: bool) -> Iterator[tuple[int, int]]:
+    """The number and the rounds of each slice."""
+    total = fault.quick if quick else fault.long
+    for number, first in enumerate(range(0, total, fault.slice), start=1):
+        yield number, min(fault.slice, total - first)
+
+
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="less than a minute")
-    parser.add_argument("--seed", type=int, default=None, help="of all random choices; printed in every line")
-    parser.add_argument("--only", default="", help="the faults whose name holds this word")
-    arguments = parser.parse_args()
+    arguments = _arguments()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the server and the folders go then too
     seed = arguments.seed if arguments.seed is not None else random.SystemRandom().randrange(2**31)
     console = Console(stderr=True)
     if not console.is_terminal:
         console = Console(stderr=True, width=160)
-    outcomes: dict[str, tuple[Outcome, float]] = {}
-    with (
-        tempfile.TemporaryDirectory(prefix="pg") as place,
-        server_in(Path(place)) as server,
-        tempfile.TemporaryDirectory(prefix="faults", dir=usual_place()) as folder,
-        _progress(console) as progress,
-    ):
-        for fault in faults_on(server, Path(folder)):
-            if arguments.only in fault.name:
-                rounds = fault.quick if arguments.quick else fault.long
-                outcomes[fault.name] = _made(fault, rounds, seed, Path(folder), progress)
-                _tell(fault.name, seed, *outcomes[fault.name])
-    console.print(_table(outcomes, seed))
-    return 0 if all(outcome.clean for outcome, _ in outcomes.values()) else 1
-
-
-def _made(fault: Fault, rounds: int, seed: int, folder: Path, progress: Progress) -> tuple[Outcome, float]:
-    bar = progress.add_task(fault.name, total=rounds if rounds < 10**9 else None)
-    place = Path(tempfile.mkdtemp(dir=folder))
-    began = time.perf_counter()
-    # Each with its own numbers, so that one fault alone goes as it did among the others.
+    command = shlex.join(["python", "-m", "bench.faults", *sys.argv[1:]])
+    console.print(f"seed {seed}")
+    outcomes: dict[str, Outcome] = {}
     try:
-        outcome = fault.make(rounds, random.Random(f"{seed} {fault.name}"), place, lambda: progress.advance(bar))
-    except Exception as error:  # noqa: BLE001  what a fault may bring out is for the table, and the others go on
-        traceback.print_exc()
-        outcome = Outcome(broke=f"{type(error).__name__}: {error}")
-    took_s = time.perf_counter() - began
-    progress.update(bar, total=outcome.rounds, completed=outcome.rounds)
-    return outcome, took_s
+        with (
+            tempfile.TemporaryDirectory(prefix="pg") as place,
+            server_in(Path(place)) as server,
+            tempfile.TemporaryDirectory(prefix="faults", dir=usual_place()) as folder,
+            _progress(console) as progress,
+        ):
+            faults = faults_on(server)
+            order = [each.name for each in faults]
+            report = Report(arguments.report, seed=seed, quick=arguments.quick, command=command, order=order)
+            for fault in faults:
+                if arguments.only in fault.name:
+                    found = _made(fault, arguments, report, Path(folder), progress)
+                    outcomes[fault.name] = summed(found)
+                    print(json.dumps(Slice(fault.name, 0, outcomes[fault.name]).line(seed)), flush=True)
+                    if not console.is_terminal:
+                        _tell(console, fault.name, outcomes[fault.name])
+    except KeyboardInterrupt:
+        console.print(f"interrupted; to go on: --seed {seed}" + ("" if arguments.report else " and --report FILE"))
+        return 130
+    console.print(_table(outcomes, seed))
+    return 0 if all(outcome.clean for outcome in outcomes.values()) else 1
 
 
-def _tell(name: str, seed: int, outcome: Outcome, took_s: float) -> None:
-    line = {
-        "bench": "faults",
-        "fault": name,
-        "seed": seed,
-        "rounds": outcome.rounds,
-        "events": outcome.events,
-        "lost": outcome.lost,
-        "duplicated": outcome.duplicated,
-        "misordered": outcome.misordered,
-        "changed": outcome.changed,
-        "told": outcome.told,
-        "broke": outcome.broke,
-        "rounds_failed": outcome.rounds_failed[:20],
-        "took_s": round(took_s, 1),
-        "note": outcome.note,
-    }
-    print(json.dumps(line), flush=True)
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--quick", action="store_true", help="less than a minute")
+    parser.add_argument("--seed", type=int, default=None, help="of all random choices; printed in every line")
+    parser.add_argument("--only", default="", help="the faults whose name holds this word")
+    parser.add_argument("--slice", type=int, default=None, help="of the long version only the slice of this number")
+    parser.add_argument("--report", type=Path, default=None, help="a file for the table; FILE.jsonl beside it")
+    return parser.parse_args()
+
+
+def _made(
+    fault: Fault, arguments: argparse.Namespace, report: Report, folder: Path, progress: Progress
+) -> list[Outcome]:
+    """What each slice found, those that an earlier run with this seed and report had made included."""
+    slices = [
+        (number, rounds)
+        for number, rounds in slices_of(fault, quick=arguments.quick)
+        if arguments.slice in (None, number)
+    ]
+    bar = progress.add_task(fault.name, total=sum(rounds for _, rounds in slices))
+    found: list[Outcome] = []
+    for number, rounds in slices:
+        outcome = report.known(fault.name, number)
+        if outcome is None:
+            # Each with its own numbers, so that one slice alone goes as it did among the others.
+            rng = random.Random(f"{report.seed} {fault.name} {number}")
+            outcome = _slice(fault, rounds, rng, folder, progress, bar)
+            report.add(Slice(fault.name, number, outcome))
+        found.append(outcome)
+        progress.update(bar, completed=sum(each for other, each in slices if other <= number))
+    return found
+
+
+def _slice(fault: Fault, rounds: int, rng: random.Random, folder: Path, progress: Progress, bar: TaskID) -> Outcome:
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory(dir=folder) as place:
+        try:
+            outcome = fault.make(rounds, rng, Path(place), lambda: progress.advance(bar))
+        except Exception as error:  # noqa: BLE001  what a fault may bring out is for the table, and the others go on
+            traceback.print_exc()
+            outcome = Outcome(broke=f"{type(error).__name__}: {error}")
+    outcome.took_s = round(time.perf_counter() - began, 1)
+    return outcome
 
 
 def _progress(console: Console) -> Progress:
@@ -137,23 +179,19 @@ def _progress(console: Console) -> Progress:
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
-def _table(outcomes: dict[str, tuple[Outcome, float]], seed: int) -> Table:
+def _tell(console: Console, name: str, outcome: Outcome) -> None:
+    cost = f"lost {outcome.lost}, duplicated {outcome.duplicated}, misordered {outcome.misordered}"
+    console.print(f"{name}: {outcome.rounds:,} rounds, {cost}, changed {outcome.changed} ({outcome.took_s:.0f} s)")
+
+
+def _table(outcomes: dict[str, Outcome], seed: int) -> Table:
     table = Table(title=f"What faults cost (seed {seed})", title_justify="left")
-    for name in ("fault", "rounds", "events", "lost", "duplicated", "misordered", "changed", "given up, told", "note"):
+    for name in ("fault", *Outcome.COUNTS, "note"):
         words = name in ("fault", "note")
         table.add_column(name, justify="left" if words else "right", no_wrap=name != "note", ratio=1 if words else None)
-    for name, (outcome, _) in outcomes.items():
+    for name, outcome in outcomes.items():
         bad = "" if outcome.clean else "bold red"
-        numbers = (
-            outcome.rounds,
-            outcome.events,
-            outcome.lost,
-            outcome.duplicated,
-            outcome.misordered,
-            outcome.changed,
-            outcome.told,
-        )
-        table.add_row(name, *(f"{each:,}" for each in numbers), outcome.broke or outcome.note, style=bad)
+        table.add_row(name, *(f"{each:,}" for each in outcome.counts), outcome.broke or outcome.note, style=bad)
     return table
 
 

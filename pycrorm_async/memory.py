@@ -17,6 +17,7 @@ from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -37,7 +38,9 @@ from pycrorm_async.hooks.recorder import Recorder, current_episode
 from pycrorm_async.plan.experience import experience
 from pycrorm_async.plan.ports import recorder
 from pycrorm_async.projections.views import UserView
+from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.query.moment import Moment
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.handed_over import HandedOver
 from pycrorm_async.queue.locks import in_forked_child
@@ -378,6 +381,12 @@ class Memory:
                 "nothing was asked of this memory yet, and `mapped` knows its types then: open a session first"
             )
         return reading.mapped(designator)
+
+    async def as_of(
+        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
+    ) -> Moment:
+        """The task tree and the world at any moment of an episode, as far as it was flushed; see `Reading.as_of`."""
+        return await self._now.reading.as_of(episode, time=time, sequence=sequence)
 
     async def number_of(self, episode: Episode) -> int:
         """The number this database gave the episode; after `flush`."""

@@ -5,11 +5,17 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
+import sqlite3
+import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import asyncpg
+
+from bench.breaking.files import small_disk
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable
@@ -24,10 +30,19 @@ from tests.proxy import Proxy, proxy_before
 from tests.store.making import episode, run_of
 from tests.writer.ends import CountingFold, KeptSource
 
-__all__ = ["lost_replies", "cut_connections", "killed_servers", "cancelled_appends"]
+__all__ = [
+    "lost_replies",
+    "cut_connections",
+    "ended_servers",
+    "start_again",
+    "locked_files",
+    "full_disks",
+    "cancelled_appends",
+]
 
 _QUICKLY = Backoff(first_s=0.002, longest_s=0.02)
 _BATCH = 100
+_PAGE = 4096
 _STORED = (
     "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY episode.number, sequence"
 )
@@ -115,8 +130,23 @@ def cut_connections(server: Server) -> Callable[[int, random.Random, Path, Step]
     return run
 
 
-def killed_servers(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """The server dies with all its processes while a writer appends, and comes back."""
+def start_again(server: Server) -> None:
+    """Until it answers: on a busy machine that may be after the patience of the command that starts it."""
+    deadline = time.monotonic() + 300
+    while True:
+        try:
+            server.start()
+            ask(server.url(), "SELECT 1")
+        except (OSError, subprocess.SubprocessError, asyncpg.PostgresError):
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.2)
+        else:
+            return
+
+
+def ended_servers(server: Server, *, killed: bool) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """The server ends while a writer appends, and comes back: killed with all its processes, or stopped for a while."""
 
     async def drained(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> int:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True, busy_timeout_s=2.0)
@@ -128,9 +158,10 @@ def killed_servers(server: Server) -> Callable[[int, random.Random, Path, Step],
             while drain.state.appended < round_ * len(records) // (rounds + 1):  # noqa: ASYNC110
                 await asyncio.sleep(0.001)
             await asyncio.sleep(rng.random() * 0.02)
-            await asyncio.to_thread(server.kill)
+            await asyncio.to_thread(server.kill if killed else server.stop)
             acknowledged = drain.state.acknowledged
-            await asyncio.to_thread(server.start)
+            await asyncio.sleep(0.0 if killed else rng.random() * 0.3)
+            await asyncio.to_thread(start_again, server)
             [[count]] = await asyncio.to_thread(ask, url, "SELECT count(*) FROM event")
             forgotten += max(0, acknowledged - count)
             step()
@@ -141,12 +172,92 @@ def killed_servers(server: Server) -> Callable[[int, random.Random, Path, Step],
     def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
         del folder
         url, records = server.new_database(), _interleaved(rounds * 40)
-        outcome = Outcome(note="PostgreSQL: SIGKILL of every process of it")
+        outcome = Outcome(
+            note="PostgreSQL: SIGKILL of every process of it" if killed else "PostgreSQL: stopped at once"
+        )
         outcome.lost += asyncio.run(drained(rounds, rng, step, url, records))
         _compared(outcome, rounds, records, url)
         return outcome
 
     return run
+
+
+def locked_files(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    """Another program holds the lock of the SQLite file for longer than a writer waits, again and again."""
+    outcome = Outcome(note="SQLite: BEGIN EXCLUSIVE by another connection")
+    url, records = f"sqlite:///{folder}/memory.db", _interleaved(rounds * 4)
+
+    async def drained() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True, busy_timeout_s=0.005)
+        drain = Drain(
+            KeptSource(records, closed=True),
+            CountingFold(log),
+            settings=Settings(batch_events_max=_BATCH),
+            backoff=_QUICKLY,
+        )
+        other = sqlite3.connect(folder / "memory.db", isolation_level=None, timeout=30)
+        running = None
+        for _ in range(rounds):
+            other.execute("BEGIN EXCLUSIVE")
+            running = running or asyncio.create_task(drain.run())
+            retries = drain.state.retries
+            while drain.state.retries == retries and not running.done():  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+            other.execute("ROLLBACK")
+            appended = drain.state.appended
+            while drain.state.appended < appended + rng.randrange(5) and not running.done():  # noqa: ASYNC110
+                await asyncio.sleep(0)
+            step()
+        assert running is not None
+        await running
+        other.close()
+        await log.close()
+
+    asyncio.run(drained())
+    _compared(outcome, rounds, records, url)
+    return outcome
+
+
+def full_disks(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    """The disk that holds the database is full, and has room again, while a writer appends."""
+    outcome = Outcome(note="SQLite on a tmpfs that another file fills")
+    url, records = f"sqlite:///{folder}/disk/memory.db", _interleaved(rounds * 4)
+    size = 2**21 + 2 * sum(len(each.payload) + 200 for each in records)
+
+    async def drained() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+        drain = Drain(
+            KeptSource(records, closed=True),
+            CountingFold(log),
+            settings=Settings(batch_events_max=_BATCH),
+            backoff=_QUICKLY,
+        )
+        running = None
+        ballast = folder / "disk" / "ballast"
+        for _ in range(rounds):
+            with contextlib.suppress(OSError), ballast.open("wb", buffering=0) as file:
+                while file.write(bytes(_PAGE)) == _PAGE:
+                    pass
+            running = running or asyncio.create_task(drain.run())
+            retries = drain.state.retries
+            while drain.state.retries == retries and not running.done():  # noqa: ASYNC110
+                await asyncio.sleep(0.001)
+            ballast.unlink()
+            appended = drain.state.appended
+            while drain.state.appended < appended + rng.randrange(5) and not running.done():  # noqa: ASYNC110
+                await asyncio.sleep(0)
+            step()
+        assert running is not None
+        await running
+        await log.close()
+
+    with small_disk(folder / "disk", f"{size}") as mounted:
+        if not mounted:
+            outcome.note = "not made: there is no right to mount a small disk here"
+            return outcome
+        asyncio.run(drained())
+        _compared(outcome, rounds, records, url)
+    return outcome
 
 
 def cancelled_appends(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
@@ -184,7 +295,7 @@ async def _cancelled_everywhere(outcome: Outcome, url: str, step: Step) -> int:
         await asyncio.wait([appending])
         cancelled = appending.cancelled()
         head = await log.append(batch[:1]) or (await log.episodes())[0].head  # nobody holds what it needs
-        known += _BATCH if head == known + _BATCH else 1
+        known += _BATCH if head == known + _BATCH or not cancelled else 1
         outcome.compare(_events(run_of(episode(1), 1, known)), _found(url))
         step()
     await log.close()

@@ -34,6 +34,7 @@ __all__ = [
     "clock_jumps",
     "events_of",
     "put",
+    "small_disk",
     "ROOMY",
 ]
 
@@ -98,7 +99,8 @@ def flipped_bits(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
         else:
             told = _told(report) if report is not None else told
             records = asyncio.run(recover(place))
-            outcome.compare(events_of(author.records), events_of(records), told=len(told))
+            named = [each for each in _behind(author, author.segments[number], bit // 8) if each.position in told]
+            outcome.compare(events_of(author.records), events_of(records), told=events_of(named))
         shutil.rmtree(place.parent)
         step()
     outcome.note = f"of {len(bits):,} bits; {refused} made a file of a newer format, which is refused and left alone"
@@ -119,6 +121,15 @@ def _journal(spool: Path, rng: random.Random) -> Author:
     return author
 
 
+def _behind(author: Author, path: Path, byte: int) -> list[Record]:
+    """The record that holds this byte, and those that follow it in its episode: more than that may not be given up."""
+    for index, (file, offset, size) in enumerate(author.places):
+        if file == path and offset <= byte < offset + size:
+            hit = author.records[index]
+            return [each for each in author.records[index:] if each.episode == hit.episode]
+    return []
+
+
 def _told(report: RepairReport) -> set[int]:
     spans = [*report.unreadable, *(span for each in report.given_up for span in each.positions)]
     return {position for first, last in spans for position in range(first, last + 1)}
@@ -135,7 +146,8 @@ def power_cuts(rounds: int, rng: random.Random, folder: Path, step: Step) -> Out
                 truth = machine.put_so_far[:count]
                 try:
                     kept = [each for each in asyncio.run(recover(cut)) if each.payload != LOST]
-                except SpoolDamaged:  # no power cut may look like damage: then all of it is lost
+                except SpoolDamaged:  # no power cut may look like damage
+                    outcome.changed += 1
                     kept = []
                 gone = kept[0].position - 1 if kept else stored
                 sure = events_of(truth[min(gone, stored) : synced])
@@ -211,14 +223,24 @@ async def _filled(outcome: Outcome, spool: Path, rng: random.Random) -> None:
 
 
 @contextmanager
-def _small_disk(place: Path) -> Iterator[str]:
-    mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(place)]
-    if subprocess.run(mount, capture_output=True, check=False).returncode == 0:
-        try:
-            yield "a tmpfs of 256 KiB"
-        finally:
+def small_disk(place: Path, size: str) -> Iterator[bool]:
+    """A tmpfs of so many bytes at this place; False if there is no right to mount one."""
+    place.mkdir(exist_ok=True)
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+    mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
+    try:
+        yield mounted
+    finally:
+        if mounted:
             subprocess.run(["umount", str(place)], check=True)
-        return
+
+
+@contextmanager
+def _small_disk(place: Path) -> Iterator[str]:
+    with small_disk(place, "256k") as mounted:
+        if mounted:
+            yield "a tmpfs of 256 KiB"
+            return
     allocate = os.posix_fallocate
 
     def refusing(descriptor: int, offset: int, size: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 __all__ = ["Event", "Outcome", "Step"]
 
@@ -29,6 +30,8 @@ class Outcome:
         told: acknowledged, not found, and named one by one by a repair: damage, not a crash.
         broke: an error that ended the rounds early.
         note: what else a reader should know.
+        rounds_failed: which rounds these were, from 1 on.
+        took_s: how long all rounds took.
     """
 
     rounds: int = 0
@@ -41,22 +44,35 @@ class Outcome:
     broke: str | None = None
     note: str = ""
     rounds_failed: list[int] = field(default_factory=list)
+    took_s: float = 0.0
+
+    COUNTS: ClassVar = ("rounds", "events", "lost", "duplicated", "misordered", "changed", "told")
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        return tuple(getattr(self, name) for name in self.COUNTS)
 
     @property
     def clean(self) -> bool:
         return not (self.lost or self.duplicated or self.misordered or self.changed or self.broke)
 
     def compare(
-        self, acknowledged: Iterable[Event], found: Iterable[Event], *, put: Iterable[Event] = (), told: int = 0
+        self,
+        acknowledged: Iterable[Event],
+        found: Iterable[Event],
+        *,
+        put: Iterable[Event] = (),
+        told: Iterable[Event] = (),
     ) -> None:
-        """One round. `acknowledged` must be in `found`; more may be only of `put`, which was tried and not answered."""
+        """One round. `acknowledged` must be in `found` or `told`; more may be only of `put`, tried and not answered."""
         sure, there = set(acknowledged), list(found)
         count = Counter(there)
         before = (self.lost, self.duplicated, self.misordered, self.changed)
         self.rounds += 1
         self.events += len(sure)
-        self.lost += max(0, len(sure - count.keys()) - told)
-        self.told += min(told, len(sure - count.keys()))
+        missing = sure - count.keys()
+        self.lost += len(missing - set(told))
+        self.told += len(missing & set(told))
         self.duplicated += sum(count.values()) - len(count)
         self.changed += len(count.keys() - sure - set(put))
         last: defaultdict[str, int] = defaultdict(int)

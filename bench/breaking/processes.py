@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import multiprocessing
 import os
 import random
 import shutil
@@ -12,14 +11,15 @@ import signal
 import sys
 import tempfile
 import time
-from collections import defaultdict
+from collections import deque
 from collections.abc import Callable
 from itertools import count
-from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import NamedTuple
 
 from bench.breaking.files import ROOMY, events_of, put
-from bench.breaking.outcome import Event, Outcome, Step
+from bench.breaking.outcome import Outcome, Step
+from bench.breaking.speaking import SPAWN, Speaker, kill_me_after
 from pycrorm_async.errors import SpoolClosed, SpoolFull
 from pycrorm_async.events.envelope import LOST
 from pycrorm_async.events.ids import episode_text
@@ -27,105 +27,111 @@ from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.store.address import DatabaseAddress
 from tests.crash import recording
 from tests.databases import ask
-from tests.queue.writing import SMALL, make, node, recover
-from tests.store.test_crash import PER_BATCH, append_all
+from tests.queue.writing import SMALL, episode, make, node, recover
+from tests.store.test_crash import PER_BATCH, append_all, batch
 
 __all__ = ["killed_recorders", "killed_appenders", "forks", "exits_with_a_full_queue", "second_openers"]
 
-_SPAWN = multiprocessing.get_context("forkserver")
-_SPAWN.set_forkserver_preload(["tests.crash.recording", "tests.store.test_crash"])
 _LONGEST_LIFE_S = 0.1
+_AT_ONCE = 4
+_LONGEST_CPU_S = 0.05
 
 
 def _said_until_killed(target: Callable[..., None], arguments: tuple[object, ...], life_s: float) -> list[list[str]]:
     """Every whole line the process had written when it was killed, so long after its first."""
-    mine, its = _SPAWN.Pipe(duplex=False)
-    process = _SPAWN.Process(target=_speaking, args=(its, target, *arguments))
-    process.start()
-    its.close()
-    said = os.read(mine.fileno(), 1 << 16)
+    process = Speaker(target, *arguments)
+    process.wait_for("\n")
     time.sleep(life_s)
-    process.kill()
-    while chunk := os.read(mine.fileno(), 1 << 20):
-        said += chunk
-    process.join()
-    mine.close()
-    return [line.split() for line in said[: said.rfind(b"\n") + 1].decode().splitlines()]
-
-
-def _speaking(out: Connection, target: Callable[..., None], *arguments: object) -> None:
-    os.dup2(out.fileno(), 1)
-    out.close()
-    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
-    target(*arguments)
+    return process.kill()
 
 
 # --- recorders --------------------------------------------------------------------------------------------------
 
 
-def _record(spool: str, seed: int, threads: int, doing: str) -> None:
+def _record(spool: str, seed: int, threads: int, doing: str, cpu_s: float) -> None:
+    kill_me_after(cpu_s)
     sys.argv = ["recording", spool, str(seed), str(threads), doing]
     recording.main()
 
 
+class _Life(NamedTuple):
+    """A recorder that is to be killed: where it records, with how many threads, and what it says."""
+
+    spool: Path
+    threads: int
+    recorder: Speaker
+
+
 def killed_recorders(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """`kill -9` at a random moment of a life of up to 0.1 s; all that putting returned for must be there."""
+    """`kill -9` after up to 0.05 s of processor time; all that putting returned for must be there."""
     outcome = Outcome(note="one to three threads; half of them with a consumer that stores meanwhile")
-    for _ in range(rounds):
-        spool = Path(tempfile.mkdtemp(dir=folder)) / "spool"
-        seed, threads, doing = rng.randrange(2**31), rng.choice((1, 1, 2, 3)), rng.choice(("recording", "storing"))
-        said = _said_until_killed(_record, (str(spool), seed, threads, doing), rng.random() * _LONGEST_LIFE_S)
-        answered = {(line[1], int(line[2])) for line in said if line[0] == "put"}
-        stored = {int(line[1]): (line[2], int(line[3]), line[4]) for line in said if line[0] == "stored"}
-        (left,) = Spool(spool).recorders()
-        there = dict(stored)
-        twice = 0
-        for each in asyncio.run(recover(left.path)):
-            if each.episode is not None and each.payload != LOST:
-                event = (episode_text(each.episode), each.sequence, each.payload.rstrip(b"x").decode())
-                twice += there.get(each.position, event) != event
-                there[each.position] = event
-        found = [there[position] for position in sorted(there)]
-        content: dict[tuple[str, int], Event] = {
-            (name, sequence): (name, sequence, f"{name}/{sequence}/") for name, sequence, _ in found
-        } | {(name, sequence): (name, sequence, f"{name}/{sequence}/") for name, sequence in answered}
-        # Each thread may have been killed between the writing and the saying.
-        outcome.changed += max(0, len(found) - len(answered) - threads) + twice
-        outcome.compare([content[each] for each in answered], found, put=content.values())
-        shutil.rmtree(spool.parent)
+    lives: deque[_Life] = deque()
+    for left in range(rounds, 0, -1):
+        while len(lives) < min(_AT_ONCE, left):
+            lives.append(_born(Path(tempfile.mkdtemp(dir=folder)), rng))
+        life = lives.popleft()
+        _compare_what_is_left(outcome, life)
+        shutil.rmtree(life.spool.parent)
         step()
     return outcome
 
 
+def _born(place: Path, rng: random.Random) -> _Life:
+    spool, threads = place / "spool", rng.choice((1, 1, 2, 3))
+    seed, doing, cpu_s = rng.randrange(2**31), rng.choice(("recording", "storing")), rng.random() * _LONGEST_CPU_S
+    return _Life(spool, threads, Speaker(_record, str(spool), seed, threads, doing, cpu_s))
+
+
+def _compare_what_is_left(outcome: Outcome, life: _Life) -> None:
+    said = life.recorder.killed()
+    answered = {(line[1], int(line[2])) for line in said if line[0] == "put"}
+    there = {int(line[1]): (line[2], int(line[3]), line[4]) for line in said if line[0] == "stored"}
+    for recorder in Spool(life.spool).recorders():
+        for each in asyncio.run(recover(recorder.path)):
+            if each.episode is not None and each.payload != LOST:
+                event = (episode_text(each.episode), each.sequence, each.payload.rstrip(b"x").decode())
+                outcome.changed += there.get(each.position, event) != event
+                there[each.position] = event
+    found = [there[position] for position in sorted(there)]
+    outcome.changed += sum(text != f"{name}/{sequence}/" for name, sequence, text in found)
+    # Each thread may have been killed between the writing and the saying.
+    outcome.changed += max(0, len(found) - len(answered) - life.threads)
+    outcome.compare([(*each, f"{each[0]}/{each[1]}/") for each in answered], found, put=found)
+
+
 # --- appenders --------------------------------------------------------------------------------------------------
+
+_STORED = (
+    "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY episode.number, sequence"
+)
 
 
 def _append(url: str, first: int) -> None:
     asyncio.run(append_all(DatabaseAddress.parse(url), count(first)))
 
 
-def killed_appenders(url: str) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """The same for a process that appends batches to the database of this URL, again from the last one it reported."""
+def killed_appenders(new_database: Callable[[Path], str]) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """The same for a process that appends batches to a database, again from the last one it reported."""
 
     def killed(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-        del folder
-        outcome = Outcome(note=f"batches of {2 * PER_BATCH} events of two episodes")
-        known = 0
+        outcome, url = Outcome(note=f"batches of {2 * PER_BATCH} events of two episodes"), new_database(folder)
+        known = appended = 0
         for _ in range(rounds):
             said = _said_until_killed(_append, (url, max(known - 1, 0)), rng.random() * _LONGEST_LIFE_S)
             appended = max([known, *(int(line[1]) + 1 for line in said if line[0] == "appended")])
-            heads = _settled(url)
-            outcome.rounds += 1
-            outcome.events = 2 * PER_BATCH * appended
+            heads = _settled(url) or [0, 0]
             outcome.lost += sum(max(0, appended * PER_BATCH - head) for head in heads)
             outcome.misordered += sum(head % PER_BATCH != 0 for head in heads)  # half a batch
-            known = heads[0] // PER_BATCH if heads else 0
+            known = heads[0] // PER_BATCH
             step()
-        counts = "count(*), count(DISTINCT sequence), min(sequence), max(sequence)"
-        rows = ask(url, f"SELECT episode, {counts} FROM event GROUP BY 1")
-        for _, there, different, first, last in rows:
-            outcome.duplicated += there - different
-            outcome.lost += (last - first + 1 - different) + (first - 1)
+        events = [
+            (episode_text(each.episode), each.sequence, each.payload.decode())
+            for number in range(known)
+            for each in batch(number)
+            if each.episode is not None
+        ]
+        outcome.compare(events[: 2 * PER_BATCH * appended], ask(url, _STORED), put=events)
+        outcome.rounds = rounds
         return outcome
 
     return killed
@@ -197,21 +203,11 @@ def exits_with_a_full_queue(rounds: int, rng: random.Random, folder: Path, step:
     outcome = Outcome(note="sys.exit, an exception nobody catches, os._exit")
     for _ in range(rounds):
         spool = Path(tempfile.mkdtemp(dir=folder)) / "spool"
-        mine, its = _SPAWN.Pipe(duplex=False)
-        how = rng.choice(("exit", "raise", "_exit"))
-        process = _SPAWN.Process(target=_speaking, args=(its, _fill_and_exit, str(spool), how))
-        process.start()
-        its.close()
-        said = b""
-        while chunk := os.read(mine.fileno(), 1 << 20):
-            said += chunk
-        process.join()
-        mine.close()
+        said = Speaker(_fill_and_exit, str(spool), rng.choice(("exit", "raise", "_exit"))).end()
         (left,) = Spool(spool).recorders()
         found = events_of(asyncio.run(recover(left.path)))
-        lines = [line.split() for line in said.decode().splitlines()]
-        name = found[0][0] if found else ""
-        outcome.compare([(name, int(line[1]), line[2]) for line in lines if line[0] == "put"], found)
+        name = episode_text(episode(1))
+        outcome.compare([(name, int(line[1]), line[2]) for line in said if line[0] == "put"], found)
         shutil.rmtree(spool.parent)
         step()
     return outcome
@@ -241,26 +237,10 @@ def second_openers(rounds: int, rng: random.Random, folder: Path, step: Step) ->
         sure = [put(queue, "EpisodeStarted", b"{}")]
         sure += [put(queue, "NodeStarted", b"x" * rng.randrange(200)) for _ in range(30)]
         queue.release()
-        barrier = _SPAWN.Barrier(4)
-        mine, its = _SPAWN.Pipe(duplex=False)
-        drainers = [
-            _SPAWN.Process(target=_speaking, args=(its, _drain_if_mine, str(queue.folder), barrier)) for _ in range(4)
-        ]
-        for each in drainers:
-            each.start()
-        its.close()
-        said = b""
-        while chunk := os.read(mine.fileno(), 1 << 20):
-            said += chunk
-        for each in drainers:
-            each.join()
-        mine.close()
-        lines = [line.split() for line in said.decode().splitlines()]
-        by_episode: defaultdict[str, list[Event]] = defaultdict(list)
-        for line in lines:
-            if line[0] == "drained":
-                by_episode[line[1]].append((line[1], int(line[2]), line[3] if len(line) > 3 else ""))
-        outcome.compare(sure, [event for events in by_episode.values() for event in events])
+        barrier = SPAWN.Barrier(4)
+        drainers = [Speaker(_drain_if_mine, str(queue.folder), barrier) for _ in range(4)]
+        said = [line for each in drainers for line in each.end() if line[0] == "drained"]
+        outcome.compare(sure, [(line[1], int(line[2]), line[3] if len(line) > 3 else "") for line in said])
         shutil.rmtree(queue.folder.parent)
         step()
     return outcome

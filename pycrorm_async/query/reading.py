@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self
 
 from sqlalchemy import Select
@@ -23,7 +24,9 @@ from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.projections.generations import Generation, current_generation
 from pycrorm_async.projections.union import unite
 from pycrorm_async.query import questions
+from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.frames import dataframe
+from pycrorm_async.query.moment import Moment
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
 from pycrorm_async.query.thoughts import all_views, with_thoughts
 from pycrorm_async.store.address import DatabaseAddress
@@ -152,6 +155,23 @@ class Reading:
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
                 return await questions.task_tree(connection, number)
+
+    async def as_of(
+        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
+    ) -> Moment:
+        """The task tree and the world of an episode at any moment, from the log: also while it runs, and of thoughts.
+
+        Args:
+            episode: its number, its id or the first digits of it, `last`, or as it was opened or listed.
+            time: seconds since the episode's start, by the monotonic clock; or a moment, aware, by the wall clock,
+                where what came before the first event that is later is told.
+            sequence: of the last event to be told.
+
+        Beyond the end it is the end, or how far the log is. Raises `UnknownEpisode`; `CallerError` for a moment before
+        the start, or for none or two of them; `LogDamaged`, `DatabaseForeign` for an event that cannot be understood.
+        """
+        await self._ready()
+        return await as_of(self._log, episode, time=time, sequence=sequence)
 
     async def number_of(self, episode: str) -> int:
         """The number this database gave to the episode of that UUID. Raises `UnknownEpisode`."""

@@ -6,8 +6,11 @@ import asyncio
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from sqlalchemy import event
+from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable
@@ -20,25 +23,57 @@ from tests.store.making import episode, record
 from tests.writer.ends import CountingFold, KeptSource
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 2 MiB of its own."""
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(tmp_path)], capture_output=True, check=False
-    )
-    if mounted.returncode != 0:
-        pytest.skip("there is no right to mount a small disk here")
-    yield tmp_path
-    subprocess.run(["umount", str(tmp_path)], check=True)
+class SmallDisk:
+    """A disk of 2 MiB of its own; where there is no right to mount one, SQLite is told to take so many pages."""
+
+    def __init__(self, place: Path, *, mounted: bool) -> None:
+        self.place = place
+        self._mounted = mounted and self._mount("size=2m") == 0
+        self._pages = 256
+
+    def fill(self) -> None:
+        if self._mounted:
+            (self.place / "ballast").write_bytes(bytes(2**20))
+
+    def limit(self, engine: AsyncEngine) -> None:
+        if not self._mounted:
+            event.listen(engine.sync_engine, "checkout", self._limit_pages)
+
+    def make_room(self) -> None:
+        self._pages = 2**20
+        if self._mounted:
+            (self.place / "ballast").unlink()
+            assert self._mount("remount,size=8m") == 0
+
+    def release(self) -> None:
+        if self._mounted:
+            subprocess.run(["umount", str(self.place)], check=True)
+
+    def _mount(self, options: str) -> int:
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(self.place)]
+        return subprocess.run(command, capture_output=True, check=False).returncode
+
+    def _limit_pages(self, connection: Any, *_: object) -> None:
+        cursor = connection.cursor()
+        cursor.execute(f"PRAGMA max_page_count = {self._pages}")
+        cursor.close()
+
+
+@pytest.fixture(params=["mounted", "simulated"])
+def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SmallDisk]:
+    disk = SmallDisk(tmp_path, mounted=request.param == "mounted")
+    yield disk
+    disk.release()
 
 
 async def test_a_database_on_a_full_disk_is_away_and_everything_is_stored_once_when_there_is_room(
-    small_disk: Path,
+    small_disk: SmallDisk,
 ) -> None:
-    ballast = small_disk / "ballast"
-    ballast.write_bytes(bytes(2**20))
+    small_disk.fill()
+    file = small_disk.place / "memory.db"
     records = [record(episode(1), sequence, payload=b'"%s"' % (b"x" * 1000)) for sequence in range(1, 1001)]
-    log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{small_disk / 'memory.db'}"), create=True)
+    log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{file}"), create=True)
+    small_disk.limit(log.engine)
     source = KeptSource(records, closed=True)
     backoff = Backoff(first_s=0.005, longest_s=0.02)
     drain = Drain(source, CountingFold(log), settings=Settings(batch_events_max=50), backoff=backoff)
@@ -49,12 +84,9 @@ async def test_a_database_on_a_full_disk_is_away_and_everything_is_stored_once_w
     assert 0 < len(source.kept) < 1000
     with pytest.raises(DatabaseUnavailable, match="full"):
         await log.append(records)
-    ballast.unlink()
-    await asyncio.to_thread(subprocess.run, ["mount", "-o", "remount,size=8m", str(small_disk)], check=True)
+    await asyncio.to_thread(small_disk.make_room)
     await asyncio.wait_for(running, 60)
     await log.close()
     assert source.kept == []
-    assert ask(small_disk / "memory.db", "SELECT count(*), min(sequence), max(sequence) FROM event") == [
-        (1000, 1, 1000)
-    ]
-    assert ask(small_disk / "memory.db", "PRAGMA integrity_check") == [("ok",)]
+    assert ask(file, "SELECT count(*), min(sequence), max(sequence) FROM event") == [(1000, 1, 1000)]
+    assert ask(file, "PRAGMA integrity_check") == [("ok",)]

@@ -1,0 +1,138 @@
+"""`pycrorm show`: an episode's task tree; and with `--at`, tree and world at any moment, also of what died."""
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.commands import answer, one_line_of, pycrorm
+
+PLANS = '''
+import os, signal
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract, MoveTorsoAction, NavigateAction, simulated_robot
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+
+@dataclass
+class HoldActionPerformable(ActionAbstract):
+    what: str
+    last: bool
+    async def perform(self):
+        await MoveTorsoAction([0.2]).resolve().perform()
+        if self.last:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+async def plan(last=False):
+    """Take the milk for a ride."""
+    with BulletWorld(), simulated_robot:
+        robot = Object("pr2", ObjectType.ROBOT)
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1, 0, 0.9]))
+        robot.attach(milk, "l_gripper_tool_frame")
+        await NavigateAction([Pose([2, 3, 0], [0, 0, 1, 1])]).resolve().perform()
+        await HoldActionPerformable("milk", last).perform()
+
+async def dies():
+    await plan(last=True)
+'''
+
+# Events: 1 start, 2 root, 3 pr2, 4 milk, 5 attached, 6 NavigateAction, 7 MoveMotion, 8 pr2 moved, 9 milk moved,
+# 10 and 11 their ends, 12 HoldAction, 13 MoveTorsoAction, 14 MoveJointsMotion, 15 joints, 16 milk (its hand rose),
+# 17 and 18 ends, 19 HoldAction's.
+
+
+@pytest.fixture(scope="module")
+def ridden(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where a ride that went well is remembered."""
+    return after_a_ride(tmp_path_factory.mktemp("ridden"), "plan", code=0)
+
+
+def after_a_ride(place: Path, plan: str, code: int) -> Path:
+    (place / "ride.py").write_text(PLANS)
+    done = pycrorm("run", f"ride.py:{plan}", cwd=place)
+    assert done.returncode == code, done.stderr
+    return place
+
+
+def statuses(then: Any) -> list[tuple[str | None, str]]:
+    return [(each["dtype"], each["status"]) for each in then["tree"]]
+
+
+def test_a_moment_is_drawn_with_its_tree_and_its_world(ridden: Path) -> None:
+    done = pycrorm("show", "1", "--at", "#9", cwd=ridden)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = [line.rstrip() for line in done.stdout.splitlines()]
+    assert lines[0] == "Episode 1: Take the milk for a ride."
+    assert lines[4].startswith("  at        #9: after event 9, 0.")
+    assert lines[5:8] == [
+        "  status    RUNNING",
+        "  running   NavigateAction > MoveMotion",
+        "  robot     pr2 at (2.000, 3.000), heading 90.0°, torso at 0.000 m",
+    ]
+    assert lines[8:12] == [
+        "root  RUNNING",
+        "└── NavigateAction  target_location=(2.00, 3.00, 0.00)  RUNNING",
+        "    └── MoveMotion  target=(2.00, 3.00, 0.00)  RUNNING",
+        "World",
+    ]
+    cells = [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines if "│" in line]
+    assert cells == [
+        ["pr2", "ROBOT", "2.000", "3.000", "0.000", "90.0°", "", ""],
+        ["milk", "MILK", "2.000", "4.000", "0.900", "90.0°", "pr2 l_gripper_tool_frame", ""],
+    ]
+    later = pycrorm("show", "last", "--at", "#16", cwd=ridden).stdout
+    assert "  running   HoldAction > MoveTorsoAction > MoveJointsMotion\n" in later
+    assert "torso at 0.200 m" in later
+    assert "torso_lift_joint 0.200" in later
+
+
+def test_a_moment_is_one_document(ridden: Path) -> None:
+    then = answer("show", "1", "--at", "#16", cwd=ridden)
+    assert (then["number"], then["sequence"], then["status"], then["simulated"]) == (1, 16, "RUNNING", False)
+    assert statuses(then) == [
+        (None, "RUNNING"),
+        ("NavigateAction", "SUCCEEDED"),
+        ("MoveMotion", "SUCCEEDED"),
+        ("HoldAction", "RUNNING"),
+        ("MoveTorsoAction", "RUNNING"),
+        ("MoveJointsMotion", "RUNNING"),
+    ]
+    robot, milk = then["world"]["objects"]
+    assert (robot["name"], robot["pose"]["position"], robot["joints"]["torso_lift_joint"]) == ("pr2", [2, 3, 0], 0.2)
+    assert milk["attached_to"] == ["pr2", "l_gripper_tool_frame"]
+    assert milk["pose"]["position"] == pytest.approx([2, 4, 1.1])
+    assert then["world"]["robot"]["torso_height"] == 0.2
+    by_time = answer("show", "1", "--at", repr(then["time_s"]), cwd=ridden)
+    assert by_time == then
+    end = answer("show", "1", "--at", "1e6", cwd=ridden)
+    assert (end["status"], end["world"]["objects"]) == ("SUCCEEDED", [])
+    assert [each["status"] for each in end["tree"]] == ["SUCCEEDED"] * 6
+
+
+def test_what_a_killed_robot_was_doing_is_shown(tmp_path: Path) -> None:
+    place = after_a_ride(tmp_path, "dies", code=-signal.SIGKILL)
+    assert pycrorm("writer", "--once", cwd=place).returncode == 0
+    end = answer("show", "1", "--at", "1e6", cwd=place)
+    assert statuses(end)[3] == ("HoldAction", "LOST")
+    assert (end["status"], end["sequence"]) == ("LOST", 19)
+    # What was in its world when it died is told, with the milk in the hand.
+    assert [each["attached_to"] for each in end["world"]["objects"]] == [None, ["pr2", "l_gripper_tool_frame"]]
+    before = answer("show", "1", "--at", "#18", cwd=place)
+    assert statuses(before)[3:5] == [("HoldAction", "RUNNING"), ("MoveTorsoAction", "SUCCEEDED")]
+    assert before["status"] == "RUNNING"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["1", "--at", "noon"], "--at takes seconds since the episode's start, or an event as '#300', not 'noon'"),
+        (["1", "--at", "#3.5"], "--at takes seconds since the episode's start, or an event as '#300', not '#3.5'"),
+        (["1", "--at=-1"], "-1 s is before episode 1 began"),
+        (["1", "--at", "#0"], "event 0 is before episode 1 began"),
+        (["7", "--at", "1"], "there is no episode '7' (`pycrorm episodes` lists the 1 there are)"),
+    ],
+)
+def test_what_is_no_moment_of_an_episode_is_one_line(ridden: Path, arguments: list[str], said: str) -> None:
+    done = pycrorm("show", *arguments, cwd=ridden)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert one_line_of(done) == f"pycrorm: {said}"

@@ -1,0 +1,403 @@
+"""The task tree and the world of an episode at any of its moments, on each kind of database.
+
+What is to be told after each event is written beside it by hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from dataclasses import fields
+from datetime import UTC, datetime, timedelta
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, UnknownEpisode
+from pycrorm_async.events.happenings import (
+    CandidateValue,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    Happening,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeReference,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectDetected,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    RobotValue,
+    SeenValue,
+    StateSampled,
+)
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.query.moment import AttachmentThen, Moment, NodeThen, RobotThen
+from pycrorm_async.query.questions import NodeSummary
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.pose import Pose
+from tests.projections.asking import stored_and_folded
+from tests.projections.script import MOVE, NAVIGATE, PICK_UP, T0_NS, Script, declarations, name_of, pose, row
+
+TYPES = (NAVIGATE, PICK_UP, MOVE)
+ID = "00000000-0000-7000-8000-000000000001"
+PR2, MILK, OUTER, INNER, AGAIN = 3, 4, 5, 9, 18
+
+
+class Line(NamedTuple):
+    """An event, and what is so after it: every node's status in tree order, every object, the episode's status."""
+
+    event: Happening
+    tree: str
+    world: str
+    status: str = "RUNNING"
+
+
+def thing(sequence: int) -> ObjectReference:
+    return ObjectReference(sequence, sequence)
+
+
+ROBOT = RobotValue(pose(), "ROBOT", 0.0, thing(PR2))
+STORY = [
+    Line(EpisodeStarted("a story", "me", "host", "1.0", "3.11"), "", ""),
+    Line(NodeStarted("root"), "root RUNNING", ""),
+    Line(
+        ObjectAdded("pr2", "ROBOT", pose(), {"torso_lift_joint": 0.0, "arm": 1.5}),
+        "root RUNNING",
+        "pr2 0 0 0 | 0 1.5",
+    ),
+    Line(ObjectAdded("milk", "MILK", pose(1, 2, 3)), "root RUNNING", "pr2 0 0 0 | 0 1.5; milk 1 2 3"),
+    Line(
+        NodeStarted("action", 2, name_of(NAVIGATE), {"target_location": pose(7)}, ROBOT),
+        "root RUNNING, NavigateAction RUNNING",
+        "pr2 0 0 0 | 0 1.5; milk 1 2 3",
+    ),
+    Line(
+        ObjectMoved(PR2, "pr2", "ROBOT", pose(0.5, 4), OUTER),
+        "root RUNNING, NavigateAction RUNNING",
+        "pr2 0.5 4 0 | 0 1.5; milk 1 2 3",
+    ),
+    Line(
+        JointsMoved(ObjectReference(PR2, 6), {"torso_lift_joint": 0.25}, OUTER),
+        "root RUNNING, NavigateAction RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3",
+    ),
+    Line(
+        StateSampled(ObjectReference(PR2, 6), {"base.x": 9.0, "arm": 9.0}, OUTER),  # may be late: the setters are exact
+        "root RUNNING, NavigateAction RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3",
+    ),
+    Line(
+        NodeStarted("action", OUTER, name_of(PICK_UP), {"object_designator": thing(MILK), "arm": "LEFT"}, ROBOT),
+        "root RUNNING, NavigateAction RUNNING, PickUpAction RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3",
+    ),
+    Line(
+        ObjectAttached(ObjectReference(PR2, 6), thing(MILK), "hand", INNER),
+        "root RUNNING, NavigateAction RUNNING, PickUpAction RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3 < pr2 hand",
+    ),
+    Line(
+        ObjectMoved(MILK, "milk", "MILK", pose(5, 6, 7), INNER),
+        "root RUNNING, NavigateAction RUNNING, PickUpAction RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 5 6 7 < pr2 hand",
+    ),
+    Line(
+        NodeEnded(INNER, "FAILED", FailureValue("a.b.IKError", "too far")),
+        "root RUNNING, NavigateAction RUNNING, PickUpAction FAILED IKError: too far",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 5 6 7 < pr2 hand",
+    ),
+    Line(
+        NodeStarted("motion", 2, name_of(MOVE), {"target": pose(8)}, ROBOT),
+        "root RUNNING, NavigateAction RUNNING, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 5 6 7 < pr2 hand",
+    ),
+    Line(
+        NodeEnded(OUTER, "SUCCEEDED"),
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 5 6 7 < pr2 hand",
+    ),
+    Line(
+        ObjectDetached(ObjectReference(PR2, 6), ObjectReference(MILK, 11), "hand"),
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 5 6 7",
+    ),
+    Line(
+        ObjectRemoved(ObjectReference(MILK, 11)),
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5",
+    ),
+    Line(
+        ObjectMoved(MILK, "milk", "MILK", pose(9, 9, 9)),  # told late, by another thread
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5",
+    ),
+    Line(
+        ObjectAdded("milk", "MILK", pose(1, 1, 1)),
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5; milk 1 1 1",
+    ),
+    Line(
+        ObjectAttached(thing(AGAIN), ObjectReference(PR2, 6), None),
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5 < milk; milk 1 1 1",
+    ),
+    Line(
+        LocationResolved("CostmapLocation", (CandidateValue(pose(1), ("LEFT",)),), 0, 4, OUTER),
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5 < milk; milk 1 1 1",
+    ),
+    Line(
+        ObjectDetected("camera", "MILK", (SeenValue("milk", "MILK", pose(8), thing(AGAIN), 1.0),), OUTER),
+        "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
+        "pr2 0.5 4 0 | 0.25 1.5 < milk; milk 1 1 1",
+    ),
+    Line(
+        EpisodeEnded("LOST"),
+        "root LOST, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion LOST",
+        "pr2 0.5 4 0 | 0.25 1.5 < milk; milk 1 1 1",
+        "LOST",
+    ),
+]
+
+
+def story(number: int = 1) -> Script:
+    script = Script(number)
+    for line in STORY:
+        script.put(line.event)
+    return script
+
+
+@pytest.fixture
+async def reading(log: EventLog) -> AsyncIterator[Reading]:
+    """Episode 1 is the story."""
+    await stored_and_folded(log, [*declarations(*TYPES), *story().records])
+    async with Reading.open_address(log.address) as opened:
+        yield opened
+
+
+def told(then: Moment) -> tuple[str, str, str]:
+    """The same in the words of the story."""
+    return ", ".join(map(_node_words, then.tree)), "; ".join(map(_object_words, then.world.objects)), then.status
+
+
+def _node_words(node: NodeThen) -> str:
+    reason = f" {node.reason}: {node.failure_message}" if node.reason else ""
+    return f"{node.dtype or 'root'} {node.status}{reason}"
+
+
+def _object_words(each: Any) -> str:
+    words = " ".join([each.name, *(f"{value:g}" for value in each.pose.position)])
+    if each.joints:
+        words += " | " + " ".join(f"{each.joints[joint]:g}" for joint in ("torso_lift_joint", "arm"))
+    if each.attached_to:
+        words += " < " + " ".join(filter(None, each.attached_to))
+    return words
+
+
+def at(sequence: int) -> datetime:
+    return datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC) + timedelta(seconds=sequence)
+
+
+async def test_after_every_event_tree_and_world_are_as_the_story_says(reading: Reading) -> None:
+    for sequence, line in enumerate(STORY, 1):
+        then = await reading.as_of(1, sequence=sequence)
+        assert (then.sequence, then.time_s, then.at) == (sequence, sequence - 1.0, at(sequence))
+        assert told(then) == line[1:], sequence
+
+
+async def test_a_time_is_that_of_the_last_event_that_had_happened(reading: Reading) -> None:
+    """Event n of a story happens n - 1 seconds after its first, and n seconds after 22:13:20."""
+    for sequence in range(1, len(STORY) + 1):
+        for time in (sequence - 1, float(sequence - 1), sequence - 1 + 0.999_999_999, at(sequence)):
+            assert (await reading.as_of(1, time=time)).sequence == sequence
+        for time in (sequence - 1 - 1e-9, at(sequence) - timedelta(microseconds=1)):
+            if sequence > 1:
+                assert (await reading.as_of(1, time=time)).sequence == sequence - 1
+    assert (await reading.as_of(1, time=np.float64(2.5))).sequence == 3
+    assert (await reading.as_of(1, sequence=np.int64(3))).sequence == 3  # type: ignore[arg-type]  # as a frame has it
+
+
+async def test_beyond_the_end_is_the_end(reading: Reading) -> None:
+    end = await reading.as_of(1, sequence=len(STORY))
+    for when in ({"sequence": 10**9}, {"time": 1e9}, {"time": datetime(2099, 1, 1, tzinfo=UTC)}):
+        assert await reading.as_of(1, **when) == end
+
+
+async def test_at_the_end_the_tree_is_that_of_the_tables(reading: Reading) -> None:
+    def summary(node: NodeSummary) -> dict[str, Any]:
+        return {each.name: getattr(node, each.name) for each in fields(NodeSummary)}
+
+    then = await reading.as_of(1, time=1e9)
+    assert [summary(each) for each in then.tree] == [summary(each) for each in await reading.tree(1)]
+
+
+async def test_a_node_says_what_it_was_then(reading: Reading) -> None:
+    parameters = {"object_designator": {"object": MILK, "row": MILK, "name": "milk"}, "arm": "LEFT"}
+    running = NodeThen(
+        id=row(INNER), parent_id=row(OUTER), depth=2, dtype="PickUpAction", kind="action", parameters=parameters,
+        status="RUNNING", started_at=at(INNER), duration_ns=None, reason=None, failure_message=None, simulated=False,
+        sequence=INNER, start_s=8.0, end_s=None,
+    )  # fmt: skip
+    assert (await reading.as_of(1, sequence=11)).tree[2] == running
+    failed = (await reading.as_of(1, sequence=12)).tree[2]
+    assert (failed.status, failed.duration_ns, failed.end_s) == ("FAILED", 3_000_000_000, 11.0)
+    lost = (await reading.as_of(1, sequence=22)).tree[3]
+    assert (lost.status, lost.duration_ns, lost.end_s) == ("LOST", None, None)
+    assert [each.dtype for each in (await reading.as_of(1, sequence=9)).running] == [
+        None,
+        "NavigateAction",
+        "PickUpAction",
+    ]
+    assert [each.dtype for each in (await reading.as_of(1, sequence=14)).running] == [None, "MoveMotion"]
+
+
+async def test_the_world_says_what_was_in_it_and_where_its_robot_was(reading: Reading) -> None:
+    then = (await reading.as_of(1, sequence=11)).world
+    assert then.attachments == (AttachmentThen("pr2", "milk", "hand"),)
+    assert then.robot == RobotThen("pr2", Pose([0.5, 4, 0]), 0.25)
+    milk = then.object("milk")
+    assert (milk.id, milk.identity_id, milk.object_type, milk.attached_to) == (
+        row(11),
+        row(MILK),
+        "MILK",
+        ("pr2", "hand"),
+    )
+    assert milk.pose.time_ns == T0_NS - 1_000_007
+    again = (await reading.as_of(1, sequence=18)).world.object("milk")
+    assert (again.id, again.identity_id) == (row(AGAIN), row(AGAIN))
+    gone = (await reading.as_of(1, sequence=16)).world
+    with pytest.raises(CallerError, match="there was no object 'milk' in the world then, but pr2"):
+        gone.object("milk")
+    empty = (await reading.as_of(1, sequence=2)).world
+    assert (empty.objects, empty.robot, empty.attachments) == ((), None, ())
+    with pytest.raises(CallerError, match="there was no object 'milk' in the world then, but nothing"):
+        empty.object("milk")
+
+
+async def test_a_moment_can_be_printed(reading: Reading) -> None:
+    assert str(await reading.as_of(1, sequence=10)) == (
+        "episode 1 at 9.000 s, event 10: RUNNING\n"
+        "  root RUNNING\n"
+        "    NavigateAction RUNNING\n"
+        "      PickUpAction RUNNING\n"
+        "pr2 Pose(position=[0.5, 4.0, 0.0], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')\n"
+        "milk Pose(position=[1.0, 2.0, 3.0], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')"
+    )
+
+
+# --- which episode ------------------------------------------------------------------------------------------------
+
+
+async def test_an_episode_is_named_in_any_way(log: EventLog) -> None:
+    thought = Script(3)
+    thought.put(EpisodeStarted("a thought", "me", "h", "1", "3.11", simulated=True, thought_by=NodeReference(ID, 5)))
+    thought.put(NodeStarted("root", simulated=True))
+    await stored_and_folded(log, [*declarations(*TYPES), *story().records, *story(2).records, *thought.records])
+    async with Reading.open_address(log.address) as reading:
+        second = await reading.episode("2")
+        for name, number in ((1, 1), ("1", 1), (ID, 1), ("last", 2), (second, 2), (second.id, 2), (3, 3)):
+            then = await reading.as_of(name, sequence=2)
+            assert (then.number, then.simulated) == (number, number == 3)
+        for unknown, message in (
+            (9, "there is no episode '9'"),
+            ("00000000-0000", "3 episodes have an id that begins with '00000000-0000'"),
+            (True, "there is no episode 'True'"),
+        ):
+            with pytest.raises(UnknownEpisode, match=message):
+                await reading.as_of(unknown, sequence=2)
+
+
+async def test_what_the_tables_do_not_show_is_told_from_the_log(log: EventLog) -> None:
+    await Projector(log).open()
+    records = story().records
+    await log.append([*declarations(*TYPES), *records[:6]])
+    async with Reading.open_address(log.address) as reading:
+        assert await reading.episodes() == []
+        assert told(await reading.as_of("last", time=1e9)) == STORY[5][1:]
+        await log.append(records[6:15])
+        assert told(await reading.as_of("last", time=1e9)) == STORY[14][1:]
+
+
+async def test_an_episode_of_many_events_is_read_to_the_moment(log: EventLog) -> None:
+    script = Script()
+    script.put(EpisodeStarted("long", "me", "h", "1", "3.11"))
+    milk = script.put(ObjectAdded("milk", "MILK", pose(2)))
+    for sequence in range(3, 1201):
+        script.put(ObjectMoved(milk, "milk", "MILK", pose(sequence)))
+    await stored_and_folded(log, script.records)
+    async with Reading.open_address(log.address) as reading:
+        for sequence in (2, 249, 250, 251, 252, 499, 500, 501, 999, 1000, 1001, 1200):
+            then = await reading.as_of(1, sequence=sequence)
+            assert then.world.object("milk").pose.position.x == sequence
+
+
+# --- what is no moment, and what cannot be told -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("when", "message"),
+    [
+        ({}, "a moment is asked for by its time or by the sequence of an event: give one of the two"),
+        ({"time": 1.0, "sequence": 1}, "a moment is asked for by its time or by the sequence of an event: give one"),
+        ({"time": -0.5}, "-0.5 s is before episode 1 began"),
+        ({"sequence": 0}, "event 0 is before episode 1 began"),
+        ({"sequence": -3}, "event -3 is before episode 1 began"),
+        ({"time": at(0)}, r"2023-11-14 22:13:20\+00:00 is before episode 1 began"),
+        ({"time": float("nan")}, "a time is seconds since the episode's start, or a datetime, not nan"),
+        ({"time": float("inf")}, "a time is seconds since the episode's start, or a datetime, not inf"),
+        ({"time": "1"}, "a time is seconds since the episode's start, or a datetime, not '1'"),
+        ({"time": True}, "a time is seconds since the episode's start, or a datetime, not True"),
+        ({"time": datetime(2023, 1, 1)}, r"datetime.datetime\(2023, 1, 1, 0, 0\) has no time zone: say which"),  # noqa: DTZ001
+        ({"sequence": 1.0}, "the sequence of an event is a whole number, not 1.0"),
+        ({"sequence": True}, "the sequence of an event is a whole number, not True"),
+    ],
+)
+async def test_what_is_no_moment_is_refused(reading: Reading, when: dict[str, Any], message: str) -> None:
+    with pytest.raises(CallerError, match=message):
+        await reading.as_of(1, **when)
+
+
+@pytest.mark.parametrize(
+    ("type_", "payload", "version", "kind", "message"),
+    [
+        ("NodeEnded", b'{"node":', 1, LogDamaged, f"episode {ID}, event 16: NodeEnded cannot be decoded: "),
+        ("NodeEnded", b'{"node":99,"status":"FAILED"}', 1, LogDamaged, "event 16: node 99 ends and never started"),
+        ("NodeStarted", b'{"kind":"action","parent":99}', 1, LogDamaged, "event 16: its parent 99 never started"),
+        ("EpisodeStarted", None, 1, LogDamaged, "event 16: the episode starts a second time"),
+        ("ObjectRemoved", b'{"object":{"object":5,"row":5}}', 1, LogDamaged, "event 16: object 5 was never added"),
+        ("NodeStarted", b'{"kind":"action","parent":2,"designator":"0f"}', 1, LogDamaged, "type 0f was never declared"),
+        ("NodeEnded", b"{}", 2, DatabaseForeign, "event 16: NodeEnded has version 2, this version knows 1: a newer"),
+        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event this version knows: a newer"),
+    ],
+)
+async def test_what_came_before_an_event_that_cannot_be_understood_is_told(
+    log: EventLog, type_: str, payload: bytes | None, version: int, kind: type[Exception], message: str
+) -> None:
+    script = Script()
+    for line in STORY[:15]:
+        script.put(line.event)
+    script.put_payload(type_, payload or script.records[0].payload, version)
+    script.put(NodeEnded(2, "SUCCEEDED"))
+    await stored_and_folded(log, [*declarations(*TYPES), *script.records])
+    async with Reading.open_address(log.address) as reading:
+        assert told(await reading.as_of(1, sequence=15)) == STORY[14][1:]
+        assert told(await reading.as_of(1, time=14.5)) == STORY[14][1:]
+        for when in ({"sequence": 16}, {"time": 1e9}):
+            with pytest.raises(kind, match=message):
+                await reading.as_of(1, **when)
+
+
+async def test_an_episode_that_does_not_begin_with_its_start_is_damaged(log: EventLog) -> None:
+    script = Script()
+    script.put(NodeStarted("root"))
+    await stored_and_folded(log, script.records)
+    async with Reading.open_address(log.address) as reading:
+        with pytest.raises(LogDamaged, match="event 1: the episode has not started, and begins with NodeStarted"):
+            await reading.as_of(1, sequence=1)
