@@ -110,7 +110,7 @@ class _Check:
         self._order = OrderCheck()
         self._open_nodes: dict[int, list[Any]] = {}
         self._open_episode: dict[int, list[Any]] = {}
-        self._untold = 0  # number of an episode of which no row can be told any more, after a finding
+        self._untold: int | None = None  # number of an episode of which no row can be told any more, after a finding
 
     def found(self) -> Verified:
         return Verified(
