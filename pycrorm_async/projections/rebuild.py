@@ -43,9 +43,12 @@ from pycrorm_async.projections.generations import (
     show,
 )
 from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.materialised import kept_tables, refresh_some
+from pycrorm_async.projections.public import public_views
+from pycrorm_async.projections.shadowing import with_views
 from pycrorm_async.projections.tables import CORE, physical_name
 from pycrorm_async.projections.union import unite
-from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
+from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_text, with_user_views
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -119,8 +122,8 @@ class Rebuild:
                 shown = there.get(SHOWN)
                 layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
                 if shown is not None:
-                    layout = layout.with_views(shown.layout.user_views)
-                layout = layout.with_views(view_texts((*BUILT_IN_VIEWS, *views), layout, connection.dialect))
+                    layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
+                layout = with_user_views(layout, (*BUILT_IN_VIEWS, *views), connection.dialect)
                 making = await grow_tables(connection, making, layout)
                 await note(connection, MAKING, making)
         return cls(log, making, share=Share())
@@ -164,12 +167,27 @@ class Rebuild:
             for _ in range(_SHOW_ATTEMPTS):
                 while await self.fold_some() is not None:
                     pass
+                await self._fill_kept()
                 try:
                     if await self._show_if_complete():
                         return
                 except RowRefused:
                     continue  # folded again, it parks its episode
         raise DatabaseUnavailable(f"{self._log.address}: more is recorded than can be folded meanwhile: run it again")
+
+    async def _fill_kept(self) -> None:
+        """Makes the rows of the views that are kept, from the new tables."""
+        async with self._log.engine.connect() as connection:
+            making = await _Making(self.number).generation(connection, "share")
+        if not making.layout.kept:
+            return
+        dialect = self._log.engine.dialect
+        views = {name: view_text(each, dialect) for name, each in public_views(making.layout, self.number).items()}
+        async with with_views(self._log.engine, views | making.layout.user_views) as connection:
+            more = True
+            while more:
+                more = await refresh_some(connection, making.layout, self.number, folded=progress.folded(self.number))
+                await connection.commit()
 
     async def _show_if_complete(self) -> bool:
         """False if so much is missing that everybody would have to wait for it."""
@@ -191,12 +209,20 @@ class Rebuild:
                 new = await noted(connection, MAKING) or new
             # A view that was registered meanwhile is kept; and whoever has read a revision before must see another one.
             if old is not None:
-                layout = new.layout.with_views(old.layout.user_views | new.layout.user_views)
-                new = replace(new, layout=layout, revision=max(new.revision, old.revision) + 1)
+                # A view registered meanwhile that is kept has no table here: then there is more to make first.
+                missing = old.layout.user_views.keys() - new.layout.user_views.keys()
+                layout = new.layout.with_views(
+                    {name: old.layout.user_views[name] for name in missing},
+                    {name: kept for name, kept in old.layout.kept.items() if name in missing},
+                )
+                new = await grow_tables(connection, new, layout)
+                new = replace(new, revision=max(new.revision, old.revision) + 1)
                 await note(connection, f"{GONE}{old.number}", old)
-            await show(connection, new)
+            new = await show(connection, new)
             await progress.carry_over(connection, self.number)
             await forget(connection, MAKING)
+            while await refresh_some(connection, new.layout, new.number):
+                pass
         return True
 
 
@@ -210,7 +236,7 @@ async def clear(log: EventLog) -> list[str]:
         for name, generation in there.items():
             if not name.startswith(GONE):
                 continue
-            tables = (*CORE, *generation.layout.leaves, progress.TABLE)
+            tables = (*CORE, *generation.layout.leaves, *kept_tables(generation.layout), progress.TABLE)
             named = [physical_name(each, generation.number) for each in tables]
             kept = [each for each in named if not await _drop(log, each)]
             left += kept
