@@ -69,6 +69,11 @@ class Speaker:
         """The same when it has ended by itself."""
         self._process.join()
         self._listener.join()
+        return self.said
+
+    @property
+    def said(self) -> list[list[str]]:
+        """The words of every whole line so far."""
         said = bytes(self._said)
         return [line.split() for line in said[: said.rfind(b"\n") + 1].decode().splitlines()]
 
