@@ -132,7 +132,8 @@ async def test_a_server_too_old(
     error = await refused(url, caplog)
     assert type(error) is DatabaseUnavailable
     assert str(error).endswith(f"PostgreSQL 14 or newer is needed, this is {version}")
-    assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname IN ('pycrorm', 'memory', 'memory_tables')") == [(0,)]
+    ours = "('pycrorm', 'memory', 'memory_tables')"
+    assert ask(url, f"SELECT count(*) FROM pg_namespace WHERE nspname IN {ours}") == [(0,)]
 
 
 async def test_a_user_without_rights(server: Server, guarded: str, caplog: pytest.LogCaptureFixture) -> None:
