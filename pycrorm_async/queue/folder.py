@@ -10,19 +10,53 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.progress import PROGRESS
 from pycrorm_async.queue.segment import segment_numbers, segment_path, sync_folder
 
-__all__ = ["ALIVE", "DRAIN", "MAKING", "TAIL", "available", "make_folder", "remove_folder", "write_safely"]
+__all__ = [
+    "ALIVE",
+    "DRAIN",
+    "MAKING",
+    "MENDED",
+    "REFUSED",
+    "TAIL",
+    "Holding",
+    "available",
+    "held_by",
+    "make_folder",
+    "remove_folder",
+    "write_safely",
+]
 
 ALIVE: Final = "alive"
 DRAIN: Final = "drain"
 MAKING: Final = ".making"
+MENDED: Final = f".mended{MAKING}"
+"""What `repair` adds to the name of a new folder until it is whole."""
+REFUSED: Final = ".refused"
 TAIL: Final = ".tail"
+
+
+class Holding(NamedTuple):
+    """Whose records a folder holds: all of a recorder's, or those of one `episode` that the database refused."""
+
+    recorder: EpisodeId
+    episode: EpisodeId | None
+
+
+def held_by(name: str) -> Holding:
+    """What a folder of this name holds. Raises `ValueError` for what is no name of ours."""
+    recorder, dot, rest = name.partition(".")
+    if not dot:
+        return Holding(parse_episode_id(recorder), None)
+    if not rest.endswith(REFUSED):
+        raise ValueError(name)
+    return Holding(parse_episode_id(recorder), parse_episode_id(rest.removesuffix(REFUSED)))
 
 
 @contextmanager
