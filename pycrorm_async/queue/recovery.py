@@ -35,7 +35,7 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
     recorder, refused = held_by(folder.name)
     with available(folder):
         own = folder.with_name(episode_text(recorder))
-        if refused is not None and (own.exists() or own.with_name(f"{own.name}{MENDED}").exists()):
+        if refused is not None and ((own / ALIVE).exists() or own.with_name(f"{own.name}{MENDED}").exists()):
             return None
         alive = FileLock.take(folder / ALIVE, create=False)
         if alive is None:

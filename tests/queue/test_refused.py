@@ -68,6 +68,7 @@ async def test_what_is_put_is_recovered_when_the_recorders_own_folder_is_gone(ow
     own.rename(mended)
     assert open_dead(kept_in(own)) is None
     shutil.rmtree(mended)
+    own.mkdir()  # killed in the last step of its removal
     assert await recover(kept_in(own)) == placed([*some(5, 9), end(10)])
 
 
