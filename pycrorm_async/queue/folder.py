@@ -86,8 +86,9 @@ def make_folder(spool: Path, name: str) -> tuple[Path, FileLock]:
 
 def remove_folder(folder: Path) -> None:
     """Deletes what is ours in it, and the folder unless somebody else left something there. Raises `OSError`."""
-    for number in segment_numbers(folder):
-        segment_path(folder, number).unlink()
+    # One made ahead goes first: left alone by a kill it would look like one whose header was lost. Then the oldest.
+    for path in sorted((segment_path(folder, number) for number in segment_numbers(folder)), key=_is_begun):
+        path.unlink()
     for path in list(folder.iterdir()):
         if path.suffix in {MAKING, TAIL}:
             path.unlink()
@@ -95,6 +96,11 @@ def remove_folder(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
+
+
+def _is_begun(segment: Path) -> bool:
+    with segment.open("rb") as file:
+        return file.read(1) != b"\0"
 
 
 def write_safely(path: Path, content: bytes) -> None:
