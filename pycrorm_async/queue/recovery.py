@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pycrorm_async.events.envelope import LOST, Record
-from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by, remove_folder
 from pycrorm_async.queue.frame import Buffer
 from pycrorm_async.queue.locks import FileLock
@@ -32,10 +32,9 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
     records a second, and has the disk keep what is given away. Raises `SpoolDamaged`, `SpoolForeign` and
     `SpoolUnavailable`, holding nothing.
     """
-    recorder, refused = held_by(folder.name)
     with available(folder):
-        own = folder.with_name(episode_text(recorder))
-        if refused is not None and ((own / ALIVE).exists() or own.with_name(f"{own.name}{MENDED}").exists()):
+        own = folder.with_name(folder.name.partition(".")[0])
+        if own != folder and ((own / ALIVE).exists() or own.with_name(f"{own.name}{MENDED}").exists()):
             return None
         alive = FileLock.take(folder / ALIVE, create=False)
         if alive is None:
@@ -46,6 +45,7 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
                 alive.release()
                 return None
             try:
+                recorder = held_by(folder.name).recorder
                 kept = scan(folder, recorder)
                 make_safe(folder, kept)
                 return RecoveredQueue(folder, recorder, kept, (drain, alive))
