@@ -22,7 +22,7 @@ from typing import NamedTuple, Self
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, InternalError
+from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged
 from pycrorm_async.projections import progress
 from pycrorm_async.projections.classes import mapped_leaves
 from pycrorm_async.projections.folding import Folding
@@ -52,14 +52,18 @@ from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_text,
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span, share_out
+from pycrorm_async.store.rows import Span, StoredEvent, share_out
 
 __all__ = ["Rebuild", "Share", "claimed", "clear"]
 
 _BATCH_EVENTS = 4_000
 """So that nobody waits long for a turn to write: on SQLite such a batch holds the write lock for some 50 ms."""
+_EPISODES_MAX = 400
+"""So many episodes that have more are looked up for a batch: each costs as much as folding some of its events."""
 _SLICE_ROWS = 10_000
 """So many rows of a table that is not shown any more are deleted at once."""
+_PAUSE_S = 0.02
+"""So long nobody deletes: on SQLite whoever waits to write looks from time to time, and would find no gap."""
 _LATE_EVENTS_MAX = 2_000
 """So many events may be left to fold when the new tables are shown: they are folded while everybody waits."""
 _SHOW_ATTEMPTS = 50
@@ -108,7 +112,7 @@ class Rebuild:
             payloads = await log.declarations()
             async with log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
-                there = await all_noted(connection)
+                there = await _known(log, connection)
                 making = there.get(MAKING)
                 if making is not None and making.version != PROJECTION_VERSION:
                     await forget(connection, MAKING)
@@ -150,15 +154,18 @@ class Rebuild:
             while True:
                 async with self._log.engine.connect() as connection:
                     behind = await progress.behind(
-                        connection, self.number, after=self._after, limit=_BATCH_EVENTS, share=self._share
+                        connection, self.number, after=self._after, limit=_EPISODES_MAX, share=self._share
                     )
                 if behind:
                     break
                 if self._after == 0:
                     return None
                 self._after = 0
-            events = await self._log.spans(share_out(behind, _BATCH_EVENTS))
-            self._after = events[-1].number
+            spans = share_out(behind, _BATCH_EVENTS)
+            events = await self._log.spans(spans)
+            if len(events) < sum(each.last - each.after for each in spans):
+                raise _damage(self._log, spans, events, {each.number: each.id for each in behind})
+            self._after = spans[-1].number
             return await self._folding.batch(events)
 
     async def show(self) -> None:
@@ -198,7 +205,7 @@ class Rebuild:
             new = await noted(connection, MAKING, hold="change")
             if new is None:
                 raise InternalError("the new tables are gone")
-            late = await progress.late(connection, self.number, limit=_LATE_EVENTS_MAX)
+            late = await progress.late(connection, self.number, limit=_LATE_EVENTS_MAX + 1)
             if sum(each.head - each.folded for each in late) > _LATE_EVENTS_MAX:
                 return False
             if late:
@@ -232,8 +239,10 @@ async def clear(log: EventLog) -> list[str]:
     with log.translated():
         await _sweep(log)
         async with log.engine.connect() as connection:
-            there = await all_noted(connection)
+            there = await _known(log, connection)
         for name, generation in there.items():
+            if name == SHOWN:
+                await _drop(log, physical_name(progress.TABLE, generation.number))
             if not name.startswith(GONE):
                 continue
             tables = (*CORE, *generation.layout.leaves, *kept_tables(generation.layout), progress.TABLE)
@@ -244,6 +253,30 @@ async def clear(log: EventLog) -> list[str]:
                 async with log.engine.begin() as connection:
                     await forget(connection, name)
     return left
+
+
+async def _known(log: EventLog, connection: AsyncConnection) -> dict[str, Generation]:
+    """Every generation there is. Raises `DatabaseForeign` where a newer version made one: it alone knows its tables."""
+    there = await all_noted(connection)
+    newest = max((each.version for each in there.values()), default=0)
+    if newest > PROJECTION_VERSION:
+        raise DatabaseForeign(
+            f"{log.address}: there are tables made by version {newest} of the fold, this is version"
+            f" {PROJECTION_VERSION}: use a newer pycrorm"
+        )
+    return there
+
+
+def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredEvent], ids: dict[int, str]) -> LogDamaged:
+    """What to raise of the first event that should be there."""
+    there = {(each.number, each.sequence) for each in events}
+    number, sequence = next(
+        (span.number, sequence)
+        for span in spans
+        for sequence in range(span.after + 1, span.last + 1)
+        if (span.number, sequence) not in there
+    )
+    return LogDamaged(ids[number], sequence, f"is missing in {log.address}")
 
 
 async def _sweep(log: EventLog) -> None:
@@ -260,7 +293,8 @@ async def _drop(log: EventLog, table: str) -> bool:
     while full:
         async with log.engine.begin() as connection:
             full = await dialect.empty(connection, table, rows_max=_SLICE_ROWS)
-        await asyncio.sleep(0)  # whoever waits to write has a turn
+        if full:
+            await asyncio.sleep(_PAUSE_S)
     for attempt in range(_DROP_ATTEMPTS):
         try:
             async with log.engine.begin() as connection:
