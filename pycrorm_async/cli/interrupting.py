@@ -13,6 +13,7 @@ from pycrorm_async.cli.output import note, problem
 
 __all__ = ["Interrupting"]
 
+_SAY_S = 1.0
 _PATIENCE = 2
 """A plan that is interrupted may have to wait for room to say so."""
 
@@ -30,7 +31,7 @@ class Interrupting:
     @contextmanager
     def heeded(self) -> Iterator[None]:
         """While the plan runs, and after it."""
-        task = asyncio.current_task()
+        task, loop = asyncio.current_task(), asyncio.get_running_loop()
         assert task is not None
 
         def told(_number: int, _frame: FrameType | None) -> None:
@@ -41,6 +42,7 @@ class Interrupting:
             if self._count > 1:  # a plan that never suspends, or does not let itself be cancelled
                 raise KeyboardInterrupt
             task.cancel()
+            loop.call_soon_threadsafe(lambda: None)  # it may be asleep
 
         before = signal.getsignal(signal.SIGINT)
         if before is not signal.default_int_handler and not _is_asyncios(before):  # ignored, or somebody else's
@@ -56,10 +58,17 @@ class Interrupting:
         finally:
             signal.signal(signal.SIGINT, before)
 
+    @property
+    def asked(self) -> bool:
+        """Whether somebody asked the plan to end."""
+        return self._count > 0
+
     def ended(self) -> None:
         """The plan is over: from now on there is only storing to interrupt."""
         if self._count:
-            note("interrupted; what was recorded is being stored. Ctrl-C again leaves at once, and loses nothing")
+            asyncio.get_running_loop().call_later(
+                _SAY_S, note, "what was recorded is being stored. Ctrl-C again leaves at once, and loses nothing"
+            )
         self._storing = True
 
 

@@ -100,7 +100,8 @@ async def _remembered(
                 outcome.failure = error
             finally:
                 interrupting.ended()
-            await _summarise(memory, outcome)
+                if not interrupting.asked:
+                    await _summarise(memory, outcome)
 
 
 async def _summarise(memory: Memory, outcome: _Outcome) -> None:
