@@ -22,7 +22,9 @@ _SHOWN = 20
 
 
 def verify(
-    episode: Annotated[str | None, typer.Option("--episode", help="Only this one: its number, or id.")] = None,
+    episode: Annotated[
+        str | None, typer.Option("--episode", help="Only this one: its number, its id, or `last`.")
+    ] = None,
     url: UrlOption = DEFAULT_URL,
     as_json: JsonOption = False,
 ) -> int:

@@ -34,7 +34,7 @@ _TOLD_MAX = 100
 _ATTEMPTS = 10
 
 _FINGERPRINTS = text("SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal")
-_TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number >= :first AND number < :end")
+_TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number >= :first_number AND number < :end")
 # From one number to the next by the index: to read all of it takes minutes where there is much.
 _NUMBERS_OF_NOBODY = text("""
 WITH RECURSIVE there (number) AS (
@@ -42,8 +42,11 @@ WITH RECURSIVE there (number) AS (
     UNION ALL SELECT (SELECT min(episode) FROM event WHERE episode > number) FROM there WHERE number IS NOT NULL
 ) SELECT number FROM there WHERE number IS NOT NULL AND number NOT IN (SELECT number FROM episode) ORDER BY number""")
 _BEYOND = text("""
-SELECT number, sequence, head FROM episode JOIN event ON episode = number AND (sequence > head OR sequence < 1)
-WHERE number >= :first AND number < :end ORDER BY number, sequence""")
+SELECT number, head, first, last FROM (
+    SELECT number, head, (SELECT min(sequence) FROM event WHERE episode = number) AS first,
+        (SELECT max(sequence) FROM event WHERE episode = number) AS last
+    FROM episode WHERE number >= :first_number AND number < :end
+) AS each_episode WHERE first < 1 OR last > head ORDER BY number""")
 
 
 class Damage(NamedTuple):
@@ -167,9 +170,11 @@ class _Check:
 
     async def _heads(self, connection: AsyncConnection, first: int, end: int | None) -> int:
         """How many events there should be; and tells of those that should not be."""
-        numbers = {"first": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end}
-        for number, sequence, head in await connection.execute(_BEYOND, numbers):
-            self._damaged(number, sequence, f"is there, and the episode is said to end with {head}")
+        numbers = {"first_number": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end}
+        for number, head, lowest, highest in await connection.execute(_BEYOND, numbers):
+            for sequence in sorted({lowest, highest}):
+                if not 1 <= sequence <= head:
+                    self._damaged(number, sequence, f"is there, and the episode is said to end with {head}")
         return int((await connection.execute(_TOTAL, numbers)).scalar_one())
 
     async def _part(self, at: _Place, end: int | None, limit: int) -> _Place | None:
