@@ -2,12 +2,13 @@
 
 Prints one JSON line: rollouts a second without, with a memory that writes by a thread, and with one whose events a
 daemon writes meanwhile, paired in turns within one run; and what either costs.
-Run it with `python -m bench.plan`.
+Run it with `python -m bench.plan`; `--quick` for two short turns.
 """
 
 import asyncio
 import json
 import statistics
+import sys
 import tempfile
 import time
 from contextlib import AsyncExitStack, suppress
@@ -23,8 +24,9 @@ from pycrorm_async.plan import MoveAndPickUpPerformable, PlanFailure, simulated_
 from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 
-ROLLOUTS = 300
-TURNS = 10
+QUICK = "--quick" in sys.argv
+ROLLOUTS = 10 if QUICK else 300
+TURNS = 2 if QUICK else 10
 
 
 class Took(NamedTuple):

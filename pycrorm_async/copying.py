@@ -102,7 +102,7 @@ async def _made(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tup
         if log.log_id == source.log_id:
             raise CallerError(f"{source.address} and {address} are the same memory: there is nothing to copy")
         projector = Projector(log)
-        await projector.open()
+        await answer_of(projector.open, backoff=BRIEF)  # another copy may be making the tables
         yield log, LogAndTables(log, projector)
     finally:
         await log.close()
@@ -181,10 +181,13 @@ class _Copier:
         assert there is not None, "its head is above zero"
         theirs = self._target.pages(there._replace(head=shared.head))
         async for page in self._source.pages(shared):
-            for event, other in zip(page, await anext(theirs), strict=True):
+            there_too = await anext(theirs)
+            for event, other in zip(page, there_too, strict=False):
                 if event[1:] != other[1:]:
                     reason = f"{self._target.address} holds another event under this number than {self._source.address}"
                     raise LogDamaged(shared.id, event.sequence, reason)
+            if len(there_too) < len(page):
+                await anext(theirs)  # says which one is missing
             self._progress(len(page))
 
     def _progress(self, count: int) -> None:

@@ -16,7 +16,7 @@ def environment() -> dict[str, str]:
     return kept | {"COLUMNS": "200", "PYTHONPATH": str(Path(__file__).parent.parent), "NO_COLOR": "1"}
 
 
-def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:
+def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subprocess.CompletedProcess[str]:
     """The command's exit code, stdout and stderr."""
     return subprocess.run(
         [*COMMAND, *map(str, arguments)],

@@ -44,6 +44,7 @@ class Proxy:
         self._pattern: bytes | None = None
         self._seen: Callable[[_Link], None] = lambda _link: None
         self._budget: int | None = None
+        self._lie = (b"", b"")
 
     def url(self, database: str, *, user: str = "postgres", password: str = "") -> str:
         who = f"{user}:{quote(password, safe='')}" if password else user
@@ -86,6 +87,11 @@ class Proxy:
         """The next time the client says this the server does it, and the connection ends instead of its answer."""
         self._arm(said, _Link.swallow)
 
+    def falsify(self, said: bytes, heard: bytes) -> None:
+        """Whatever the server says, the client hears the one instead of the other."""
+        assert len(said) == len(heard), "the length of a message stands before it"
+        self._lie = said, heard
+
     def cut_after_bytes(self, count: int) -> None:
         """The connection ends in the middle of whatever the client says, after so many bytes of it."""
         self._budget = count
@@ -126,6 +132,7 @@ class Proxy:
     def heal(self) -> None:
         """No fault now and none to come."""
         self._pattern = self._budget = None
+        self._lie = (b"", b"")
         self._refusing = False
         self.chunk_bytes = _CHUNK
         self.flow()
@@ -146,6 +153,11 @@ class Proxy:
             else:
                 self._budget -= len(chunk)
         return chunk
+
+    def passed_on(self, chunk: bytes) -> bytes:
+        """What the client hears of the server's bytes."""
+        said, heard = self._lie
+        return chunk.replace(said, heard) if said else chunk
 
     async def flowing(self) -> None:
         await self._flowing.wait()
@@ -221,7 +233,7 @@ class _Link:
             await self._proxy.flowing()
             if self._swallowing:
                 return
-            self._client[1].write(chunk)
+            self._client[1].write(self._proxy.passed_on(chunk))
             await self._client[1].drain()
 
 

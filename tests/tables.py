@@ -36,34 +36,39 @@ _OF_EPISODES = ("process_metadata", "simulated_episode")
 _IDS = ("key", "row", "pose", "object")
 """What the layout calls a column of ids, of the tables that designator types brought."""
 
+_SHOWN = "SELECT generation, layout FROM {}pycrorm_generation WHERE projection = 'tables'"
 _COLUMNS_SQLITE = """
 SELECT each.name, part.name FROM sqlite_master AS each JOIN pragma_table_info(each.name) AS part
 WHERE each.type = 'table' ORDER BY each.name, part.cid"""
 _COLUMNS_POSTGRESQL = """
 SELECT table_name::text, column_name::text FROM information_schema.columns JOIN information_schema.tables
-USING (table_schema, table_name) WHERE table_schema = 'memory' AND table_type = 'BASE TABLE'
+USING (table_schema, table_name) WHERE table_schema = 'memory_tables' AND table_type = 'BASE TABLE'
 ORDER BY table_name, ordinal_position"""
 
 
 def tables_of(place: str | Path) -> Tables:
     """The rows of the tables people see now, those without rows left out. `place` is a URL, or a SQLite file's path."""
     episodes = dict(ask(place, "SELECT number, id FROM episode"))
-    [(generation, layout)] = ask(place, "SELECT generation, layout FROM pycrorm_generation")
+    on_server = str(place).startswith("postgresql:")
+    schema = "memory_tables." if on_server else ""
+    [(generation, layout)] = ask(place, _SHOWN.format(schema))
     leaves = json.loads(layout)["leaves"]
     columns: dict[str, list[str]] = {}
-    on_server = str(place).startswith("postgresql:")
     for physical, column in ask(place, _COLUMNS_POSTGRESQL if on_server else _COLUMNS_SQLITE):
         name, mark, number = physical.rpartition("__")
         if mark and number == str(generation):
             columns.setdefault(name, []).append(column)
-    found = {name: _rows(place, name, generation, each, leaves.get(name), episodes) for name, each in columns.items()}
+    found = {
+        name: _rows(place, name, f'{schema}"{name}__{generation}"', each, leaves.get(name), episodes)
+        for name, each in columns.items()
+    }
     return {name: rows for name, rows in found.items() if rows}
 
 
 def _rows(
     place: str | Path,
     name: str,
-    generation: int,
+    physical: str,
     columns: list[str],
     leaf: Mapping[str, str] | None,
     episodes: Mapping[int, str],
@@ -71,7 +76,7 @@ def _rows(
     keys = _KEYS.get(name, ("id",))
     listed = ", ".join(f'"{column}"' for column in columns)
     rows: dict[Key, dict[str, Any]] = {}
-    for values in ask(place, f'SELECT {listed} FROM "{name}__{generation}"'):
+    for values in ask(place, f"SELECT {listed} FROM {physical}"):
         row = {
             column: _portable(name, column, leaf, value, episodes)
             for column, value in zip(columns, values, strict=True)

@@ -18,6 +18,7 @@ from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, Index
 
 from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.materialised import kept_tables, make_kept, shown_texts
 from pycrorm_async.projections.public import public_views
 from pycrorm_async.projections.tables import (
     CORE,
@@ -168,6 +169,10 @@ async def grow_tables(connection: AsyncConnection, generation: Generation, layou
             await make_empty(connection, name, {"id": "key", **columns}, generation.number)
         else:
             await _add_columns(connection, name, columns, present, generation.number)
+    there = kept_tables(generation.layout)
+    for kept in layout.kept.values():
+        if kept.table not in there:
+            await make_kept(connection, kept, generation.number)
     return replace(generation, revision=generation.revision + 1, layout=layout)
 
 
@@ -178,7 +183,7 @@ async def show(connection: AsyncConnection, generation: Generation) -> Generatio
     views = {
         name: view_text(meaning, connection.dialect)
         for name, meaning in public_views(layout, generation.number).items()
-    } | layout.user_views
+    } | shown_texts(layout, generation.number)
     await dialect_of(connection).replace_views(connection, before.views if before else {}, views)
     shown = replace(generation, views=views)
     await note(connection, SHOWN, shown)

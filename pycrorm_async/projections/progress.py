@@ -12,7 +12,7 @@ from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.rows import EpisodeRow
 
-__all__ = ["TABLE", "COLUMNS", "behind", "late", "total", "advance", "park", "carry_over"]
+__all__ = ["TABLE", "COLUMNS", "behind", "late", "folded", "total", "advance", "park", "carry_over"]
 
 TABLE = "pycrorm_progress"
 COLUMNS: dict[str, Storage] = {"id": "key", "folded": "integer", "parked": "text"}
@@ -44,6 +44,11 @@ WHERE episode.folded > coalesce(progress.folded, 0) AND progress.parked IS NULL 
         {"limit": limit},
     )
     return [EpisodeRow(*row) for row in found]
+
+
+def folded(generation: int) -> str:
+    """What tells, for each episode, how much of it is in this generation."""
+    return f"SELECT id AS number, folded FROM {physical_name(TABLE, generation)}"  # noqa: S608
 
 
 async def total(connection: AsyncConnection, generation: int) -> int:

@@ -24,7 +24,8 @@ from pycrorm_async.projections.generations import (
     show,
 )
 from pycrorm_async.projections.layout import Layout
-from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
+from pycrorm_async.projections.materialised import refresh_some
+from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, with_user_views
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -65,7 +66,7 @@ class Projector:
                     raise DatabaseForeign(f"{self._log.address}: the tables are gone: run `pycrorm rebuild`")
                 generation = found or await make_generation(connection, 1)
                 layout = generation.layout.with_leaves(mapped_leaves())
-                layout = layout.with_views(view_texts(self._views, layout, connection.dialect))
+                layout = with_user_views(layout, self._views, connection.dialect)
                 if found is None or layout != generation.layout:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
             self._folding = Folding(self._log, _Live(), generation)
@@ -81,17 +82,20 @@ class Projector:
         with self._log.translated():
             while events := await self._log.unfolded(self._batch_events):
                 count += await self._fold(events)
+            while await self._refresh():
+                pass
         return count
 
     async def fold_some(self) -> bool:
-        """One batch of the same; False if nothing was behind."""
+        """One batch of the same, or some of the views that are kept; False if nothing was behind."""
         with self._log.translated():
             # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
             events = await self._log.unfolded(self._batch_events, after=self._last_number)
-            if events:
-                self._last_number = events[-1].number
-                await self._fold(events)
-        return bool(events)
+            if not events:
+                return await self._refresh()
+            self._last_number = events[-1].number
+            await self._fold(events)
+        return True
 
     async def _fold(self, events: Sequence[StoredEvent]) -> int:
         assert self._folding is not None, "opened before anything is folded"
@@ -100,6 +104,15 @@ class Projector:
         if self._folding.generation.revision != before:
             await self._sweep()
         return count
+
+    async def _refresh(self) -> bool:
+        assert self._folding is not None, "opened before anything is folded"
+        if not self._folding.generation.layout.kept:
+            return False
+        async with self._log.engine.begin() as connection:
+            await dialect_of(connection).alone(connection)
+            generation = await _Live().generation(connection, "share")
+            return await refresh_some(connection, generation.layout, generation.number)
 
     async def _sweep(self) -> None:
         async with self._log.engine.begin() as connection:

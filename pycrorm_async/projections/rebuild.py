@@ -22,7 +22,7 @@ from typing import NamedTuple, Self
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, InternalError
+from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged
 from pycrorm_async.projections import progress
 from pycrorm_async.projections.classes import mapped_leaves
 from pycrorm_async.projections.folding import Folding
@@ -43,20 +43,27 @@ from pycrorm_async.projections.generations import (
     show,
 )
 from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.materialised import kept_tables, refresh_some
+from pycrorm_async.projections.public import public_views
+from pycrorm_async.projections.shadowing import with_views
 from pycrorm_async.projections.tables import CORE, physical_name
 from pycrorm_async.projections.union import unite
-from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
+from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_text, with_user_views
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span, share_out
+from pycrorm_async.store.rows import Span, StoredEvent, share_out
 
 __all__ = ["Rebuild", "Share", "claimed", "clear"]
 
 _BATCH_EVENTS = 4_000
 """So that nobody waits long for a turn to write: on SQLite such a batch holds the write lock for some 50 ms."""
+_EPISODES_MAX = 400
+"""So many episodes that have more are looked up for a batch: each costs as much as folding some of its events."""
 _SLICE_ROWS = 10_000
 """So many rows of a table that is not shown any more are deleted at once."""
+_PAUSE_S = 0.02
+"""So long nobody deletes: on SQLite whoever waits to write looks from time to time, and would find no gap."""
 _LATE_EVENTS_MAX = 2_000
 """So many events may be left to fold when the new tables are shown: they are folded while everybody waits."""
 _SHOW_ATTEMPTS = 50
@@ -105,7 +112,7 @@ class Rebuild:
             payloads = await log.declarations()
             async with log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
-                there = await all_noted(connection)
+                there = await _known(log, connection)
                 making = there.get(MAKING)
                 if making is not None and making.version != PROJECTION_VERSION:
                     await forget(connection, MAKING)
@@ -119,8 +126,8 @@ class Rebuild:
                 shown = there.get(SHOWN)
                 layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
                 if shown is not None:
-                    layout = layout.with_views(shown.layout.user_views)
-                layout = layout.with_views(view_texts((*BUILT_IN_VIEWS, *views), layout, connection.dialect))
+                    layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
+                layout = with_user_views(layout, (*BUILT_IN_VIEWS, *views), connection.dialect)
                 making = await grow_tables(connection, making, layout)
                 await note(connection, MAKING, making)
         return cls(log, making, share=Share())
@@ -147,15 +154,18 @@ class Rebuild:
             while True:
                 async with self._log.engine.connect() as connection:
                     behind = await progress.behind(
-                        connection, self.number, after=self._after, limit=_BATCH_EVENTS, share=self._share
+                        connection, self.number, after=self._after, limit=_EPISODES_MAX, share=self._share
                     )
                 if behind:
                     break
                 if self._after == 0:
                     return None
                 self._after = 0
-            events = await self._log.spans(share_out(behind, _BATCH_EVENTS))
-            self._after = events[-1].number
+            spans = share_out(behind, _BATCH_EVENTS)
+            events = await self._log.spans(spans)
+            if len(events) < sum(each.last - each.after for each in spans):
+                raise _damage(self._log, spans, events, {each.number: each.id for each in behind})
+            self._after = spans[-1].number
             return await self._folding.batch(events)
 
     async def show(self) -> None:
@@ -164,12 +174,27 @@ class Rebuild:
             for _ in range(_SHOW_ATTEMPTS):
                 while await self.fold_some() is not None:
                     pass
+                await self._fill_kept()
                 try:
                     if await self._show_if_complete():
                         return
                 except RowRefused:
                     continue  # folded again, it parks its episode
         raise DatabaseUnavailable(f"{self._log.address}: more is recorded than can be folded meanwhile: run it again")
+
+    async def _fill_kept(self) -> None:
+        """Makes the rows of the views that are kept, from the new tables."""
+        async with self._log.engine.connect() as connection:
+            making = await _Making(self.number).generation(connection, "share")
+        if not making.layout.kept:
+            return
+        dialect = self._log.engine.dialect
+        views = {name: view_text(each, dialect) for name, each in public_views(making.layout, self.number).items()}
+        async with with_views(self._log.engine, views | making.layout.user_views) as connection:
+            more = True
+            while more:
+                more = await refresh_some(connection, making.layout, self.number, folded=progress.folded(self.number))
+                await connection.commit()
 
     async def _show_if_complete(self) -> bool:
         """False if so much is missing that everybody would have to wait for it."""
@@ -180,7 +205,7 @@ class Rebuild:
             new = await noted(connection, MAKING, hold="change")
             if new is None:
                 raise InternalError("the new tables are gone")
-            late = await progress.late(connection, self.number, limit=_LATE_EVENTS_MAX)
+            late = await progress.late(connection, self.number, limit=_LATE_EVENTS_MAX + 1)
             if sum(each.head - each.folded for each in late) > _LATE_EVENTS_MAX:
                 return False
             if late:
@@ -191,12 +216,20 @@ class Rebuild:
                 new = await noted(connection, MAKING) or new
             # A view that was registered meanwhile is kept; and whoever has read a revision before must see another one.
             if old is not None:
-                layout = new.layout.with_views(old.layout.user_views | new.layout.user_views)
-                new = replace(new, layout=layout, revision=max(new.revision, old.revision) + 1)
+                # A view registered meanwhile that is kept has no table here: then there is more to make first.
+                missing = old.layout.user_views.keys() - new.layout.user_views.keys()
+                layout = new.layout.with_views(
+                    {name: old.layout.user_views[name] for name in missing},
+                    {name: kept for name, kept in old.layout.kept.items() if name in missing},
+                )
+                new = await grow_tables(connection, new, layout)
+                new = replace(new, revision=max(new.revision, old.revision) + 1)
                 await note(connection, f"{GONE}{old.number}", old)
-            await show(connection, new)
+            new = await show(connection, new)
             await progress.carry_over(connection, self.number)
             await forget(connection, MAKING)
+            while await refresh_some(connection, new.layout, new.number):
+                pass
         return True
 
 
@@ -206,11 +239,13 @@ async def clear(log: EventLog) -> list[str]:
     with log.translated():
         await _sweep(log)
         async with log.engine.connect() as connection:
-            there = await all_noted(connection)
+            there = await _known(log, connection)
         for name, generation in there.items():
+            if name == SHOWN:
+                await _drop(log, physical_name(progress.TABLE, generation.number))
             if not name.startswith(GONE):
                 continue
-            tables = (*CORE, *generation.layout.leaves, progress.TABLE)
+            tables = (*CORE, *generation.layout.leaves, *kept_tables(generation.layout), progress.TABLE)
             named = [physical_name(each, generation.number) for each in tables]
             kept = [each for each in named if not await _drop(log, each)]
             left += kept
@@ -218,6 +253,30 @@ async def clear(log: EventLog) -> list[str]:
                 async with log.engine.begin() as connection:
                     await forget(connection, name)
     return left
+
+
+async def _known(log: EventLog, connection: AsyncConnection) -> dict[str, Generation]:
+    """Every generation there is. Raises `DatabaseForeign` where a newer version made one: it alone knows its tables."""
+    there = await all_noted(connection)
+    newest = max((each.version for each in there.values()), default=0)
+    if newest > PROJECTION_VERSION:
+        raise DatabaseForeign(
+            f"{log.address}: there are tables made by version {newest} of the fold, this is version"
+            f" {PROJECTION_VERSION}: use a newer pycrorm"
+        )
+    return there
+
+
+def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredEvent], ids: dict[int, str]) -> LogDamaged:
+    """What to raise of the first event that should be there."""
+    there = {(each.number, each.sequence) for each in events}
+    number, sequence = next(
+        (span.number, sequence)
+        for span in spans
+        for sequence in range(span.after + 1, span.last + 1)
+        if (span.number, sequence) not in there
+    )
+    return LogDamaged(ids[number], sequence, f"is missing in {log.address}")
 
 
 async def _sweep(log: EventLog) -> None:
@@ -234,7 +293,8 @@ async def _drop(log: EventLog, table: str) -> bool:
     while full:
         async with log.engine.begin() as connection:
             full = await dialect.empty(connection, table, rows_max=_SLICE_ROWS)
-        await asyncio.sleep(0)  # whoever waits to write has a turn
+        if full:
+            await asyncio.sleep(_PAUSE_S)
     for attempt in range(_DROP_ATTEMPTS):
         try:
             async with log.engine.begin() as connection:

@@ -107,6 +107,18 @@ class Dialect(Protocol):
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]: ...
 
+    async def hold_still(self, connection: AsyncConnection) -> None:
+        """Whatever is read in the transaction that begins now is of one moment."""
+        ...
+
+    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
+        """Until the transaction ends, none of these tables is dropped."""
+        ...
+
+    async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
+        """What the database finds wrong with its own pages, if it can be asked."""
+        ...
+
     # --- what a projector adds ----------------------------------------------------------------------------------
 
     async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:

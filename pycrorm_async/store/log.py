@@ -177,6 +177,13 @@ class EventLog:
             return await self._dialect.declarations(connection)
 
     @asynccontextmanager
+    async def snapshot(self) -> AsyncIterator[AsyncConnection]:
+        """A connection whose transaction sees everything as it is at one moment."""
+        async with self._reading() as connection:
+            await self._dialect.hold_still(connection)
+            yield connection
+
+    @asynccontextmanager
     async def _reading(self) -> AsyncIterator[AsyncConnection]:
         with self.translated():
             async with self._reads.connect() as connection:

@@ -28,8 +28,8 @@ LANES = 2
 
 SETTINGS = Settings(
     sync_interval_ms=10,
-    segment_bytes=2**17,
-    record_bytes_max=2**14,
+    segment_bytes=2**15,
+    record_bytes_max=2**12,
     spool_bytes_max=2**26,
     spool_reserve_bytes=2**18,
     flush_timeout_s=90,

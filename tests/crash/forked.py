@@ -15,7 +15,8 @@ from multiprocessing.connection import Connection
 __all__ = ["Forked"]
 
 _FORKED = multiprocessing.get_context("forkserver")
-_FORKED.set_forkserver_preload(["tests.crash.recording", "tests.crash.chores"])
+_FORKED.set_forkserver_preload(["tests.crash.recording", "tests.crash.chores", "tests.crash.walking"])
+_HANGS_S = 300.0
 
 
 class Forked:
@@ -35,7 +36,7 @@ class Forked:
         self._reader.start()
 
     def wait_for_its_first_words(self) -> None:
-        assert self._first.wait(60), "it says nothing"
+        assert self._first.wait(_HANGS_S), "it says nothing"
         assert self._bytes, f"it ended without a word, with exit code {self.process.exitcode}"
 
     def kill(self) -> None:
@@ -48,7 +49,7 @@ class Forked:
 
     def wait(self) -> int:
         """Its exit code, when it has ended."""
-        self.process.join(timeout=120)
+        self.process.join(timeout=_HANGS_S)
         assert self.process.exitcode is not None, "it does not end"
         self._reader.join()
         self._output.close()

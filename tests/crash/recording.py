@@ -29,8 +29,9 @@ def say(*words: object) -> None:
     os.write(1, (" ".join(map(str, words)) + "\n").encode())
 
 
-def record_without_end(queue: RecorderQueue, rng: random.Random) -> None:
-    while True:
+def record_without_end(queue: RecorderQueue, rng: random.Random, events_max: int) -> None:
+    put = 0
+    while put < events_max:
         episode = episode_id(time.time_ns(), rng.randbytes(10))
         name = episode_text(episode)
         kinds = ["EpisodeStarted", *["NodeStarted"] * rng.randrange(1, 40), "EpisodeEnded"]
@@ -38,6 +39,7 @@ def record_without_end(queue: RecorderQueue, rng: random.Random) -> None:
             payload = f"{name}/{index}/".encode() + b"x" * rng.randrange(0, 1200)
             sequence = queue.put_nowait(Heading(episode, kind, 1), payload)
             say("put", name, sequence)
+        put += len(kinds)
 
 
 async def store_without_end(queue: RecorderQueue, rng: random.Random) -> None:
@@ -49,21 +51,25 @@ async def store_without_end(queue: RecorderQueue, rng: random.Random) -> None:
         await queue.acknowledge(batch[-1].position)
 
 
-def main() -> None:
-    seed, threads, storing = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "storing"
+def record(spool: str, seed: int, threads: int, doing: str, events_max: int = sys.maxsize) -> None:
+    """Until it is killed; `doing` is "recording", or "storing" too. Each thread puts so many events, and waits then."""
     rng = random.Random(seed)
     queue = RecorderQueue.create(
-        Path(sys.argv[1]),
+        Path(spool),
         settings=SETTINGS,
         clock=SYSTEM_CLOCK,
         recorder=episode_id(time.time_ns(), rng.randbytes(10)),
     )
     for number in range(threads):
         own = random.Random(seed * 100 + number)
-        threading.Thread(target=record_without_end, args=(queue, own), daemon=True).start()
-    if storing:
+        threading.Thread(target=record_without_end, args=(queue, own, events_max), daemon=True).start()
+    if doing == "storing":
         asyncio.run(store_without_end(queue, rng))
     threading.Event().wait()
+
+
+def main() -> None:
+    record(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
 
 
 if __name__ == "__main__":

@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import random
 import subprocess
-import sys
-import threading
 import time
 from collections import defaultdict
 from pathlib import Path
 
 from tests.commands import COMMAND, environment, pycrorm
+from tests.crash.forked import Forked
+from tests.crash.walking import take_a_walk
 from tests.databases import ask
 
 __all__ = ["Robot", "Lab"]
 
-ROOT = Path(__file__).parents[2]
+HANGS_S = 300.0
+"""After this long a process hangs, however busy the machine is."""
 
 
 class Robot:
@@ -27,57 +28,26 @@ class Robot:
 
     def __init__(self, url: str, spool: Path, name: str, seed: int) -> None:
         self.name = name
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "tests.crash.walking", url, str(spool), name, str(seed)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            cwd=ROOT,
-            env=environment(),
-        )
-        self._said: list[bytes] = []
-        self._errors = b""
-        self._readers = [threading.Thread(target=self._listen), threading.Thread(target=self._listen_to_errors)]
-        for each in self._readers:
-            each.start()
+        self.forked = Forked(take_a_walk, url, str(spool), name, seed)
 
     def wait_until_it_walks(self) -> None:
-        deadline = time.monotonic() + 60
-        while len(self._said) < 5:
-            assert time.monotonic() < deadline, self._errors.decode()
+        deadline = time.monotonic() + HANGS_S
+        while len(self.said) < 5:
+            assert time.monotonic() < deadline
             time.sleep(0.01)
 
     def kill(self) -> None:
-        self.process.kill()
-        self._leave()
+        self.forked.kill()
 
     def stop(self) -> None:
         """It ends its episode and closes its memory."""
-        assert self.process.stdin is not None
-        self.process.stdin.close()
-        self._leave()
-        assert self.process.returncode == 0, self._errors.decode()
+        self.forked.tell_to_stop()
+        assert self.forked.wait() == 0
 
     @property
     def said(self) -> list[list[str]]:
         """The words of each line that is whole."""
-        return [line.decode().split() for line in self._said if line.endswith(b"\n")]
-
-    def _leave(self) -> None:
-        self.process.wait(timeout=90)
-        for each in self._readers:
-            each.join()
-        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-            assert pipe is not None
-            pipe.close()
-
-    def _listen(self) -> None:
-        assert self.process.stdout is not None
-        self._said.extend(self.process.stdout)
-
-    def _listen_to_errors(self) -> None:
-        assert self.process.stderr is not None
-        self._errors = self.process.stderr.read()
+        return [line.split() for line in self.forked.said]
 
 
 class Lab:
@@ -129,10 +99,10 @@ class Lab:
     def stop_daemon(self) -> int:
         assert self.daemon is not None
         self.daemon.terminate()
-        return self.daemon.wait(timeout=60)
+        return self.daemon.wait(timeout=HANGS_S)
 
     def wait_for_log(self, words: str) -> None:
-        deadline = time.monotonic() + 90
+        deadline = time.monotonic() + HANGS_S
         while words not in self.log.read_text():
             assert time.monotonic() < deadline, self.log.read_text()
             time.sleep(0.05)

@@ -24,7 +24,7 @@ import pytest
 from tests.commands import pycrorm
 from tests.crash.chores import LANES, do_chores
 from tests.crash.forked import Forked
-from tests.crash.robots import Lab
+from tests.crash.robots import HANGS_S, Lab
 from tests.databases import Server, ask
 from tests.proxy import Proxy, proxy_before
 
@@ -35,7 +35,7 @@ class Robot:
     """A robot's process and the name it has in the memory; `killed` if it did not come to its end."""
 
     def __init__(self, url: str, spool: Path, name: str, seed: int) -> None:
-        self.forked = Forked(do_chores, url, str(spool), name, seed, 0.1)
+        self.forked = Forked(do_chores, url, str(spool), name, seed, 0.2)
         self.name = name
         self.killed = False
 
@@ -96,6 +96,8 @@ async def work(machines: list[Machine], rng: random.Random, seconds: float) -> N
     async with asyncio.TaskGroup() as tasks:
         keepers = [tasks.create_task(machine.keep_a_daemon()) for machine in machines]
         for machine in machines:
+            await asyncio.to_thread(machine.lab.wait_for_log, "draining")
+        for machine in machines:
             for robot in [machine.start_robot() for _ in range(ROBOTS_A_MACHINE)]:
                 await asyncio.to_thread(robot.forked.wait_for_its_first_words)
             await asyncio.to_thread(machine.lab.wait_for_log, "appeared")
@@ -108,13 +110,20 @@ async def work(machines: list[Machine], rng: random.Random, seconds: float) -> N
             assert await asyncio.to_thread(robot.forked.wait) == 0, robot.name
         for trouble in troubles:
             trouble.cancel()
-        async with asyncio.timeout(60):
-            while any(machine.folders() for machine in machines):  # noqa: ASYNC110
-                await asyncio.sleep(0.05)
+        await until_all_is_stored(machines)
         for keeper in keepers:
             keeper.cancel()
     for machine in machines:
         assert await asyncio.to_thread(machine.lab.stop_daemon) == 0, machine.lab.log.read_text()
+
+
+async def until_all_is_stored(machines: list[Machine]) -> None:
+    loop = asyncio.get_running_loop()
+    deadline = loop.time() + HANGS_S
+    while left := [name for machine in machines for name in machine.folders()]:
+        if loop.time() > deadline:
+            raise AssertionError(f"not stored: {left}\n" + "\n".join(each.lab.log.read_text() for each in machines))
+        await asyncio.sleep(0.05)
 
 
 async def kill_now_and_then(machines: list[Machine], seconds: float) -> None:

@@ -1,8 +1,7 @@
 """Killed with SIGKILL at any moment: whatever putting returned for is there once, in order, and nothing else is."""
 
 import random
-import subprocess
-import sys
+import shutil
 import time
 from collections import defaultdict
 from pathlib import Path
@@ -12,26 +11,17 @@ import pytest
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
+from tests.crash.forked import Forked
+from tests.crash.recording import record
 
-ROOT = Path(__file__).parents[2]
+TOGETHER = 4
+"""How many recorders live at the same time; each has a spool of its own."""
+LIFE_S_MAX = 0.015
 LOST = b'{"status":"LOST"}'
 
 
-def killed_at_a_random_moment(spool: Path, seed: int) -> list[list[str]]:
-    """What the process said before it died."""
-    rng = random.Random(seed)
-    arguments = [str(spool), str(seed), str(rng.choice([1, 1, 2, 3])), rng.choice(["recording", "storing"])]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "tests.crash.recording", *arguments], stdout=subprocess.PIPE, cwd=ROOT
-    )
-    with process:
-        assert process.stdout is not None
-        first = process.stdout.readline()
-        time.sleep(rng.random() * 0.1)
-        process.kill()
-        said = first + process.stdout.read()
-    lines = said.decode().splitlines(keepends=True)
-    return [line.split() for line in lines if line.endswith("\n")]
+def start(spool: Path, rng: random.Random, seed: int) -> Forked:
+    return Forked(record, str(spool), seed, rng.choice([1, 1, 2, 3]), rng.choice(["recording", "storing"]), 400)
 
 
 async def recovered_by(folder: Path) -> list[Record]:
@@ -44,9 +34,25 @@ async def recovered_by(folder: Path) -> list[Record]:
     return records
 
 
-async def prove_one_round(spool: Path, seed: int) -> None:
-    print(f"seed {seed}")
-    said = killed_at_a_random_moment(spool, seed)
+async def kill_and_prove(folder: Path, seeds: range) -> None:
+    for seed, said in killed(folder, seeds).items():
+        print(f"seed {seed}")
+        await prove(folder / str(seed), said)
+        shutil.rmtree(folder / str(seed))
+
+
+def killed(folder: Path, seeds: range) -> dict[int, list[list[str]]]:
+    """What recorders with these seeds said; they live at once and are killed one after the other."""
+    recorders = {seed: start(folder / str(seed), random.Random(seed), seed) for seed in seeds}
+    for each in recorders.values():
+        each.wait_for_its_first_words()
+    for seed, each in recorders.items():
+        time.sleep(random.Random(seed).random() * LIFE_S_MAX)
+        each.kill()
+    return {seed: [line.split() for line in each.said] for seed, each in recorders.items()}
+
+
+async def prove(spool: Path, said: list[list[str]]) -> None:
     put = {(name, int(sequence)) for what, name, sequence, *_ in said if what == "put"}
     stored = [(int(line[1]), line[2], int(line[3]), line[4]) for line in said if line[0] == "stored"]
     (folder,) = Spool(spool).recorders()
@@ -86,11 +92,12 @@ async def prove_one_round(spool: Path, seed: int) -> None:
 
 
 async def test_every_written_record_survives_a_kill_once_and_in_order(tmp_path: Path) -> None:
-    for seed in range(30):
-        await prove_one_round(tmp_path / str(seed), seed)
+    first = random.SystemRandom().randrange(2**20)
+    for seed in range(first, first + 500, TOGETHER):
+        await kill_and_prove(tmp_path, range(seed, seed + TOGETHER))
 
 
 @pytest.mark.soak
-async def test_every_written_record_survives_a_thousand_kills(tmp_path: Path) -> None:
-    for seed in range(1000, 2000):
-        await prove_one_round(tmp_path / str(seed), seed)
+async def test_every_written_record_survives_ten_thousand_kills(tmp_path: Path) -> None:
+    for seed in range(0, 10_000, TOGETHER):
+        await kill_and_prove(tmp_path, range(seed, seed + TOGETHER))

@@ -11,7 +11,6 @@ import itertools
 import os
 import random
 import select
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,5 +62,5 @@ async def walk(url: str, spool: Path, name: str, rng: random.Random) -> None:
                 await memory.synced()
 
 
-if __name__ == "__main__":
-    asyncio.run(walk(sys.argv[1], Path(sys.argv[2]), sys.argv[3], random.Random(int(sys.argv[4]))))
+def take_a_walk(url: str, spool: str, name: str, seed: int) -> None:
+    asyncio.run(walk(url, Path(spool), name, random.Random(seed)))

@@ -131,9 +131,9 @@ async def test_a_memory_of_the_first_version_shows_what_it_held_and_its_spool_is
         (1, 18, 18, None, None), (2, 4, 4, None, None), (3, 6, 6, None, None),
     ]  # fmt: skip
     assert ask(
-        every_event, "SELECT id, description, created_by, status, time_created FROM process_metadata ORDER BY 1"
+        every_event, "SELECT id, description, created_by, status, created_at FROM process_metadata ORDER BY 1"
     ) == [(1, "Everything once", "ada", "SUCCEEDED", t0 + 1_000_000), (3, "Cut short", "ada", "LOST", t0 + 1_000_000)]
-    assert ask(every_event, "SELECT id, parent_id, dtype, status, reason_message FROM task_tree_node ORDER BY id") == [
+    assert ask(every_event, "SELECT id, parent_id, dtype, status, failure_message FROM task_tree_node ORDER BY id") == [
         (id_of(1, 4), None, None, "SUCCEEDED", None),
         (id_of(1, 5), id_of(1, 4), "PickUpAction", "SUCCEEDED", None),
         (id_of(1, 6), id_of(1, 5), "GreetAction", "FAILED", "no answer"),

@@ -281,6 +281,29 @@ async def test_the_world_says_what_was_in_it_and_where_its_robot_was(reading: Re
         empty.object("milk")
 
 
+async def test_what_nobody_saw_the_end_of_has_none_and_what_is_gone_holds_nothing(log: EventLog) -> None:
+    """A world that is left is emptied object by object; a node that outlives its episode is LOST."""
+    script = Script()
+    for event in (
+        EpisodeStarted("left", "me", "h", "1", "3.11"),
+        NodeStarted("root"),
+        ObjectAdded("pr2", "ROBOT", pose()),
+        ObjectAdded("milk", "MILK", pose(1, 2, 3)),
+        ObjectAttached(thing(3), thing(4), "hand"),
+        ObjectRemoved(thing(3)),
+        NodeEnded(2, "LOST"),
+    ):
+        script.put(event)
+    await stored_and_folded(log, script.records)
+    async with Reading.open_address(log.address) as reading:
+        then = await reading.as_of(1, sequence=7)
+        assert [_object_words(each) for each in then.world.objects] == ["milk 1 2 3"]
+        assert (then.world.attachments, then.world.robot) == ((), None)
+        (root,) = then.tree
+        assert (root.status, root.duration_ns, root.end_s) == ("LOST", None, None)
+        assert (await reading.tree(1))[0].duration_ns is None
+
+
 async def test_a_moment_can_be_printed(reading: Reading) -> None:
     assert str(await reading.as_of(1, sequence=10)) == (
         "episode 1 at 9.000 s, event 10: RUNNING\n"

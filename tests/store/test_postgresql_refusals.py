@@ -22,9 +22,8 @@ WRITTEN = "s3cr%20et%2F%40%23%3F%26%3A%25"
 GUARDED = "local all guarded scram-sha-256\n"
 
 
-@pytest.fixture
-def guarded(server: Server) -> str:
-    """A database that asks the user `guarded` for the password."""
+def guarded_in(server: Server) -> str:
+    """The name of a new database that asks the user `guarded` for the password."""
     rules = server.folder / "pg_hba.conf"
     if not rules.read_text().startswith(GUARDED):
         rules.write_text(GUARDED + rules.read_text())
@@ -34,6 +33,11 @@ def guarded(server: Server) -> str:
     database = urlsplit(server.new_database()).path.removeprefix("/")
     ask(server.url(), f"GRANT CREATE ON DATABASE {database} TO guarded")
     return database
+
+
+@pytest.fixture
+def guarded(server: Server) -> str:
+    return guarded_in(server)
 
 
 async def refused(
@@ -128,7 +132,8 @@ async def test_a_server_too_old(
     error = await refused(url, caplog)
     assert type(error) is DatabaseUnavailable
     assert str(error).endswith(f"PostgreSQL 14 or newer is needed, this is {version}")
-    assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname IN ('pycrorm', 'memory')") == [(0,)]
+    ours = "('pycrorm', 'memory', 'memory_tables')"
+    assert ask(url, f"SELECT count(*) FROM pg_namespace WHERE nspname IN {ours}") == [(0,)]
 
 
 async def test_a_user_without_rights(server: Server, guarded: str, caplog: pytest.LogCaptureFixture) -> None:

@@ -100,6 +100,17 @@ class PostgreSQL:
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
 
+    async def hold_still(self, connection: AsyncConnection) -> None:
+        await connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
+
+    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        named = ", ".join(f"{TABLES_SCHEMA}.{quote(each)}" for each in tables)
+        await connection.exec_driver_sql(f"LOCK TABLE {named} IN ACCESS SHARE MODE")
+
+    async def faults_of_file(self, connection: AsyncConnection) -> list[str]:  # noqa: ARG002
+        return []  # a server looks after its pages itself
+
     # --- folding ------------------------------------------------------------------------------------------------
 
     async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:

@@ -105,6 +105,16 @@ class SQLite:
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
 
+    async def hold_still(self, connection: AsyncConnection) -> None:
+        """A transaction is a snapshot."""
+
+    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
+        """They are of the snapshot."""
+
+    async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
+        found = list((await connection.exec_driver_sql("PRAGMA quick_check")).scalars())
+        return [] if found == ["ok"] else found
+
     # --- folding ------------------------------------------------------------------------------------------------
 
     async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:

@@ -1,0 +1,94 @@
+"""`pycrorm verify`: are log and tables what they should be."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, UrlOption
+from pycrorm_async.cli.output import print_json, stderr, stdout
+from pycrorm_async.projections.verify import Verified
+from pycrorm_async.projections.verify import verify as verify_log
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.naming import episode_named
+
+__all__ = ["verify"]
+
+_SHOWN = 20
+
+
+def verify(
+    episode: Annotated[str | None, typer.Option("--episode", help="Only this one: its number, or id.")] = None,
+    url: UrlOption = DEFAULT_URL,
+    as_json: JsonOption = False,
+) -> int:
+    """Fold the log again and compare with the tables, row by row; look whether the log is whole.
+
+    Reads only, while recording and folding go on. Exit code 0 if all is as it should be, 1 if tables differ from the
+    log (`pycrorm rebuild` makes them anew), 4 if the log itself is damaged.
+    """
+    found, ids = asyncio.run(_verify(url, episode))
+    if as_json:
+        print_json(_document(found, ids))
+    else:
+        _print(found)
+    if found.damage:
+        return 4
+    return 1 if found.drift else 0
+
+
+async def _verify(url: str, episode: str | None) -> tuple[Verified, dict[int, str]]:
+    bar = Progress(
+        TextColumn("verifying"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        console=stderr,
+        disable=not stderr.is_terminal,
+        transient=True,
+    )
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    try:
+        only = None if episode is None else await episode_named(log, episode)
+        with bar:
+            task = bar.add_task("", total=None)
+            found = await verify_log(
+                log, episode=only, tell=lambda done, total: bar.update(task, completed=done, total=total)
+            )
+        return found, {each.number: each.id for each in await log.episodes()}
+    finally:
+        await log.close()
+
+
+def _print(found: Verified) -> None:
+    for damage in found.damages[:_SHOWN]:
+        stdout.print(f"damage: {damage}", markup=False)
+    for each in found.differences[:_SHOWN]:
+        stdout.print(f"drift: episode {each.number}, event {each.sequence}: {each}", markup=False)
+    shown = min(len(found.damages), _SHOWN) + min(len(found.differences), _SHOWN)
+    if found.damage + found.drift > shown:
+        stdout.print(f"and {found.damage + found.drift - shown} more")
+    if found.behind:
+        stdout.print(f"{found.behind} events are not in the tables yet")
+    said = f"{found.events} events of {found.episodes} episodes and {found.rows} rows: "
+    if found.damage:
+        stdout.print(f"{said}the log is damaged; what is whole can be copied to another with `pycrorm copy`")
+    elif found.drift:
+        stdout.print(f"{said}the log is whole, the tables differ from it: `pycrorm rebuild` makes them anew")
+    else:
+        stdout.print(f"{said}all as it should be")
+
+
+def _document(found: Verified, ids: dict[int, str]) -> dict[str, Any]:
+    def named(number: int | None) -> str | None:
+        return None if number is None else ids.get(number)
+
+    return {
+        **{name: value for name, value in found._asdict().items() if name not in ("damages", "differences")},
+        "damages": [{"episode": named(each.number), **each._asdict()} for each in found.damages],
+        "differences": [{"episode": named(each.number), **each._asdict()} for each in found.differences],
+    }

@@ -1,0 +1,270 @@
+"""Cancelled at every await there is, one after the other: of the writer beside a plan, of a flush, of the daemon.
+
+A loop whose tasks are stepped counts their awaits, and at the n-th cancels the work from outside, as a Ctrl-C or a
+timeout does; n goes through all of them. What was acknowledged is stored, what was not is given again, and the next
+writer finds no lock and no half batch.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import types
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Generator
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Any
+
+from pycrorm_async.adoption import LogAndTables, open_destination, recover
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.config import Settings
+from pycrorm_async.daemon import _Folders, _Living
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.happenings import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue import Spool
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.writer.daemon import Daemon
+from pycrorm_async.writer.live import LiveWriter
+from pycrorm_async.writer.ports import Found, Held
+from tests.databases import ask
+from tests.projections.script import SAYING, Script, declarations, name_of
+from tests.queue.writing import make
+from tests.writer.ends import KeptSource
+
+SETTINGS = Settings(batch_events_max=10, idle_ms=1, batch_age_ms=1)
+CLOSING = {"AsyncAdapt_aiosqlite_connection._terminate_graceful_close", "Connection._cancel"}
+"""What SQLAlchemy and asyncpg leave to the loop when they are cancelled while they end what was cancelled."""
+TEXTS = ["a", "b", "c", "d", "e"]
+
+
+class Steps:
+    """Counts the awaits of all tasks that its loop makes, and cancels `work` at one of them."""
+
+    def __init__(self, at: int) -> None:
+        self.at = at
+        self.count = 0
+        self.work: asyncio.Task[None] | None = None
+        self.names: dict[asyncio.Task[Any], str] = {}
+
+    def make(self, loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> asyncio.Task[Any]:
+        """A task factory."""
+        task = asyncio.Task(self._run(work), loop=loop, **options)
+        self.names[task] = work.__qualname__
+        task.add_done_callback(lambda _: work.close())  # if it was cancelled before it began
+        return task
+
+    async def _run(self, work: Coroutine[Any, Any, Any]) -> Any:
+        return await self._stepped(work)
+
+    @types.coroutine
+    def _stepped(self, work: Coroutine[Any, Any, Any]) -> Generator[Any, Any, Any]:
+        step: Callable[[], Any] = lambda: work.send(None)  # noqa: E731
+        while True:
+            try:
+                awaited = step()
+            except StopIteration as end:
+                return end.value
+            self.count += 1
+            if self.count == self.at and self.work is not None:
+                self.work.cancel()
+            try:
+                value = yield awaited
+            except BaseException as error:  # noqa: BLE001  passed on into the work
+                step = _throwing(work, error)
+            else:
+                step = _sending(work, value)
+
+
+def _throwing(work: Coroutine[Any, Any, Any], error: BaseException) -> Callable[[], Any]:
+    return lambda: work.throw(error)
+
+
+def _sending(work: Coroutine[Any, Any, Any], value: object) -> Callable[[], Any]:
+    return lambda: work.send(value)
+
+
+async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, alone: bool = True) -> bool:
+    """Runs it to its end or to its n-th await; whether it was cancelled. Nothing is left running if it was alone."""
+    loop, steps = asyncio.get_running_loop(), Steps(at)
+    before = asyncio.all_tasks()
+    loop.set_task_factory(steps.make)
+    try:
+        steps.work = loop.create_task(work)
+        async with asyncio.timeout(300):
+            await asyncio.wait([steps.work])
+    finally:
+        loop.set_task_factory(None)
+    left = asyncio.all_tasks() - before if alone else set()
+    assert {steps.names[task] for task in left} <= CLOSING
+    for task in left:  # as `asyncio.run` does at its end
+        task.cancel()
+    await asyncio.gather(*left, return_exceptions=True)
+    if not steps.work.cancelled():
+        steps.work.result()
+        return False
+    return True
+
+
+async def at_every_await(round_: Callable[[int], Awaitable[bool]], *, awaits_min: int = 30) -> None:
+    """A round for each n, until one is not cancelled any more."""
+    at = 1
+    while await round_(at):
+        at += 1
+    print(f"{at} awaits")
+    assert at > awaits_min, "it has more awaits than that"
+
+
+def script_of(number: int) -> Script:
+    """An episode of five nodes: 14 records and a declaration, in two batches."""
+    script = Script(number)
+    script.put(EpisodeStarted(f"episode {number}", "me", "host", "1.0", "3.11"))
+    root = script.put(NodeStarted("root"))
+    for text in TEXTS:
+        node = script.put(NodeStarted("action", root, name_of(SAYING), {"text": text}))
+        script.put(NodeEnded(node, "SUCCEEDED"))
+    script.put(NodeEnded(root, "SUCCEEDED"))
+    script.put(EpisodeEnded("SUCCEEDED"))
+    return script
+
+
+def proved(url: str, script: Script) -> None:
+    """The episode is in the log once and in order, and in the tables."""
+    name = episode_text(script.episode)
+    [(number, head, folded, refused, parked)] = ask(
+        url, f"SELECT number, head, folded, refused, parked FROM episode WHERE id = '{name}'"
+    )
+    assert (head, folded, refused, parked) == (14, 14, None, None)
+    events = ask(url, f"SELECT sequence, type, payload FROM event WHERE episode = {number} ORDER BY sequence")
+    assert events == [(each.sequence, each.type, each.payload.decode()) for each in script.records]
+    rows = ask(
+        url,
+        "SELECT text, status FROM saying_action JOIN task_tree_node ON task_tree_node.id = saying_action.id"
+        f" WHERE saying_action.id / {2**31} = {number} ORDER BY saying_action.id",
+    )
+    assert rows == [(text, "SUCCEEDED") for text in TEXTS]
+
+
+def stored(url: str, script: Script) -> int:
+    """How many events of the episode are in the log."""
+    heads = ask(url, f"SELECT head FROM episode WHERE id = '{episode_text(script.episode)}'")
+    return int(heads[0][0]) if heads else 0
+
+
+def nobody_holds_a_lock(url: str) -> None:
+    ask(url, "SELECT 1 FROM episode FOR UPDATE NOWAIT" if url.startswith("postgresql") else "BEGIN IMMEDIATE")
+
+
+def opened(url: str, spool: Path) -> AbstractAsyncContextManager[LogAndTables]:
+    return open_destination(DatabaseAddress.parse(url), Spool(spool), clock=SYSTEM_CLOCK)
+
+
+def writer_of(source: KeptSource, destination: LogAndTables) -> LiveWriter:
+    return LiveWriter(source, destination, adopt=list, settings=SETTINGS)
+
+
+def kept_source(script: Script) -> KeptSource:
+    """Its declaration comes first."""
+    records = [*declarations(SAYING), *script.records]
+    return KeptSource([each._replace(position=at) for at, each in enumerate(records, 1)], closed=True)
+
+
+async def test_opening_is_cancelled_at_each_of_its_awaits_and_leaves_no_lock(database_url: str, tmp_path: Path) -> None:
+    async def life() -> None:
+        async with opened(database_url, tmp_path / "spool"):
+            pass
+
+    async def round_(at: int) -> bool:
+        was_cancelled = await cancelled_at(at, life())
+        nobody_holds_a_lock(database_url)
+        return was_cancelled
+
+    await life()
+    await at_every_await(round_)
+    async with opened(database_url, tmp_path / "spool") as destination:
+        await writer_of(kept_source(script_of(1)), destination).run()
+    proved(database_url, script_of(1))
+
+
+async def test_the_writer_beside_a_plan_is_cancelled_at_each_of_its_awaits(database_url: str, tmp_path: Path) -> None:
+    async with opened(database_url, tmp_path / "spool") as destination:
+
+        async def round_(at: int) -> bool:
+            script = script_of(at)
+            source = kept_source(script)
+            was_cancelled = await cancelled_at(at, writer_of(source, destination).run())
+            acknowledged = max(source.acknowledgements, default=0)
+            assert stored(database_url, script) >= acknowledged - 1
+            nobody_holds_a_lock(database_url)
+            again = source.reopened()
+            await writer_of(again, destination).run()
+            assert again.kept == []
+            proved(database_url, script)
+            return was_cancelled
+
+        await at_every_await(round_)
+
+
+async def test_a_flush_is_cancelled_at_each_of_its_awaits_and_the_writer_goes_on(
+    database_url: str, tmp_path: Path
+) -> None:
+    async with opened(database_url, tmp_path / "spool") as destination:
+
+        async def round_(at: int) -> bool:
+            script = script_of(at)
+            source = kept_source(script)
+            writer = writer_of(source, destination)
+            running = asyncio.create_task(writer.run())
+            was_cancelled = await cancelled_at(at, writer.flush(15), alone=False)
+            await running
+            assert source.kept == []
+            proved(database_url, script)
+            return was_cancelled
+
+        await at_every_await(round_, awaits_min=2)
+
+
+async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, tmp_path: Path) -> None:
+    held: list[Held] = []
+    async with opened(database_url, tmp_path / "spool") as destination:
+
+        async def life(spool: Path) -> None:
+            leave = asyncio.Event()
+
+            def say(line: str) -> None:
+                if "has ended" in line:
+                    leave.set()
+
+            look = _Folders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
+
+            def look_and_note(but: Collection[str]) -> Found:
+                found = look(but)
+                held.extend(found.held)
+                return found
+
+            await Daemon(destination, look_and_note, settings=SETTINGS, say=say).run(leave)
+
+        async def round_(at: int) -> bool:
+            script = script_of(at)
+            spool = tmp_path / str(at)
+            queue = make(spool, offered=True)
+            for each in (*declarations(SAYING), *script.records):
+                queue.put_nowait(Heading(each.episode, each.type, each.version), each.payload, reserved=True)
+            await queue.synced_to()
+            queue.close()
+            was_cancelled = await cancelled_at(at, life(spool))
+            while held:  # its process ends then, and with it the locks
+                living = held.pop()
+                assert isinstance(living, _Living)
+                living.release()
+            assert stored(database_url, script) >= queue.stored - 1
+            nobody_holds_a_lock(database_url)
+            queue.release()
+            if Spool(spool).recorders():  # the next daemon finds it dead
+                report = await recover(database_url, spool=spool)
+                assert (report.failed, report.lost, report.drained.stopped) == ({}, (), {})
+                assert Spool(spool).recorders() == []
+            await destination.fold()
+            proved(database_url, script)
+            return was_cancelled
+
+        await at_every_await(round_)
