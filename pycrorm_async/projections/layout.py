@@ -107,10 +107,11 @@ class Layout(msgspec.Struct, frozen=True):
                 raise Contradictory(f"{each} became {self.renamed[each]}, and {dtype} was {each} too: drop that alias")
         known = self.types.get(dtype) or DesignatorType(declared.kind, ())
         one = [known, *(self.types[each] for each in former if each in self.types)]
-        for each in one:
-            if declared.kind != each.kind:
-                raise Contradictory(f"{declared.dtype} is declared as {each.kind} and as {declared.kind}")
-        tables = tuple(dict.fromkeys((*known.tables, declared.table, *(name for each in one for name in each.tables))))
+        for type_ in one:
+            if declared.kind != type_.kind:
+                raise Contradictory(f"{declared.dtype} is declared as {type_.kind} and as {declared.kind}")
+        others = (table for type_ in one for table in type_.tables)
+        tables = tuple(dict.fromkeys((*known.tables, declared.table, *others)))
         self._refuse_taken(declared, {dtype, *former})
         # All tables of a type agree, also in columns that an author's class brought: else an earlier declaration of the
         # type, accepted before, would be refused the next time.

@@ -25,11 +25,15 @@ from pycrorm_async.orm import Action
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections import fold
 from pycrorm_async.projections.generations import PROJECTION_VERSION
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.rebuilding import rebuild_memory
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.schema import Birth, make_or_migrate
 from pycrorm_async.world import Arms
 from tests.databases import ask, ask_to_change
+from tests.store.making import declaration, episode, run_of
 from tests.tables import differences, tables_of
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
@@ -166,6 +170,10 @@ async def test_a_memory_of_the_first_version_shows_what_it_held_and_its_spool_is
     before = tables_of(every_event)
     await rebuild_memory(every_event)
     assert differences(before, tables_of(every_event)) == []
+    log = await EventLog.open(DatabaseAddress.parse(every_event), create=False)
+    verified = await verify(log)
+    await log.close()
+    assert (verified.episodes, verified.events, verified.damages, verified.differences) == (3, 28, [], [])
 
 
 async def test_a_log_of_the_first_version_has_the_tables_of_a_new_one(golden: str, tmp_path: Path) -> None:
@@ -178,6 +186,30 @@ async def test_a_log_of_the_first_version_has_the_tables_of_a_new_one(golden: st
     )
     assert ask(golden, of_the_log) == ask(new, of_the_log)
     assert len(ask(new, of_the_log)) == 17
+
+
+async def test_who_has_the_log_open_goes_on_when_a_newer_program_brings_it_up_to_date_and_nobody_older_opens_it_again(
+    database_url: str,
+) -> None:
+    address = DatabaseAddress.parse(database_url)
+    older = await EventLog.open(address, create=True)
+    await older.append([declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 3)])
+    schema = "" if address.is_sqlite else "pycrorm."
+    engine = address.engine()
+    second = (f"ALTER TABLE {schema}episode ADD COLUMN robot text", f"CREATE INDEX by_robot ON {schema}episode (robot)")
+    migrations = (*dialect_of(engine).migrations, second)
+    newer = await make_or_migrate(engine, "name", birth=Birth("another", 5), migrations=migrations)
+    await engine.dispose()
+    assert newer == older.log_id
+    assert (
+        await older.append([declaration(b'{"dtype":"B"}'), *run_of(episode(1), 4, 6), *run_of(episode(2), 1, 2)]) == {}
+    )
+    assert [(each.number, each.head) for each in await older.episodes()] == [(1, 6), (2, 2)]
+    await older.close()
+    assert ask(database_url, "SELECT count(*) FROM event") == [(8,)]
+    for create in (True, False):
+        with pytest.raises(DatabaseForeign, match=r"its format is 2, this version knows 1$"):
+            await EventLog.open(address, create=create)
 
 
 # --- a designator whose fields changed ------------------------------------------------------------------------------
@@ -253,7 +285,7 @@ async def test_a_memory_that_is_open_learns_the_new_name_and_keeps_the_class_it_
         await performed(golden, WelcomeActionPerformable("Eve", Arms.BOTH, "en"))
         async with reading.session() as session:
             assert reading.mapped("WelcomeAction") is greet
-            rows = (await session.scalars(select(greet).order_by(greet.id))).all()
+            rows: list[Any] = list(await session.scalars(select(greet).order_by(greet.id)))
             assert [(row.whom, row.language) for row in rows] == [
                 ("Ada", None), ("Cleo", None), ("Dora", None), ("Eve", "en"),
             ]  # fmt: skip
