@@ -34,8 +34,11 @@ def rebuild(
             f"generation {done.generation}: {done.events} events of {done.episodes} episodes in"
             f" {duration(int(done.seconds * 1e9))}, {rate:,.0f} events/s"
         )
-    for table in done.left:
-        note(f"{table} is not shown any more, and somebody uses it still: the next rebuild drops it")
+    if done.left:
+        note(
+            f"{len(done.left)} tables that are not shown any more are used still, by a long transaction or a view:"
+            f" {done.left[0]}, … (the next rebuild drops them)"
+        )
     for episode, reason in done.parked.items():
         note(f"episode {episode} is parked: {reason}")
     return 1 if done.parked else 0
