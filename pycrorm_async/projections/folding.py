@@ -8,7 +8,7 @@ is the `Goal`'s: of what people see (`projector`), or of what is made beside it 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
@@ -28,9 +28,9 @@ from pycrorm_async.projections.write import write_rows
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import StoredEvent
+from pycrorm_async.store.rows import Span, StoredEvent
 
-__all__ = ["Folding", "Goal", "Folded", "folded"]
+__all__ = ["Folding", "Goal", "Folded", "folded", "by_span"]
 
 
 class Goal(Protocol):
@@ -77,14 +77,14 @@ class Folding:
         self.generation = generation
         self._types: _Types | None = None
 
-    async def batch(self, events: Sequence[StoredEvent]) -> int:
+    async def batch(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> int:
         """How many of them are folded now: fewer if an episode was parked, none if somebody else was quicker.
 
-        An event that cannot be folded parks its episode with the reason; what came before it is written, and the others
-        go on.
+        An event that is missing or cannot be folded parks its episode with the reason; what came before it is written,
+        and the others go on.
         """
         types = await self._types_now()
-        done = folded(events, types.designators)
+        done = folded(spans, events, types.designators)
         try:
             async with self._log.engine.begin() as connection:
                 written = await self._write(connection, done, types)
@@ -93,13 +93,13 @@ class Folding:
                     return 0
             self.generation = written
         except RowRefused as refusal:
-            return await self._apart(events, refusal)
+            return await self._apart(spans, events, refusal)
         return sum(now - before for _, before, now in done.steps)
 
-    async def batch_in(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> bool:
+    async def batch_in(self, connection: AsyncConnection, spans: Sequence[Span], events: Sequence[StoredEvent]) -> bool:
         """The same in the caller's transaction, which must not be committed if it says False or raises `RowRefused`."""
         types = await self._types_now()
-        return await self._write(connection, folded(events, types.designators), types) is not None
+        return await self._write(connection, folded(spans, events, types.designators), types) is not None
 
     async def _write(self, connection: AsyncConnection, done: Folded, types: _Types) -> Generation | None:
         """The generation written to; None if the tables or the progress are not what the fold took them to be."""
@@ -136,38 +136,44 @@ class Folding:
             self._types = types
         return types
 
-    async def _apart(self, events: Sequence[StoredEvent], refusal: RowRefused) -> int:
+    async def _apart(self, spans: Sequence[Span], events: Sequence[StoredEvent], refusal: RowRefused) -> int:
         """The database refused a row of this batch: find the episode it belongs to, and park that one."""
-        episodes = [list(each) for _, each in groupby(events, key=attrgetter("number"))]
-        if len(episodes) > 1:
-            return sum([await self.batch(each) for each in episodes])
+        if len(spans) > 1:
+            return sum([await self.batch([span], some) for span, some in by_span(spans, events)])
+        span = spans[0]
         if len(events) > 1:
             # Halves, so that all that comes before the event is shown.
             middle = len(events) // 2
-            count = await self.batch(events[:middle])
-            return count + (await self.batch(events[middle:]) if count == middle else 0)
+            cut = events[middle - 1].sequence
+            count = await self.batch([span._replace(last=cut)], events[:middle])
+            return count + (await self.batch([span._replace(after=cut)], events[middle:]) if count == middle else 0)
         async with self._log.engine.begin() as connection:
             reason = f"event {events[0].sequence}: the database refuses it: {refusal}"
             await self._goal.park(connection, events[0].number, reason)
         return 0
 
 
-def folded(events: Sequence[StoredEvent], designators: Designators) -> Folded:
-    """These events, those of an episode together and in order, as rows."""
+def folded(spans: Sequence[Span], events: Sequence[StoredEvent], designators: Designators) -> Folded:
+    """The events of these spans, in their order, as rows."""
     rows, steps, parked = Rows(), [], {}
-    for number, episode in groupby(events, key=attrgetter("number")):
-        first = last = None
-        for event in episode:
-            if first is None:
-                first = last = event.sequence - 1
-            if number in parked:
-                continue
+    for span, some in by_span(spans, events):
+        last = span.after
+        for event in some:
+            if event.sequence != last + 1:
+                break
             try:
                 fold(event, designators, rows)
-                last = event.sequence
             except CannotFold as reason:
-                parked[number] = f"event {event.sequence}: {reason}"
-        assert first is not None
-        assert last is not None
-        steps.append((number, first, last))
+                parked[span.number] = f"event {event.sequence}: {reason}"
+                break
+            last = event.sequence
+        if last < span.last and span.number not in parked:
+            parked[span.number] = f"event {last + 1} is missing in the log"
+        steps.append((span.number, span.after, last))
     return Folded(rows, steps, parked)
+
+
+def by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, list[StoredEvent]]]:
+    """Each span with its events, of which there may be none; one span an episode."""
+    read = {number: list(some) for number, some in groupby(events, key=attrgetter("number"))}
+    return ((span, read.get(span.number, [])) for span in spans)

@@ -30,7 +30,7 @@ from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import advance_folded, park
-from pycrorm_async.store.rows import StoredEvent
+from pycrorm_async.store.rows import Span
 
 __all__ = ["Projector"]
 
@@ -80,8 +80,8 @@ class Projector:
         """
         count = 0
         with self._log.translated():
-            while events := await self._log.unfolded(self._batch_events):
-                count += await self._fold(events)
+            while spans := await self._log.unfolded(self._batch_events):
+                count += await self._fold(spans)
             while await self._refresh():
                 pass
         return count
@@ -90,17 +90,17 @@ class Projector:
         """One batch of the same, or some of the views that are kept; False if nothing was behind."""
         with self._log.translated():
             # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
-            events = await self._log.unfolded(self._batch_events, after=self._last_number)
-            if not events:
+            spans = await self._log.unfolded(self._batch_events, after=self._last_number)
+            if not spans:
                 return await self._refresh()
-            self._last_number = events[-1].number
-            await self._fold(events)
+            self._last_number = spans[-1].number
+            await self._fold(spans)
         return True
 
-    async def _fold(self, events: Sequence[StoredEvent]) -> int:
+    async def _fold(self, spans: Sequence[Span]) -> int:
         assert self._folding is not None, "opened before anything is folded"
         before = self._folding.generation.revision
-        count = await self._folding.batch(events)
+        count = await self._folding.batch(spans, await self._log.spans(spans))
         if self._folding.generation.revision != before:
             await self._sweep()
         return count

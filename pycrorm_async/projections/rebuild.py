@@ -167,7 +167,7 @@ class Rebuild:
             if len(events) < sum(each.last - each.after for each in spans):
                 raise _damage(self._log, spans, events, {each.number: each.id for each in behind})
             self._after = spans[-1].number
-            return await self._folding.batch(events)
+            return await self._folding.batch(spans, events)
 
     async def show(self) -> None:
         """Puts the new tables before the people, with all that the old ones showed. The old ones wait for `clear`."""
@@ -210,8 +210,8 @@ class Rebuild:
             if sum(each.head - each.folded for each in late) > _LATE_EVENTS_MAX:
                 return False
             if late:
-                events = await self._log.spans([Span(each.number, each.folded, each.head) for each in late])
-                if not await self._folding.batch_in(connection, events):
+                spans = [Span(each.number, each.folded, each.head) for each in late]
+                if not await self._folding.batch_in(connection, spans, await self._log.spans(spans)):
                     await connection.rollback()
                     return False
                 new = await noted(connection, MAKING) or new

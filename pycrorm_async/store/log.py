@@ -150,7 +150,7 @@ class EventLog:
         async with self._reading() as connection:
             return await self._dialect.spans(connection, spans)
 
-    async def unfolded(self, limit: int = 10_000, *, after: int = 0) -> list[StoredEvent]:
+    async def unfolded(self, limit: int = 10_000, *, after: int = 0) -> list[Span]:
         """What the tables do not show yet, at most `limit` events, some of each episode; nothing of parked episodes.
 
         Begins with the episodes that follow number `after`, and with the first one when there are none.
@@ -159,7 +159,7 @@ class EventLog:
             behind = await self._dialect.behind(connection, after=after, limit=limit)
             if not behind and after:
                 behind = await self._dialect.behind(connection, after=0, limit=limit)
-            return await self._dialect.spans(connection, share_out(behind, limit))
+            return share_out(behind, limit)
 
     async def behind(self) -> list[EpisodeRow]:
         """The episodes of which the tables do not show all; without the parked ones."""

@@ -309,3 +309,18 @@ async def test_tables_of_another_version_are_refused(log: EventLog) -> None:
         await connection.exec_driver_sql("UPDATE pycrorm_generation SET version = 4")
     with pytest.raises(DatabaseForeign, match=r"made by version 4 of the fold, this is version 3: use a newer pycrorm"):
         await Projector(log).open()
+
+
+@pytest.mark.parametrize("missing", [1, 2, 3])
+async def test_an_event_that_is_missing_parks_its_episode_and_the_others_go_on(log: EventLog, missing: int) -> None:
+    projector = Projector(log)
+    await projector.open()
+    await log.append([*rich_episode(1).records[:3], *rich_episode(2).records[:3]])
+    async with log.engine.begin() as connection:
+        postgresql = log.engine.dialect.name == "postgresql"
+        trigger, place = ("event_is_not_changed", " ON event") if postgresql else ("event_is_not_deleted", "")
+        await connection.exec_driver_sql(f"DROP TRIGGER {trigger}{place}")
+        await connection.exec_driver_sql(f"DELETE FROM event WHERE episode = 1 AND sequence = {missing}")
+    assert await projector.fold_behind() == 3 + missing - 1
+    rows = [(row.number, row.folded, row.parked) for row in await log.episodes()]
+    assert rows == [(1, missing - 1, f"event {missing} is missing in the log"), (2, 3, None)]

@@ -42,10 +42,10 @@ async def test_what_is_behind_shrinks_as_it_is_folded(log: EventLog) -> None:
     async with log.engine.begin() as connection:
         assert await advance_folded(connection, [(1, 0, 2), (2, 0, 2)])
     assert [(row.number, row.folded, row.head) for row in await log.behind()] == [(1, 2, 3)]
-    assert [(each.number, each.sequence) for each in await log.unfolded()] == [(1, 3)]
+    assert await log.unfolded() == [(1, 2, 3)]
     await log.append(run_of(episode(2), 3, 4))
-    assert [(each.number, each.sequence) for each in await log.unfolded()] == [(1, 3), (2, 3), (2, 4)]
-    assert [(each.number, each.sequence) for each in await log.unfolded(2)] == [(1, 3), (2, 3)]
+    assert await log.unfolded() == [(1, 2, 3), (2, 2, 4)]
+    assert await log.unfolded(2) == [(1, 2, 3), (2, 2, 3)]
 
 
 async def test_progress_that_someone_else_made_is_noticed(log: EventLog) -> None:
