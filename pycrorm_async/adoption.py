@@ -11,7 +11,7 @@ from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, asynccontextmanager
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings
@@ -33,7 +33,6 @@ __all__ = [
     "open_destination",
     "shared_address",
     "dead_queues",
-    "living_queues",
     "RecoveryReport",
     "recover",
     "Waiting",
@@ -145,12 +144,12 @@ async def recover(url: str, *, spool: Path | None = None, settings: Settings | N
     place = Spool(spool or address.default_spool)
     async with open_destination(address, place, clock=SYSTEM_CLOCK) as destination:
         with ExitStack() as held:
-            living = list(living_queues(place, failures, held))
+            living = list(_living_queues(place, failures, held))
             sources: Iterator[Source] = chain(living, dead_queues(place, failures, lost))
             done = await drain_once(sources, destination, settings=settings or Settings())
-            reasons = done.stopped
             for queue, state in zip(living, done.drained, strict=False):
-                queue.note_shown(state.appended or queue.given, {each: reasons[each] for each in state.refused})
+                stopped = {each: why for each, why in done.stopped.items() if each in queue.episodes}
+                queue.note_shown(state.appended or queue.given, {**state.refused, **stopped})
     return RecoveryReport(done, len(living), tuple(lost), {**done.failed, **failures})
 
 
@@ -162,11 +161,24 @@ def shared_address(url: str) -> DatabaseAddress:
     return address
 
 
-def living_queues(spool: Spool, failures: dict[str, PycrormError], held: ExitStack) -> Iterator[LiveQueue]:
+class _LivingQueue(LiveQueue):
+    """Knows the ids of the `episodes` of which it gave something, for one round."""
+
+    def __init__(self, *held: Any) -> None:
+        super().__init__(*held)
+        self.episodes: set[str] = set()
+
+    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
+        batch = await super().get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+        self.episodes |= {episode_text(each) for each in {record.episode for record in batch} if each is not None}
+        return batch
+
+
+def _living_queues(spool: Spool, failures: dict[str, PycrormError], held: ExitStack) -> Iterator[_LivingQueue]:
     """What living recorders have synced by now and nobody drains; held until the stack is closed."""
     for folder in spool.recorders():
         try:
-            queue = LiveQueue.take(folder.path) if folder.alive else None
+            queue = _LivingQueue.take(folder.path) if folder.alive else None
         except PycrormError as error:
             failures[folder.name] = error
             continue
@@ -185,6 +197,7 @@ class Waiting(NamedTuple):
 
 def waiting(url: str, spool: Path | None = None) -> Waiting:
     """What a spool holds beside its database. Reads only. Raises `SpoolUnavailable`."""
-    recorders = Spool(spool or DatabaseAddress.parse(url).default_spool).recorders()
+    found = Spool(spool or DatabaseAddress.parse(url).default_spool).recorders()
+    recorders = [each for each in found if each.refused is None]  # what was refused is no news: `status` tells it
     alive = sum(each.alive for each in recorders)
     return Waiting(len(recorders) - alive, alive)

@@ -9,11 +9,12 @@ from pathlib import Path
 from pycrorm_async.adoption import open_destination, shared_address
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import PycrormError, SpoolUnavailable
+from pycrorm_async.errors import DatabaseForeign, PycrormError, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
 from pycrorm_async.queue.spool import RecorderFolder, Spool
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.writer.daemon import Daemon, Moved
 from pycrorm_async.writer.ports import Found, Held, LetGo
 
@@ -30,7 +31,8 @@ async def serve(
 ) -> Moved:
     """Drains every recorder of the spool and folds, until `leave` is set; `say` gets one line for each notable thing.
 
-    Raises `SpoolUnavailable` when another daemon drains this spool, and as `Memory.open` does.
+    Raises `SpoolUnavailable` when another daemon drains this spool, `DatabaseForeign` when a SQLite file is replaced by
+    another meanwhile, and as `Memory.open` does.
     """
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
@@ -40,7 +42,7 @@ async def serve(
     try:
         async with open_destination(address, place, clock=SYSTEM_CLOCK) as destination:
             say(f"draining {place.path} into {address}")
-            look = _Folders(place, destination.log_id)
+            look = _Folders(place, destination.log_id, address)
             return await Daemon(destination, look, settings=settings or Settings(), say=say).run(leave)
     finally:
         lock.release()
@@ -49,11 +51,17 @@ async def serve(
 class _Folders:
     """Looks round in a spool, and takes hold of what can be drained. Implements the writer's `Look`."""
 
-    def __init__(self, spool: Spool, log_id: str) -> None:
+    def __init__(self, spool: Spool, log_id: str, address: DatabaseAddress) -> None:
         self._spool = spool
         self._log_id = log_id
+        self._file = address.path if address.is_sqlite else None
+        self._opened = _identity(self._file)
 
     def __call__(self, but: Collection[str]) -> Found:
+        # A file that is only gone may be put back. Into another one this process, which has the old one open, would
+        # never write: the next one looks what it is.
+        if (now := _identity(self._file)) is not None and now != self._opened:
+            raise DatabaseForeign(f"{self._file} was replaced while it was open: start `pycrorm writer` again")
         held: list[Held] = []
         failed: dict[str, Exception] = {}
         folders = [each for each in self._spool.recorders() if each.name not in but]
@@ -68,6 +76,15 @@ class _Folders:
                 if taken is not None:
                     held.append(taken)
         return Found(held, failed)
+
+
+def _identity(file: Path | None) -> tuple[int, int] | None:
+    """Which file this is; None for none, and where there is no telling."""
+    try:
+        status = file.stat() if file is not None else None
+    except OSError:
+        return None
+    return None if status is None else (status.st_dev, status.st_ino)
 
 
 def _take(folder: RecorderFolder) -> Held | None:
@@ -112,6 +129,9 @@ class _Dead(Held):
     async def acknowledge(self, position: int) -> None:
         await self._queue.acknowledge(position)
 
+    def set_aside(self, records: Sequence[Record]) -> bool:
+        return self._queue.set_aside(records)
+
     def give_up(self, reason: str) -> None:
         self._queue.give_up(reason)
 
@@ -125,7 +145,7 @@ class _Dead(Held):
     def let_go(self) -> LetGo:
         if self._queue.stored < self._queue.last:
             self._queue.release()
-            return LetGo("is kept", whole=False)
+            return LetGo("is kept", whole=False, again=not self._queue.holds_refused)
         self._queue.remove()
         count = len(self._queue.lost)
         return LetGo(

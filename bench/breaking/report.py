@@ -1,6 +1,7 @@
 """What was found, in two files: `FILE` is a table for a reader, `FILE.jsonl` a line for each slice, added at once.
 
-The lines are what an interrupted run goes on from: a slice that has one is not made again.
+The lines are what an interrupted run goes on from: a slice that has one is not made again, unless it broke off by an
+error; then its line stays in the file, and the table has what came of it when it was made again.
 """
 
 from __future__ import annotations
@@ -66,8 +67,9 @@ class Report:
                 self._slices[line["fault"], line["slice"]] = outcome
 
     def known(self, fault: str, number: int) -> Outcome | None:
-        """What this slice found in an earlier run."""
-        return self._slices.get((fault, number))
+        """What this slice found in an earlier run; None if it is to be made."""
+        outcome = self._slices.get((fault, number))
+        return None if outcome is None or outcome.broke else outcome
 
     def add(self, made: Slice) -> None:
         """Writes both files."""

@@ -18,7 +18,8 @@ __all__ = ["SPAWN", "Speaker", "kill_me_after"]
 SPAWN = multiprocessing.get_context("forkserver")
 # A kill costs a fork and not the start of an interpreter: all that `bench.faults` imports is there already.
 SPAWN.set_forkserver_preload(["bench.breaking.machine", "bench.breaking.simulation", "rich.progress", "rich.table"])
-_PATIENCE_S = 600.0
+_PATIENCE_S = 3600.0
+"""A machine may be so busy that starting a process takes minutes; a process that ended is noticed at once."""
 
 
 class Speaker:

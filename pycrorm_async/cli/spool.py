@@ -13,6 +13,7 @@ import typer
 from pycrorm_async.cli.options import JsonOption
 from pycrorm_async.cli.output import moment, note, print_facts, print_json, print_table, problem, stdout
 from pycrorm_async.errors import FilesError, PycrormError
+from pycrorm_async.queue.folder import REFUSED
 from pycrorm_async.queue.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
 from pycrorm_async.queue.repair import RepairReport, finish_repairs, repair_folder
 from pycrorm_async.queue.rescue import Range
@@ -152,7 +153,7 @@ def _print_repair(report: RepairReport) -> None:
 
 
 def _state(each: RecorderReport) -> str:
-    state = "alive" if each.alive else "dead"
+    state = "refused" if each.name.endswith(REFUSED) else "alive" if each.alive else "dead"
     return f"{state}, drained now" if each.being_drained else state
 
 

@@ -20,7 +20,7 @@ from pycrorm_async.queue.spool import RecorderFolder, Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["status", "RecorderState", "EpisodeState"]
+__all__ = ["status", "RecorderState", "EpisodeState", "RefusedState"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,15 @@ class EpisodeState:
     parked: str | None
 
 
+@dataclass(frozen=True)
+class RefusedState:
+    """Events of one episode that the database refused: kept in this folder, and offered to it again by every start."""
+
+    episode: str
+    folder: Path
+    bytes: int
+
+
 def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
     """Say who records, who drains, and how far database and tables are behind. Reads only.
 
@@ -71,7 +80,9 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     """
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
-    recorders = [_recorder(each) for each in place.recorders()]
+    folders = place.recorders()
+    recorders = [_recorder(each) for each in folders if each.refused is None]
+    refused = [RefusedState(each.refused, each.path, _bytes(each.path)) for each in folders if each.refused is not None]
     has_daemon = place.has_writer
     episodes: list[EpisodeState] = []
     fault: str | None = None
@@ -88,6 +99,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
                 "database": fault or "ok",
                 "recorders": recorders,
                 "episodes": episodes,
+                "refused": refused,
             }
         )
     else:
@@ -101,13 +113,15 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     given_up = [each for each in recorders if each.given_up]
     for recorder in given_up:
         problem(f"nothing more of recorder {recorder.name} is stored: {recorder.given_up}")
-    return 1 if stopped or given_up else 0
+    for each in refused:
+        problem(f"what the database refused of episode {each.episode} is kept in {each.folder}")
+    return 1 if stopped or given_up or refused else 0
 
 
 def _recorder(folder: RecorderFolder) -> RecorderState:
     with available(folder.path):
         locked = is_locked(folder.path / DRAIN)
-        spooled = sum(_size(segment_path(folder.path, number)) for number in _numbers(folder.path))
+        spooled = _bytes(folder.path)
         progress = Progress.open(folder.path, writing=False) if folder.alive else None
         if progress is None:
             drained = "nobody" if not locked else "itself" if folder.alive else "another"
@@ -131,11 +145,11 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
     )
 
 
-def _numbers(folder: Path) -> list[int]:
+def _bytes(folder: Path) -> int:
     try:
-        return segment_numbers(folder)
+        return sum(_size(segment_path(folder, number)) for number in segment_numbers(folder))
     except FileNotFoundError:  # it was all stored, and is gone since it was listed
-        return []
+        return 0
 
 
 def _size(path: Path) -> int:

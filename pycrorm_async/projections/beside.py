@@ -16,9 +16,10 @@ from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import Span, StoredEvent, share_out
 
-__all__ = ["Beside", "CatchUp", "Share"]
+__all__ = ["Beside", "CatchUp", "Share", "WHOLE"]
 
-_EPISODES_MAX = 2_000
+_EPISODES_MAX = 400
+"""So many episodes that have more are looked up for a batch: each costs as much as folding some of its events."""
 
 
 class Share(NamedTuple):
@@ -26,6 +27,9 @@ class Share(NamedTuple):
 
     part: int = 0
     many: int = 1
+
+
+WHOLE = Share()
 
 
 class Beside:
@@ -50,10 +54,7 @@ class Beside:
         if found is None or self._number not in (None, found.number):
             raise InternalError(f"the tables of {self._projection or 'the memory'} that were folded into are gone")
         if found.version != self._version:
-            raise DatabaseForeign(
-                f"the tables of the projection {self._projection} are of version {found.version}, and the one here of"
-                f" version {self._version}: `pycrorm rebuild {self._projection}` makes them anew"
-            )
+            raise DatabaseForeign(f"its tables are of version {found.version} now, and here it is {self._version}")
         self.place = progress.place_of(found.number, self._projection)
         return found
 
@@ -79,7 +80,7 @@ class CatchUp:
         generation: Generation,
         *,
         meaning: Meaning = TABLES,
-        share: Share = Share(),  # noqa: B008 - it is immutable
+        share: Share = WHOLE,
         after_tables: bool = False,
         batch_events: int,
     ) -> None:

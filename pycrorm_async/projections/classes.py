@@ -7,16 +7,18 @@ table until a designator says which dtype is kept there. Classes of one memory a
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from sqlalchemy import Boolean, Column, Double, Float, Integer, Table
 from sqlalchemy.orm import Mapper
+from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.orm import Action, Designator, Language, Motion
 from pycrorm_async.orm.types import Moment
 from pycrorm_async.projections.layout import Leaf
 from pycrorm_async.projections.tables import Storage
 
-__all__ = ["mapped_leaves"]
+__all__ = ["mapped_leaves", "storage_of"]
 
 _KINDS = {Action: "action", Motion: "motion", Language: "language"}
 _ROOTS = (Designator, *_KINDS)
@@ -45,6 +47,11 @@ def _storage(column: Column[object]) -> Storage:
         target = key.target_fullname
         if target in ("pose.id", "object.id"):
             return "pose" if target == "pose.id" else "object"
+    return storage_of(column.type)
+
+
+def storage_of(type_: TypeEngine[Any]) -> Storage:
+    """How a value of this type is stored."""
     kinds: tuple[tuple[type, Storage], ...] = (
         (Moment, "time"),
         (Boolean, "boolean"),
@@ -52,4 +59,4 @@ def _storage(column: Column[object]) -> Storage:
         (Float, "real"),
         (Double, "real"),
     )
-    return next((storage for kind, storage in kinds if isinstance(column.type, kind)), "text")
+    return next((storage for kind, storage in kinds if isinstance(type_, kind)), "text")

@@ -16,7 +16,7 @@ from pycrorm_async.events.fields import fault_in_table, table_name
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldType
 from pycrorm_async.projections.tables import Storage
 
-__all__ = ["Layout", "DesignatorType", "Leaf", "Contradictory", "STORED_AS"]
+__all__ = ["Layout", "DesignatorType", "Leaf", "Kept", "Contradictory", "STORED_AS"]
 
 STORED_AS: dict[FieldType, Storage] = {
     "integer": "integer",
@@ -54,12 +54,26 @@ class DesignatorType(msgspec.Struct, frozen=True):
     bases: tuple[str, ...] = ()
 
 
+class Kept(msgspec.Struct, frozen=True):
+    """The tables of a user's view that is kept: its columns, its rows, and how far it is with each episode."""
+
+    columns: dict[str, Storage]
+    table: str
+    progress: str
+
+
 class Layout(msgspec.Struct, frozen=True):
-    """Leaf tables by name, designator types by dtype, and users' views (name to SQL) of one memory."""
+    """Leaf tables by name, designator types by dtype, and users' views of one memory.
+
+    Of views the meaning as SQL, by name; the tables of those that are kept; and tables of kept views whose meaning was
+    changed.
+    """
 
     leaves: dict[str, dict[str, Storage]] = {}
     types: dict[str, DesignatorType] = {}
     user_views: dict[str, str] = {}
+    kept: dict[str, Kept] = {}
+    outdated: tuple[str, ...] = ()
 
     def with_leaves(self, leaves: Iterable[Leaf]) -> Self:
         """With the tables of these mapped classes; what is declared already wins."""
@@ -70,9 +84,14 @@ class Layout(msgspec.Struct, frozen=True):
                 types[leaf.dtype] = DesignatorType(leaf.kind, (leaf.table,))
         return msgspec.structs.replace(self, leaves=tables, types=types)
 
-    def with_views(self, views: Mapping[str, str]) -> Self:
+    def with_views(self, views: Mapping[str, str], kept: Mapping[str, Kept]) -> Self:
         """With these users' views, in place of those of the same names."""
-        return msgspec.structs.replace(self, user_views=self.user_views | dict(views))
+        now = {name: each for name, each in self.kept.items() if name not in views} | dict(kept)
+        old = {table for each in self.kept.values() for table in (each.table, each.progress)}
+        old -= {table for each in now.values() for table in (each.table, each.progress)}
+        return msgspec.structs.replace(
+            self, user_views=self.user_views | dict(views), kept=now, outdated=(*self.outdated, *sorted(old))
+        )
 
     def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
         """With the table of this type. Raises `Contradictory` and says why."""

@@ -29,8 +29,8 @@ from pycrorm_async.projections.views import UserView
 __all__ = ["Projection", "Event", "Changes", "Column", "OF_EVERY_TABLE", "columns_of"]
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
-Column: TypeAlias = Literal["row", "pose", "object", "integer", "real", "text", "boolean", "time", "json"]
-"""How a column is stored: the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON."""
+Column: TypeAlias = Literal["row", "integer", "real", "text", "boolean", "time", "json"]
+"""How a column is stored: the id of a row, a scalar, µs since 1970, JSON."""
 OF_EVERY_TABLE: dict[str, Storage] = {"id": "key", "process_metadata_id": "row"}
 
 
@@ -86,8 +86,8 @@ class Projection(ABC):
     Attributes:
         name: in the database: small letters, digits and underscores.
         version: counts what the fold means. With another one `pycrorm rebuild NAME` makes the tables anew.
-        tables: columns and how they are stored (`row`, `pose`, `object`, `integer`, `real`, `text`, `boolean`, `time`
-            in µs since 1970, `json`). Every table also has `id`, and `process_metadata_id` for its episode.
+        tables: columns and how they are stored (`row` for the id of one, `integer`, `real`, `text`, `boolean`,
+            `time` in µs since 1970, `json`). Every table also has `id`, and `process_metadata_id` for its episode.
         views: questions about these tables with a name, shown beside them.
     """
 
@@ -113,7 +113,8 @@ def columns_of(projection: Projection) -> dict[str, dict[str, Storage]]:
 
 
 def _fault_in(projection: Projection) -> str | None:
-    name, version = getattr(projection, "name", None), projection.version
+    name: Any = getattr(projection, "name", None)
+    version: Any = projection.version
     if not isinstance(name, str) or not _NAME.fullmatch(name) or name == "tables":
         return f"its name is {name!r}, and must be small letters, digits and underscores, 40 at most, not 'tables'"
     if not isinstance(version, int) or not 0 < version < 2**31:
@@ -129,7 +130,9 @@ def _fault_in(projection: Projection) -> str | None:
             if not _NAME.fullmatch(column) or column in OF_EVERY_TABLE:
                 return f"the column {table}.{column}: not a name it can have"
             if storage not in get_args(Column):
-                return f"the column {table}.{column} is stored as {storage!r}, and that is one of {', '.join(get_args(Column))}"
+                return f"the column {table}.{column} is {storage!r}, and must be one of {', '.join(get_args(Column))}"
+    if any(each.materialised for each in projection.views):
+        return "a view of a projection cannot be materialised: it stands on tables that are kept already"
     names = [*projection.tables, *(each.name for each in projection.views)]
     twice = next((each for each in names if [*map(str.lower, names)].count(each.lower()) > 1), None)
     return f"two of its tables and views are called {twice!r}" if twice else None

@@ -12,7 +12,7 @@ from pycrorm_async.events.happenings import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.projections.fold import CannotFold, happening_of
 from pycrorm_async.projections.own import OF_EVERY_TABLE, Changes, Event, Projection, columns_of
 from pycrorm_async.projections.rows import Row
-from pycrorm_async.projections.tables import Storage, column_type, physical_name
+from pycrorm_async.projections.tables import OWN, Storage, column_type, physical_name
 from pycrorm_async.projections.values import is_missing, json_text, microseconds
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.rows import StoredEvent
@@ -70,7 +70,7 @@ class OwnRows:
         """All of it, in this transaction. Raises `RowRefused`."""
         dialect, quote = dialect_of(connection), connection.dialect.identifier_preparer.quote
         for (table, columns), made in self.to_insert().items():
-            await dialect.insert_rows(connection, physical_name(table, generation), columns, made)
+            await dialect.insert_rows(connection, physical_name(f"{OWN}{table}", generation), columns, made)
         for table, rows in self._updates.items():
             alike: dict[tuple[str, ...], list[Row]] = {}
             for id_, values in rows.items():
@@ -80,7 +80,7 @@ class OwnRows:
                     quote(name): column_type(self._columns[table][name]).compile(dialect=connection.dialect)
                     for name in ("id", *columns)
                 }
-                await dialect.update_rows(connection, physical_name(table, generation), kinds, made)
+                await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, made)
 
     def _event(self, stored: StoredEvent) -> Event:
         happening = happening_of(stored)
@@ -93,7 +93,7 @@ class OwnRows:
         number, sequence, _, _, wall_ns, monotonic_ns, _ = stored
         return Event(number, sequence, microseconds(wall_ns), monotonic_ns, happening, dtype, parameters)
 
-    def _checked(self, event: StoredEvent, table: str, id_: int, given: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked(self, event: StoredEvent, table: str, id_: Any, given: Mapping[str, Any]) -> dict[str, Any]:
         columns = self._columns.get(table)
         if columns is None:
             raise CannotFold(f"{self._projection.name} has no table {table!r}")

@@ -6,13 +6,15 @@ are; one that does catches up. Whatever is wrong with one is told, and the other
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from sqlalchemy import Dialect
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import CallerError, DatabaseForeign
+from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.projections import progress
 from pycrorm_async.projections.beside import Beside, CatchUp
@@ -29,10 +31,14 @@ from pycrorm_async.projections.generations import (
 from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.own import Projection, columns_of
 from pycrorm_async.projections.own_rows import OwnRows
-from pycrorm_async.projections.views import view_texts
+from pycrorm_async.projections.tables import OWN, Storage
+from pycrorm_async.projections.views import with_user_views
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["OwnMeaning", "layout_of", "make_own", "set_up", "kept_up"]
+__all__ = ["OwnTables", "OwnMeaning", "layout_of", "make_own", "refuse_taken", "fault_in_version"]
+
+_LOOK_S = 1.0
+"""What another process has stored is looked for so often: it costs as much as there are episodes."""
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -56,9 +62,12 @@ class OwnMeaning:
 def layout_of(projection: Projection, dialect: Dialect) -> Layout:
     """Its tables and views. Raises `CallerError`."""
     tables = columns_of(projection)
-    leaves = {name: {each: tables[name][each] for each in columns if each != "id"} for name, columns in tables.items()}
+    leaves: dict[str, dict[str, Storage]] = {
+        f"{OWN}{name}": {each: storage for each, storage in columns.items() if each != "id"}
+        for name, columns in tables.items()
+    }
     layout = Layout(leaves=leaves)
-    return layout.with_views(view_texts(projection.views, layout, dialect))
+    return with_user_views(layout, projection.views, dialect)
 
 
 async def make_own(connection: AsyncConnection, projection: Projection, key: str) -> Generation:
@@ -73,36 +82,41 @@ async def make_own(connection: AsyncConnection, projection: Projection, key: str
     return made
 
 
-async def set_up(connection: AsyncConnection, projection: Projection, taken: Iterable[str]) -> bool:
-    """Makes what is missing of it; whether the views have to be made again.
+def refuse_taken(name: str, layout: Layout, tables: Layout, projections: Mapping[str, Generation]) -> None:
+    """Raises `CallerError` if this projection wants a name that the memory or another one has."""
+    others = {other: one for other, one in projections.items() if other != name}
+    owners = {each: f"the projection {other}" for other, one in others.items() for each in _names(one.layout)}
+    owners |= dict.fromkeys(_names(tables), "the memory")
+    for each in _names(layout):
+        if each in owners:
+            raise CallerError(f"the projection {name} wants {each!r}, which {owners[each]} has: rename it")
+
+
+async def _set_up(connection: AsyncConnection, projection: Projection, tables: Layout) -> tuple[Generation, bool]:
+    """Makes what is missing of it; how it is, and whether the views have to be made again.
 
     Args:
         connection: alone in the memory.
         projection: known here.
-        taken: the names of tables and views that are not of projections.
+        tables: the layout of ours.
 
     Raises `CallerError` for a name that is taken, `DatabaseForeign` for tables of another version.
     """
     layout = layout_of(projection, connection.dialect)
     there = projections_in(await all_noted(connection))
-    others = {name: f"the projection {owner}" for owner, each in there.items() for name in _names(each.layout)}
-    owners = {name.lower(): "the memory" for name in taken}
-    owners |= {name: owner for name, owner in others.items() if owner != f"the projection {projection.name}"}
-    for name in _names(layout):
-        if name in owners:
-            raise CallerError(f"the projection {projection.name} wants {name!r}, which {owners[name]} has: rename it")
+    refuse_taken(projection.name, layout, tables, there)
     found = there.get(projection.name)
     key = f"{PROJECTION}{projection.name}"
     if found is None:
-        await make_own(connection, projection, key)
-        return True
+        return await make_own(connection, projection, key), True
     fault = fault_in_version(projection, found, layout)
     if fault is not None:
         raise DatabaseForeign(fault)
     if found.layout == layout:
-        return False
-    await note(connection, key, Generation(found.number, found.revision + 1, layout, {}, found.version))
-    return True
+        return found, False
+    found = replace(found, revision=found.revision + 1, layout=layout)
+    await note(connection, key, found)
+    return found, True
 
 
 def fault_in_version(projection: Projection, found: Generation, layout: Layout) -> str | None:
@@ -119,15 +133,62 @@ def fault_in_version(projection: Projection, found: Generation, layout: Layout) 
 
 
 class OwnTables:
-    """A projection that is kept up to date."""
+    """The projections that a process knows, each kept up to date. What is wrong with one is told, once."""
 
-    def __init__(self, log: EventLog, projection: Projection, generation: Generation, *, batch_events: int) -> None:
-        self.name = projection.name
-        goal = _Live(f"{PROJECTION}{projection.name}", projection.name, projection.version)
-        self._catch_up = CatchUp(
-            log, goal, generation, meaning=OwnMeaning(projection), after_tables=True, batch_events=batch_events
-        )
+    def __init__(
+        self, log: EventLog, named: Sequence[Projection], found: Sequence[Projection], *, batch_events: int
+    ) -> None:
+        self._log = log
+        self._named = named
+        self._found = found
+        self._batch_events = batch_events
+        self._folded: dict[str, CatchUp] = {}
+        self._looked_s = 0.0
+
+    async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
+        """Makes what is missing; whether the views have to be made again.
+
+        Raises `CallerError` for a name that is taken, of a projection that was named.
+        """
+        changed = False
+        for each in (*self._named, *self._found):
+            try:
+                generation, is_new = await _set_up(connection, each, tables)
+            except (DatabaseForeign, CallerError) as fault:
+                if isinstance(fault, CallerError) and each in self._named:
+                    raise
+                _log.warning("%s", fault)
+                continue
+            changed = changed or is_new
+            goal = Beside(f"{PROJECTION}{each.name}", each.name, each.version)
+            self._folded[each.name] = CatchUp(
+                self._log,
+                goal,
+                generation,
+                meaning=OwnMeaning(each),
+                after_tables=True,
+                batch_events=self._batch_events,
+            )
+        return changed
+
+    async def fold_some(self, *, now: bool) -> bool:
+        """A batch of each; False if nothing was behind. Without `now` it is enough to look from time to time."""
+        time_s = asyncio.get_running_loop().time()
+        if not self._folded or (not now and time_s < self._looked_s + _LOOK_S):
+            return False
+        count = 0
+        for name, each in [*self._folded.items()]:
+            try:
+                count += await each.fold_some() is not None
+            except DatabaseUnavailable:
+                raise
+            except PycrormError as fault:
+                _log.warning("the projection %s is not kept up to date any more: %s", name, fault)
+                del self._folded[name]
+        if not count:
+            self._looked_s = time_s
+        return count > 0
 
 
 def _names(layout: Layout) -> list[str]:
-    return [name.lower() for name in (*layout.leaves, *layout.user_views)]
+    return [name.removeprefix(OWN).lower() for name in (*layout.leaves, *layout.user_views)]

@@ -15,11 +15,26 @@ from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.rows import EpisodeRow
 
-__all__ = ["TABLE", "COLUMNS", "place_of", "behind", "late", "total", "advance", "park", "carry_over"]
+__all__ = [
+    "TABLE",
+    "COLUMNS",
+    "SEEN",
+    "place_of",
+    "behind",
+    "late",
+    "folded",
+    "total",
+    "parked",
+    "advance",
+    "park",
+    "carry_over",
+]
 
 TABLE = "pycrorm_progress"
 COLUMNS: dict[str, Storage] = {"id": "key", "folded": "integer", "parked": "text"}
 """The episode's number, the last sequence that is in the tables, and why no more is."""
+SEEN = "SELECT number, folded FROM episode"
+"""What tells how much of each episode is in the tables that people see."""
 
 
 def place_of(generation: int, projection: str | None = None) -> str:
@@ -52,16 +67,26 @@ AND number % :many = :part {begun} ORDER BY number LIMIT :limit"""),  # noqa: S6
     return [EpisodeRow(*row) for row in found]
 
 
-async def late(connection: AsyncConnection, place: str, *, limit: int) -> list[EpisodeRow]:
-    """The episodes of which people see more than is in this generation; their `head` is what people see."""
+async def late(connection: AsyncConnection, place: str, *, seen: str, limit: int) -> list[EpisodeRow]:
+    """The episodes of which people see more than is in this generation; their `head` is what people see.
+
+    `seen` is what tells how much that is: `SEEN`, or `folded` of another generation.
+    """
     found = await connection.execute(
         text(f"""
-SELECT number, episode.id, episode.folded, coalesce(progress.folded, 0), started_wall_ns
-FROM episode LEFT JOIN {place} AS progress ON progress.id = number
-WHERE episode.folded > coalesce(progress.folded, 0) AND progress.parked IS NULL ORDER BY number LIMIT :limit"""),  # noqa: S608
+SELECT episode.number, episode.id, seen.folded, coalesce(progress.folded, 0), started_wall_ns
+FROM episode JOIN ({seen}) AS seen ON seen.number = episode.number
+LEFT JOIN {place} AS progress ON progress.id = episode.number
+WHERE seen.folded > coalesce(progress.folded, 0) AND progress.parked IS NULL
+ORDER BY episode.number LIMIT :limit"""),  # noqa: S608
         {"limit": limit},
     )
     return [EpisodeRow(*row) for row in found]
+
+
+def folded(place: str) -> str:
+    """What tells, for each episode, how much of it is in this generation."""
+    return f"SELECT id AS number, folded FROM {place}"  # noqa: S608
 
 
 async def total(connection: AsyncConnection, place: str) -> int:
@@ -70,6 +95,17 @@ async def total(connection: AsyncConnection, place: str) -> int:
         text(f"SELECT coalesce(sum(folded), 0) FROM {place}")  # noqa: S608
     )
     return int(found.scalar_one())
+
+
+async def parked(connection: AsyncConnection, place: str) -> dict[str, str]:
+    """By episode id, why no more of it is in this generation."""
+    found = await connection.execute(
+        text(
+            f"SELECT episode.id, progress.parked FROM {place} AS progress JOIN episode ON number = progress.id"  # noqa: S608
+            " WHERE progress.parked IS NOT NULL ORDER BY number"
+        )
+    )
+    return {each.id: each.parked for each in found}
 
 
 async def advance(connection: AsyncConnection, place: str, steps: Sequence[Progress]) -> bool:

@@ -24,7 +24,10 @@ from pycrorm_async.projections.generations import (
     show,
 )
 from pycrorm_async.projections.layout import Layout
-from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
+from pycrorm_async.projections.materialised import refresh_some
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_tables import OwnTables
+from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, with_user_views
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -42,20 +45,33 @@ class Projector:
     Args:
         log: open for writing.
         views: users' views to make beside the tables.
+        projections: of one's own, to be kept up to date too.
+        found: the same, but a fault in one of them is told and not raised.
         batch_events: how many events one transaction takes at most.
     """
 
-    def __init__(self, log: EventLog, *, views: Sequence[UserView] = (), batch_events: int = 10_000) -> None:
+    def __init__(
+        self,
+        log: EventLog,
+        *,
+        views: Sequence[UserView] = (),
+        projections: Sequence[Projection] = (),
+        found: Sequence[Projection] = (),
+        batch_events: int = 10_000,
+    ) -> None:
         self._log = log
         self._views = (*BUILT_IN_VIEWS, *views)
         self._batch_events = batch_events
+        self._own = OwnTables(log, projections, found, batch_events=batch_events)
+        self._has_news = True
         self._folding: Folding | None = None
         self._last_number = 0
 
     async def open(self) -> None:
         """Makes tables and views that are missing: those of every memory, of the mapped classes, of the users.
 
-        Raises `DatabaseForeign` for tables of another version, `CallerError` for a view whose name is taken.
+        Raises `DatabaseForeign` for tables of another version, `CallerError` for a view or a projection whose name
+        is taken.
         """
         with self._log.translated():
             async with self._log.engine.begin() as connection:
@@ -65,8 +81,9 @@ class Projector:
                     raise DatabaseForeign(f"{self._log.address}: the tables are gone: run `pycrorm rebuild`")
                 generation = found or await make_generation(connection, 1)
                 layout = generation.layout.with_leaves(mapped_leaves())
-                layout = layout.with_views(view_texts(self._views, layout, connection.dialect))
-                if found is None or layout != generation.layout:
+                layout = with_user_views(layout, self._views, connection.dialect)
+                changed = await self._own.set_up(connection, layout)
+                if found is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
             self._folding = Folding(self._log, _Live(), generation)
             await self._sweep()
@@ -81,17 +98,24 @@ class Projector:
         with self._log.translated():
             while events := await self._log.unfolded(self._batch_events):
                 count += await self._fold(events)
+            while await self._refresh():
+                pass
+            while await self._own.fold_some(now=True):
+                pass
         return count
 
     async def fold_some(self) -> bool:
-        """One batch of the same; False if nothing was behind."""
+        """One batch of the same, or some of the views that are kept; False if nothing was behind."""
         with self._log.translated():
             # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
             events = await self._log.unfolded(self._batch_events, after=self._last_number)
-            if events:
-                self._last_number = events[-1].number
-                await self._fold(events)
-        return bool(events)
+            if not events:
+                self._has_news = await self._refresh() or await self._own.fold_some(now=self._has_news)
+                return self._has_news
+            self._has_news = True
+            self._last_number = events[-1].number
+            await self._fold(events)
+        return True
 
     async def _fold(self, events: Sequence[StoredEvent]) -> int:
         assert self._folding is not None, "opened before anything is folded"
@@ -100,6 +124,15 @@ class Projector:
         if self._folding.generation.revision != before:
             await self._sweep()
         return count
+
+    async def _refresh(self) -> bool:
+        assert self._folding is not None, "opened before anything is folded"
+        if not self._folding.generation.layout.kept:
+            return False
+        async with self._log.engine.begin() as connection:
+            await dialect_of(connection).alone(connection)
+            generation = await _Live().generation(connection, "share")
+            return await refresh_some(connection, generation.layout, generation.number)
 
     async def _sweep(self) -> None:
         async with self._log.engine.begin() as connection:

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,9 +18,11 @@ from sqlalchemy.orm import aliased
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
 from pycrorm_async.orm import Object, PickUpAction, Pose, TaskTreeNode
-from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.classes import storage_of
+from pycrorm_async.projections.layout import Kept, Layout
+from pycrorm_async.projections.materialised import EPISODE
 
-__all__ = ["UserView", "BUILT_IN_VIEWS", "view_texts", "view_text"]
+__all__ = ["UserView", "BUILT_IN_VIEWS", "with_user_views", "view_texts", "view_text"]
 
 
 @dataclass(frozen=True)
@@ -29,10 +32,13 @@ class UserView:
     Attributes:
         name: of the view in the database; not that of a table of the memory.
         meaning: a select over the mapped classes, or over anything else in this database.
+        materialised: its rows are kept, for questions that cost much. Each row must come from one episode alone, which
+            a column `process_metadata_id` names: an episode that has changed has its rows made anew, at every flush.
     """
 
     name: str
     meaning: Select[*tuple[Any, ...]]
+    materialised: bool = False
 
     @cached_property
     def table(self) -> TableClause:
@@ -43,6 +49,21 @@ class UserView:
 def view_text(meaning: Any, dialect: Dialect) -> str:
     """The SQL of a select, its parameters written in."""
     return str(meaning.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
+
+
+def with_user_views(layout: Layout, views: Sequence[UserView], dialect: Dialect) -> Layout:
+    """The layout with these views. Raises `CallerError` for a name that is taken, or rows that name no episode."""
+    texts = view_texts(views, layout, dialect)
+    return layout.with_views(texts, {each.name: _kept(each, texts[each.name]) for each in views if each.materialised})
+
+
+def _kept(view: UserView, meaning: str) -> Kept:
+    columns = {name: storage_of(each.type) for name, each in view.meaning.subquery().c.items()}
+    if EPISODE not in columns:
+        raise CallerError(f"the view {view.name} cannot be materialised: its rows name no episode (select {EPISODE})")
+    # Of another meaning it is another table: what there was cannot be shown under the new one.
+    digest = hashlib.blake2b(f"{view.name}{meaning}{columns}".encode(), digest_size=6).hexdigest()
+    return Kept(columns, f"pycrorm_view_{digest}", f"pycrorm_view_{digest}_progress")
 
 
 def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> dict[str, str]:

@@ -22,13 +22,14 @@ from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.projections.generations import Generation, current_generation
+from pycrorm_async.projections.shadowing import with_views
 from pycrorm_async.projections.union import unite
 from pycrorm_async.query import questions
 from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.frames import dataframe
 from pycrorm_async.query.moment import Moment
 from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
-from pycrorm_async.query.thoughts import all_views, with_thoughts
+from pycrorm_async.query.thoughts import all_views
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -214,8 +215,9 @@ class Reading:
             return
         generation = await _generation(self._log)
         if generation.revision != self._all_views[0]:
-            self._all_views = generation.revision, all_views(generation, self._log.engine.dialect)
-        async with with_thoughts(self._log.engine, self._all_views[1]) as connection:
+            async with self._log.engine.connect() as connection:
+                self._all_views = generation.revision, await all_views(connection, generation)
+        async with with_views(self._log.engine, self._all_views[1]) as connection:
             yield connection
 
 

@@ -10,6 +10,7 @@
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
         00000002.segment       the last one may be made ahead: all zero
         00000001.segment.tail  what sealing cut off, to be looked at until the folder is removed
+      <recorder>.<episode>.refused/   what the database refused of this episode (`refused.py`), in the same format
       <recorder>.damaged/      a damaged folder as it was, when `repair` put another in its place
 
 Everything below is little endian, and every structure begins at a multiple of 8 bytes.

@@ -10,19 +10,53 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.progress import PROGRESS
 from pycrorm_async.queue.segment import segment_numbers, segment_path, sync_folder
 
-__all__ = ["ALIVE", "DRAIN", "MAKING", "TAIL", "available", "make_folder", "remove_folder", "write_safely"]
+__all__ = [
+    "ALIVE",
+    "DRAIN",
+    "MAKING",
+    "MENDED",
+    "REFUSED",
+    "TAIL",
+    "Holding",
+    "available",
+    "held_by",
+    "make_folder",
+    "remove_folder",
+    "write_safely",
+]
 
 ALIVE: Final = "alive"
 DRAIN: Final = "drain"
 MAKING: Final = ".making"
+MENDED: Final = f".mended{MAKING}"
+"""What `repair` adds to the name of a new folder until it is whole."""
+REFUSED: Final = ".refused"
 TAIL: Final = ".tail"
+
+
+class Holding(NamedTuple):
+    """Whose records a folder holds: all of a recorder's, or those of one `episode` that the database refused."""
+
+    recorder: EpisodeId
+    episode: EpisodeId | None
+
+
+def held_by(name: str) -> Holding:
+    """What a folder of this name holds. Raises `ValueError` for what is no name of ours."""
+    recorder, dot, rest = name.partition(".")
+    if not dot:
+        return Holding(parse_episode_id(recorder), None)
+    if not rest.endswith(REFUSED):
+        raise ValueError(name)
+    return Holding(parse_episode_id(recorder), parse_episode_id(rest.removesuffix(REFUSED)))
 
 
 @contextmanager
@@ -52,8 +86,9 @@ def make_folder(spool: Path, name: str) -> tuple[Path, FileLock]:
 
 def remove_folder(folder: Path) -> None:
     """Deletes what is ours in it, and the folder unless somebody else left something there. Raises `OSError`."""
-    for number in segment_numbers(folder):
-        segment_path(folder, number).unlink()
+    # One made ahead goes first: left alone by a kill it would look like one whose header was lost. Then the oldest.
+    for path in sorted((segment_path(folder, number) for number in segment_numbers(folder)), key=_is_begun):
+        path.unlink()
     for path in list(folder.iterdir()):
         if path.suffix in {MAKING, TAIL}:
             path.unlink()
@@ -61,6 +96,11 @@ def remove_folder(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
+
+
+def _is_begun(segment: Path) -> bool:
+    with segment.open("rb") as file:
+        return file.read(1) != b"\0"
 
 
 def write_safely(path: Path, content: bytes) -> None:

@@ -6,6 +6,7 @@ A frame decodes whole and unchanged or not at all: every bit of it is under its 
 from __future__ import annotations
 
 import mmap
+from collections.abc import Sequence
 from struct import Struct
 from typing import Final, NamedTuple, TypeAlias
 from zlib import crc32
@@ -26,6 +27,7 @@ __all__ = [
     "encode_header",
     "encode_body",
     "encode_commit",
+    "encode_span",
     "decode",
     "chain",
     "frame_bytes",
@@ -135,6 +137,40 @@ def encode_commit(*, position: int, count: int, checksum: int, wall_ns: int, mon
         payload=CHECKSUM.pack(checksum),
         salt=salt,
     )
+
+
+def encode_span(frames: Sequence[Frame], *, after: int, salt: int, unsaid: Sequence[int] = ()) -> tuple[bytes, bytes]:
+    """These records at the positions that follow `after`; and the commit frame that says of them, and of those before
+    whose checksums are `unsaid`, that they are on the disk.
+    """
+    encoded = [
+        encode(
+            kind=each.kind,
+            version=each.version,
+            position=position,
+            sequence=each.sequence,
+            wall_ns=each.wall_ns,
+            monotonic_ns=each.monotonic_ns,
+            episode=each.episode,
+            type_name=each.type,
+            payload=each.payload,
+            salt=salt,
+        )
+        for position, each in enumerate(frames, after + 1)
+    ]
+    checksums = [*unsaid, *(CHECKSUM.unpack_from(each, CHECKSUM_START)[0] for each in encoded)]
+    span = 0
+    for checksum in checksums:
+        span = chain(checksum, span)
+    commit = encode_commit(
+        position=after + len(frames),
+        count=len(checksums),
+        checksum=span,
+        wall_ns=frames[-1].wall_ns if frames else 0,
+        monotonic_ns=frames[-1].monotonic_ns if frames else 0,
+        salt=salt,
+    )
+    return b"".join(encoded), commit
 
 
 def decode(buffer: Buffer, offset: int, salt: int) -> Frame | None:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign, SpoolUnavailable
-from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
-from pycrorm_async.queue.folder import ALIVE, DRAIN, MAKING, TAIL, available
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue.folder import ALIVE, DRAIN, MAKING, MENDED, TAIL, available, held_by
 from pycrorm_async.queue.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.locks import is_locked
 from pycrorm_async.queue.scan import Kept, Survey, survey
@@ -22,7 +22,6 @@ from pycrorm_async.queue.spool import RecorderFolder, Spool
 
 __all__ = [
     "SET_ASIDE",
-    "MENDED",
     "SpoolReport",
     "RecorderReport",
     "SegmentReport",
@@ -33,8 +32,6 @@ __all__ = [
 
 SET_ASIDE: Final = ".damaged"
 """What `repair` adds to the name of a folder it has put aside."""
-MENDED: Final = f".mended{MAKING}"
-"""What it adds to that of the new one until it is whole."""
 
 _PROGRESS = "progress"
 """How far another process has drained a living recorder's folder."""
@@ -71,12 +68,12 @@ class Damage:
 
 @dataclass(frozen=True)
 class RecorderReport:
-    """One recorder's folder.
+    """One recorder's folder, or what was refused of it.
 
     Attributes:
-        name: the recorder's id.
+        name: of the folder: the recorder's id, and for what was refused of it the episode's.
         path: its folder.
-        alive: its process lives.
+        alive: its process lives; of what was refused: more may be put into it.
         being_drained: somebody holds the right to drain it.
         first, last: positions of the first and the last whole record; last is first - 1 if there is none.
         safe: position up to which a sync said that all is on the disk.
@@ -164,15 +161,15 @@ def is_set_aside(path: Path) -> bool:
 
 def _is_unfinished(path: Path) -> bool:
     """A recorder's folder without its `alive`, the last file to go, or under the name it has before it is whole."""
-    name, suffix, rest = path.name.partition(".")
+    name = path.name.removesuffix(MENDED).removesuffix(MAKING)
     if not _is_name(name) or not path.is_dir():
         return False
-    return f".{rest}" in (MAKING, MENDED) if suffix else not any(path.iterdir())
+    return name != path.name or not any(path.iterdir())
 
 
 def _is_name(name: str) -> bool:
     try:
-        parse_episode_id(name)
+        held_by(name)
     except ValueError:
         return False
     return True
@@ -237,7 +234,7 @@ def _looked_at(recorder: RecorderFolder, *, being_drained: bool) -> RecorderRepo
 
 def _surveyed(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
     """A look that is good for something: of a folder that changes meanwhile, the first that contradicts nobody."""
-    recorder = parse_episode_id(folder.name)
+    recorder = held_by(folder.name).recorder
     before: SpoolDamaged | None = None
     looks = _LOOKS if changing else 1
     for look in range(1, looks + 1):

@@ -9,7 +9,7 @@ folder: this source ends, and recovery gives all of it once more, `progress` ign
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Self
 
@@ -22,6 +22,7 @@ from pycrorm_async.queue.frame import Buffer
 from pycrorm_async.queue.locks import FileLock, is_locked
 from pycrorm_async.queue.progress import Drained, Note, Progress
 from pycrorm_async.queue.reader import Cursor, Reader, map_segment
+from pycrorm_async.queue.refused import RefusedRecords
 from pycrorm_async.queue.scan import checked_header
 from pycrorm_async.queue.segment import header_bytes, segment_numbers, segment_path
 
@@ -42,6 +43,7 @@ class LiveQueue:
         self._recorder = recorder
         self._drain = drain
         self._progress = progress
+        self._refused = RefusedRecords(folder)
         before = progress.drained()
         self._said = before._replace(note=Note())  # what a drainer before said in words is not ours to repeat
         self._reader = Reader(recorder=recorder, start=self._segment_of(before.stored), load=self._load)
@@ -114,6 +116,11 @@ class LiveQueue:
         if position > self._said.stored:
             self._say(self._said._replace(stored=position))
 
+    def set_aside(self, records: Sequence[Record]) -> bool:
+        """As `RecorderQueue.set_aside`."""
+        self._refused.put(records)
+        return True
+
     def give_up(self, reason: str) -> None:
         """Whoever waits for room there is told; the first reason stays."""
         if self._said.note.given_up is None:
@@ -163,6 +170,7 @@ class LiveQueue:
         """Another may drain it. Twice is once."""
         self._reader.close()
         self._progress.close()
+        self._refused.release()
         self._drain.release()
 
     # --- inside -----------------------------------------------------------------------------------------------

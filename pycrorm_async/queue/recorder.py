@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from pycrorm_async.queue.locks import FileLock, in_forked_child, is_locked
 from pycrorm_async.queue.outside import Outside
 from pycrorm_async.queue.progress import Drained
 from pycrorm_async.queue.reader import Batch, Cursor, Reader, map_segment
+from pycrorm_async.queue.refused import RefusedRecords
 from pycrorm_async.queue.segment import header_bytes, segment_path
 from pycrorm_async.queue.syncer import Syncer
 
@@ -78,6 +80,7 @@ class RecorderQueue:
             )
             self._disk_was_full = self._appender.prepare()
             self._outside = Outside(folder) if offered else None
+        self._refused = RefusedRecords(folder)
         self._reader = Reader(recorder=recorder, start=Cursor(1, header_bytes(0), 0), load=self._load)
         in_forked_child(self._forked)
         self._syncer.start()
@@ -234,6 +237,14 @@ class RecorderQueue:
         if self._trimmable():
             self._syncer.hurry()
 
+    def set_aside(self, records: Sequence[Record]) -> bool:
+        """These are refused, and kept in a folder of their episode's own when it returns (`refused.py`): True.
+
+        From one thread at a time; blocks. Raises `FilesError` or `SpoolDamaged` when they can only stay here.
+        """
+        self._refused.put(records)
+        return True
+
     def give_up(self, reason: str) -> None:
         """Nothing more will be acknowledged: from any thread. The first reason stays.
 
@@ -378,6 +389,7 @@ class RecorderQueue:
         finally:
             if self._outside is not None:
                 self._outside.close()
+            self._refused.release()
             for lock in (self._drain, self._alive):
                 if lock is not None:
                     lock.release()

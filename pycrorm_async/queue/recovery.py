@@ -6,17 +6,19 @@ never written: recovering again, also after being killed in between, gives the s
 
 from __future__ import annotations
 
-import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from pycrorm_async.events.envelope import LOST, Record
-from pycrorm_async.events.ids import EpisodeId, parse_episode_id
-from pycrorm_async.queue.folder import ALIVE, DRAIN, TAIL, available, remove_folder, write_safely
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by, remove_folder
 from pycrorm_async.queue.frame import Buffer
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.reader import Reader
+from pycrorm_async.queue.refused import RefusedRecords
 from pycrorm_async.queue.scan import Kept, scan
-from pycrorm_async.queue.segment import CLOSES, segment_path, sync_folder
+from pycrorm_async.queue.sealing import make_safe, seal, tails
+from pycrorm_async.queue.segment import CLOSES, segment_path
 
 __all__ = ["RecoveredQueue", "open_dead"]
 
@@ -24,11 +26,16 @@ __all__ = ["RecoveredQueue", "open_dead"]
 def open_dead(folder: Path) -> RecoveredQueue | None:
     """The folder as a source, or None if its recorder lives, somebody drains it, or it is gone.
 
+    None also for what was refused of a recorder whose own folder is still there: whoever drains that may put more in.
+
     Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte, some 300,000
     records a second, and has the disk keep what is given away. Raises `SpoolDamaged`, `SpoolForeign` and
     `SpoolUnavailable`, holding nothing.
     """
     with available(folder):
+        own = folder.with_name(folder.name.partition(".")[0])
+        if own != folder and ((own / ALIVE).exists() or own.with_name(f"{own.name}{MENDED}").exists()):
+            return None
         alive = FileLock.take(folder / ALIVE, create=False)
         if alive is None:
             return None
@@ -38,9 +45,9 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
                 alive.release()
                 return None
             try:
-                recorder = parse_episode_id(folder.name)
+                recorder = held_by(folder.name).recorder
                 kept = scan(folder, recorder)
-                _make_safe(folder, kept)
+                make_safe(folder, kept)
                 return RecoveredQueue(folder, recorder, kept, (drain, alive))
             except BaseException:
                 drain.release()
@@ -62,6 +69,7 @@ class RecoveredQueue:
         self.lost = _ends(kept)
         self._kept = kept
         self._locks = locks
+        self._refused = RefusedRecords(folder)
         self._reader = Reader(recorder=recorder, start=kept.start, load=self._load)
         self._given = kept.start.position
         self.stored = kept.start.position
@@ -72,10 +80,15 @@ class RecoveredQueue:
         return self._kept.cut.position + len(self.lost)
 
     @property
+    def holds_refused(self) -> bool:
+        """Whether all of it was refused before."""
+        return held_by(self.name).episode is not None
+
+    @property
     def tail_bytes(self) -> int:
         """How much of the files lies behind the cut and is not zero: written, never synced, and torn."""
         with available(self.folder):
-            return sum(len(tail) for _, tail in self._tails())
+            return sum(len(tail) for _, tail in tails(self.folder, self._kept))
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
         """The next records in order, at least one, at most the limits; empty when all are given."""
@@ -107,6 +120,13 @@ class RecoveredQueue:
                     break
                 segment_path(self.folder, number).unlink(missing_ok=True)
 
+    def set_aside(self, records: Sequence[Record]) -> bool:
+        """As `RecorderQueue.set_aside`; what was refused before stays where it is."""
+        if self.holds_refused:
+            return False
+        self._refused.put(records)
+        return True
+
     def give_up(self, reason: str) -> None:
         """Nobody puts into it, so nobody waits for room."""
 
@@ -116,18 +136,7 @@ class RecoveredQueue:
         Twice is once, and killed at any point it can be done again. Raises `SpoolUnavailable`.
         """
         with available(self.folder):
-            for path, tail in self._tails():
-                if tail:
-                    write_safely(path.with_name(f"{path.name}{TAIL}"), tail)
-            for number in self._kept.numbers:
-                path = segment_path(self.folder, number)
-                if number > self._kept.cut.number:
-                    path.unlink(missing_ok=True)
-                elif number == self._kept.cut.number:
-                    with path.open("rb+") as file:
-                        file.truncate(self._kept.cut.offset)
-                        os.fsync(file.fileno())
-            sync_folder(self.folder)
+            seal(self.folder, self._kept)
 
     def remove(self) -> None:
         """Deletes the folder, all of which is stored, and gives up the locks. Raises `SpoolUnavailable`."""
@@ -142,37 +151,13 @@ class RecoveredQueue:
     def release(self) -> None:
         """Gives up the locks; what was not acknowledged is given again by whoever recovers next. Twice is once."""
         self._reader.close()
+        self._refused.release()
         for lock in self._locks:
             lock.release()
-
-    def _tails(self) -> list[tuple[Path, bytes]]:
-        """For each file that reaches behind the cut what is there, without the zeros at its end."""
-        cut = self._kept.cut
-        return [
-            (path, path.read_bytes()[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
-            for number in self._kept.numbers
-            if number >= cut.number and (path := segment_path(self.folder, number)).exists()
-        ]
 
     def _load(self, number: int) -> tuple[Path, Buffer]:
         path = segment_path(self.folder, number)
         return path, path.read_bytes()
-
-
-def _make_safe(folder: Path, kept: Kept) -> None:
-    """What is kept is on the disk, the lowest number first. Raises `OSError`.
-
-    A killed recorder's last records are there for all who read, and yet may be nowhere but in the page cache. If they
-    were given away like this and lost in a power cut, the log would hold events that the next computed ends replace.
-    """
-    for number in kept.numbers:
-        if number <= kept.cut.number:
-            descriptor = os.open(segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
-            try:
-                os.fdatasync(descriptor)
-            finally:
-                os.close(descriptor)
-    sync_folder(folder)
 
 
 def _ends(kept: Kept) -> tuple[Record, ...]:

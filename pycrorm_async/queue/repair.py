@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pycrorm_async.errors import InternalError, SpoolUnavailable
-from pycrorm_async.events.ids import episode_text, parse_episode_id
-from pycrorm_async.queue.folder import ALIVE, DRAIN, available
-from pycrorm_async.queue.inspection import MENDED, SET_ASIDE, Damage
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by
+from pycrorm_async.queue.inspection import SET_ASIDE, Damage
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.rescue import Range, Rescue, ranges
 from pycrorm_async.queue.scan import Survey, scan, survey
@@ -83,7 +83,7 @@ def repair_folder(folder: Path) -> RepairReport | None:
     with available(folder):
         locks = _locked(folder)
         try:
-            found = survey(folder, parse_episode_id(folder.name))
+            found = survey(folder, held_by(folder.name).recorder)
             if found.damage is None:
                 return None
             return _replace(folder, found)
@@ -162,7 +162,7 @@ def _filled(mended: Path, folder: Path, found: Survey) -> Rescue:
     (mended / ALIVE).touch()
     rescue = Rescue(folder, mended, found)
     rescue.run()
-    written = scan(mended, parse_episode_id(folder.name)).cut.position
+    written = scan(mended, held_by(folder.name).recorder).cut.position
     if written != rescue.position:
         raise InternalError(f"{mended} holds records up to {written} and not up to {rescue.position}")
     sync_folder(mended)

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeAlias
 
-from pycrorm_async.events.ids import EpisodeId, parse_episode_id
-from pycrorm_async.queue.folder import write_safely
-from pycrorm_async.queue.frame import CHECKSUM, CHECKSUM_START, COMMIT, EVENT, Frame, chain, encode, encode_commit
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.folder import held_by, write_safely
+from pycrorm_async.queue.frame import COMMIT, EVENT, Frame, encode_span
 from pycrorm_async.queue.scan import Kept, Survey, whole_frames
 from pycrorm_async.queue.segment import (
     CLOSES,
@@ -42,7 +42,7 @@ class Rescue:
     def __init__(self, damaged: Path, mended: Path, found: Survey) -> None:
         self._damaged = damaged
         self._mended = mended
-        self._recorder = parse_episode_id(damaged.name)
+        self._recorder = held_by(damaged.name).recorder
         self._found = found
         self.headless = _is_headless(found.kept)
         self._open = dict(found.kept.open)
@@ -138,52 +138,21 @@ class Rescue:
             except OSError:  # a file system without links
                 write_safely(target, source.read_bytes())
             return
-        content = source.read_bytes()[: cut.offset]
-        write_safely(target, content + self._commit(number, self.position, list(self._found.unsaid), (0, 0)))
+        content, unsaid = source.read_bytes()[: cut.offset], self._found.unsaid
+        if unsaid:
+            content += encode_span([], after=self.position, salt=salt_of(self._recorder, number), unsaid=unsaid)[1]
+        write_safely(target, content)
 
     def _write(self, before: dict[EpisodeId, Last], records: list[Frame]) -> None:
         """The next segment; none for no records."""
         if not records:
             return
         self._number += 1
-        salt = salt_of(self._recorder, self._number)
-        encoded = [encode_header(SegmentHeader(self._recorder, self._number, self.position + 1, before))]
-        checksums: list[int] = []
-        for frame in records:
-            self.position += 1
-            again = encode(
-                kind=frame.kind,
-                version=frame.version,
-                position=self.position,
-                sequence=frame.sequence,
-                wall_ns=frame.wall_ns,
-                monotonic_ns=frame.monotonic_ns,
-                episode=frame.episode,
-                type_name=frame.type,
-                payload=frame.payload,
-                salt=salt,
-            )
-            checksums += CHECKSUM.unpack_from(again, CHECKSUM_START)
-            encoded.append(again)
+        header = encode_header(SegmentHeader(self._recorder, self._number, self.position + 1, before))
+        span = encode_span(records, after=self.position, salt=salt_of(self._recorder, self._number))
+        self.position += len(records)
         self.saved += len(records)
-        times = records[-1].wall_ns, records[-1].monotonic_ns
-        encoded.append(self._commit(self._number, self.position, checksums, times))
-        write_safely(segment_path(self._mended, self._number), b"".join(encoded))
-
-    def _commit(self, number: int, position: int, checksums: list[int], times: tuple[int, int]) -> bytes:
-        if not checksums:
-            return b""
-        span = 0
-        for each in checksums:
-            span = chain(each, span)
-        return encode_commit(
-            position=position,
-            count=len(checksums),
-            checksum=span,
-            wall_ns=times[0],
-            monotonic_ns=times[1],
-            salt=salt_of(self._recorder, number),
-        )
+        write_safely(segment_path(self._mended, self._number), b"".join((header, *span)))
 
 
 def _is_headless(kept: Kept) -> bool:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
-from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.queue.folder import ALIVE, available, write_safely
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue.folder import ALIVE, available, held_by, write_safely
 from pycrorm_async.queue.locks import FileLock, is_locked, one_at_a_time
 
 __all__ = ["Spool", "RecorderFolder"]
@@ -17,7 +17,10 @@ WRITER: Final = "writer"
 
 
 class RecorderFolder(NamedTuple):
-    """One recorder's folder. `alive`: its process lived when this was looked up; a dead one never lives again."""
+    """One recorder's folder, or what was refused of it. `alive`: its process lived when this was looked up.
+
+    A dead recorder never lives again; a folder of refused records is alive while somebody may put more into it.
+    """
 
     path: Path
     alive: bool
@@ -25,6 +28,12 @@ class RecorderFolder(NamedTuple):
     @property
     def name(self) -> str:
         return self.path.name
+
+    @property
+    def refused(self) -> str | None:
+        """Id of the episode whose refused records are kept here; None for a recorder's own folder."""
+        episode = held_by(self.name).episode
+        return None if episode is None else episode_text(episode)
 
 
 class Spool:
@@ -38,7 +47,7 @@ class Spool:
         self.path = path
 
     def recorders(self) -> list[RecorderFolder]:
-        """All recorders, oldest first. Raises `SpoolUnavailable`."""
+        """All recorders, oldest first, each before what was refused of it. Raises `SpoolUnavailable`."""
         with available(self.path):
             return [
                 RecorderFolder(path, alive=is_locked(path / ALIVE)) for path in self._entries() if _is_recorder(path)
@@ -106,7 +115,7 @@ class Spool:
 
 def _is_recorder(path: Path) -> bool:
     try:
-        parse_episode_id(path.name)
+        held_by(path.name)
     except ValueError:
         return False
     return (path / ALIVE).exists()

@@ -7,12 +7,13 @@ None waits for another's database: what is away is asked again with pauses, and 
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
 from pycrorm_async.writer.backoff import PATIENT, Backoff
 from pycrorm_async.writer.drain import to_the_end
 from pycrorm_async.writer.ports import Found, Held, Look, Shown
@@ -25,7 +26,7 @@ LEAVE_S: Final = 10.0
 """How long leaving may take. What is not stored by then stays in its folder, and the next daemon finds it."""
 _LOOK_S: Final = 0.5
 _REST = Backoff(first_s=1.0, longest_s=60.0)
-"""Before a folder is tried again that could not be drained to its end: it is damaged, or an episode is refused."""
+"""Before a folder is tried again that could not be drained to its end: it is damaged, or nothing can be set aside."""
 
 
 class Moved(NamedTuple):
@@ -63,9 +64,9 @@ class Daemon:
         """Until `leave` is set. Then takes hold of nothing new, drains what is synced at that moment, folds, returns.
 
         Returns after `LEAVE_S` in any case, when the database lets it; nothing is lost by that. Raises `SpoolForeign`
-        when the spool has become another database's.
+        when the spool has become another database's, and `DatabaseForeign` when the database has become another.
         """
-        foreign: SpoolForeign | None = None
+        foreign: SpoolForeign | DatabaseForeign | None = None
         async with asyncio.TaskGroup() as tasks:
             folding = tasks.create_task(self._fold_as_it_comes(), name="pycrorm fold")
             served: set[asyncio.Task[None]] = set()
@@ -75,16 +76,17 @@ class Daemon:
                         task = tasks.create_task(self._serve(held), name=f"pycrorm drain {held.name}")
                         served.add(task)
                         task.add_done_callback(served.discard)
-                except SpoolForeign as error:
+                except (SpoolForeign, DatabaseForeign) as error:
                     foreign = error
                 await _wait(leave, _LOOK_S)
             for each in self._serving.values():
                 each.held.finish()
             if served:
-                _, late = await asyncio.wait(served, timeout=LEAVE_S)
+                patience_s = 0.0 if isinstance(foreign, DatabaseForeign) else LEAVE_S
+                _, late = await asyncio.wait(served, timeout=patience_s)
                 for task in late:
                     task.cancel()
-                if late:
+                if late and foreign is None:
                     self._say(f"not finished after {LEAVE_S:g} s: what is left is safe in the spool")
             folding.cancel()
         if foreign is not None:
@@ -108,12 +110,13 @@ class Daemon:
             self._rest(name, str(fault))
         return list(found.held)
 
-    def _rest(self, name: str, reason: str) -> None:
+    def _rest(self, name: str, reason: str, *, again: bool = True) -> None:
         attempt = self._rests.get(name, (0, 0.0))[0] + 1
-        pause_s = _REST.pause_s(attempt, self._randomness())
+        pause_s = _REST.pause_s(attempt, self._randomness()) if again else math.inf
         assert pause_s is not None, "it is tried for ever"
         self._rests[name] = attempt, self._now_s() + pause_s
-        self._say_news(f"recorder {name}: {reason}; tried again now and then", f"{name} rests")
+        when = "now and then" if again else "by the next writer"
+        self._say_news(f"recorder {name}: {reason}; tried again {when}", f"{name} rests")
 
     # --- one recorder -----------------------------------------------------------------------------------------
 
@@ -124,7 +127,7 @@ class Daemon:
             self._destination,
             settings=self._settings,
             on_append=self._news.set,
-            on_give_up=lambda line: self._say_news(line, name),
+            say=lambda line: self._say_news(line, name),
         )
         self._serving[name] = serving
         if name not in self._rests:
@@ -140,9 +143,10 @@ class Daemon:
             await to_the_end(self._let_go(serving, fault))
 
     async def _let_go(self, serving: Serving, fault: str | None) -> None:
-        name, state = serving.name, serving.state
+        name, state, again = serving.name, serving.state, True
         try:
             left = await asyncio.to_thread(serving.held.let_go)
+            again = left.again
             if fault is None and not left.whole:
                 fault = next(
                     (f"episode {episode} {why}" for episode, why in state.refused.items()), "not all is stored"
@@ -159,7 +163,7 @@ class Daemon:
             self._said.pop(name, None)
             self._said.pop(f"{name} rests", None)
         else:
-            self._rest(name, fault)
+            self._rest(name, fault, again=again)
 
     # --- the tables -------------------------------------------------------------------------------------------
 

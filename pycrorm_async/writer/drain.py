@@ -1,10 +1,10 @@
 """Moves records from one source into the log: read, append, acknowledge, in that order only.
 
 Killed or cancelled anywhere in between, the worst that follows is that a batch is appended a second time, which
-stores it once. While the database is away the drain waits and the source keeps its records. Once an episode's record
-is refused nothing from that record on is ever acknowledged, whatever happens to later ones: a source forgets by
-position only, so this is how the refused records are kept. They are offered again by the source of the next process.
-The source is told at once, for it can only fill up from then on; so it is when the drain ends with an error.
+stores it once. While the database is away the drain waits and the source keeps its records. What is refused is set
+aside by the source before it is acknowledged, and is offered again by the next process. If that cannot be done, nothing
+from the first such record on is ever acknowledged: a source forgets by position only, so this is how they are kept. The
+source is told at once, for it can only fill up from then on; so it is when the drain ends with an error.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.errors import DamageError, DatabaseUnavailable, FilesError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.writer.asking import answer_of
@@ -66,7 +66,7 @@ class Drain:
         settings: Settings,
         backoff: Backoff = PATIENT,
         on_append: Callable[[], None] = lambda: None,
-        on_give_up: Callable[[str], None] = _log.error,
+        say: Callable[[str], None] = _log.error,
         randomness: Callable[[], float] = random.random,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
@@ -75,18 +75,17 @@ class Drain:
         self._settings = settings
         self._backoff = backoff
         self._on_append = on_append
-        self._on_give_up = on_give_up
+        self._say = say
         self._randomness = randomness
         self._sleep = sleep
         self._records = self._batches = self._retries = 0
         self._away: str | None = None
         self._last_error: str | None = None
         self._appended = self._acknowledged = 0
-        self._ceiling: int | None = None  # the last position that may be acknowledged, once something was refused
+        self._ceiling: int | None = None  # no position above it is acknowledged any more
         self._refused: dict[str, str] = {}
         self._moved = asyncio.Condition()
         self._over = False
-        self._refusal_told = False
 
     async def run(self) -> None:
         """Drains until the source is closed and empty.
@@ -101,13 +100,10 @@ class Drain:
                 age_s_max=settings.batch_age_ms / 1000,
             ):
                 refusals = await self._append(batch)
-                await self._acknowledge(self._safe_position(batch, refusals))
+                await self._acknowledge(await self._safe_position(batch, refusals))
                 self._batches += 1
                 self._appended = batch[-1].position
                 self._on_append()
-                if self._refused and not self._refusal_told:
-                    self._refusal_told = True
-                    self._give_up(_refusal(self._refused))
                 await self._tell()
         except Exception as error:
             self._give_up(f"the writer stopped: {error}")
@@ -162,14 +158,29 @@ class Drain:
         self._retries += 1
         self._away = self._last_error = str(error)
 
-    def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
+    async def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
         """How far the source may forget now."""
         self._records += sum(1 for record in batch if record.episode not in refusals) if refusals else len(batch)
-        for episode, reason in refusals.items():
-            self._refused.setdefault(episode_text(episode), reason)
-        if refusals and self._ceiling is None:
-            self._ceiling = next(each.position for each in batch if each.episode in refusals) - 1
+        refused = {episode_text(episode): reason for episode, reason in refusals.items()}
+        if refused and self._ceiling is None:
+            await self._set_aside([each for each in batch if each.episode in refusals], refused)
+        self._refused = {**refused, **self._refused}
         return batch[-1].position if self._ceiling is None else self._ceiling
+
+    async def _set_aside(self, records: Sequence[Record], refused: Mapping[str, str]) -> None:
+        try:
+            aside = await to_the_end(asyncio.to_thread(self._source.set_aside, records))
+        except (FilesError, DamageError) as error:
+            self._ceiling = records[0].position - 1
+            episode, reason = next(iter(refused.items()))
+            self._give_up(f"episode {episode} was refused: {reason}; its events cannot be set aside: {error}")
+            return
+        if not aside:
+            self._ceiling = records[0].position - 1
+        for episode, reason in refused.items():
+            if episode not in self._refused:
+                kept = f"episode {episode} was refused: {reason}; its events are kept in the spool"
+                self._say(f"recorder {self._source.name}: {kept}")
 
     async def _acknowledge(self, position: int) -> None:
         if position > self._acknowledged:
@@ -177,17 +188,12 @@ class Drain:
             self._acknowledged = position
 
     def _give_up(self, reason: str) -> None:
-        self._on_give_up(f"nothing more is acknowledged to recorder {self._source.name}: {reason}")
+        self._say(f"nothing more is acknowledged to recorder {self._source.name}: {reason}")
         self._source.give_up(reason)
 
     async def _tell(self) -> None:
         async with self._moved:
             self._moved.notify_all()
-
-
-def _refusal(refused: Mapping[str, str]) -> str:
-    episode, reason = next(iter(refused.items()))
-    return f"episode {episode} was refused: {reason}"
 
 
 async def to_the_end(work: Coroutine[Any, Any, _T]) -> _T:

@@ -34,6 +34,15 @@ class Source(Protocol):
         """Everything up to this position is stored for good: its segments may be deleted."""
         ...
 
+    def set_aside(self, records: Sequence[Record]) -> bool:
+        """Keeps records that the log refused elsewhere, so that the source may forget them like stored ones: durable
+        when it returns. What was set aside before is so once. Blocks.
+
+        False if they are to stay where they are, because the source is made of such records. Raises `FilesError` or
+        `DamageError` if it cannot be done.
+        """
+        ...
+
     def give_up(self, reason: str) -> None:
         """From now on nothing more will be acknowledged: whoever waits for room is told why. The first reason stays."""
         ...
@@ -89,10 +98,14 @@ class Held(Source, Protocol):
 
 
 class LetGo(NamedTuple):
-    """What became of a folder, in words; `whole` unless something is left in it that could not be stored."""
+    """What became of a folder, in words; `whole` unless something is left in it that could not be stored.
+
+    `again`: whether that is to be tried again in this process.
+    """
 
     what: str
     whole: bool
+    again: bool = True
 
 
 class Found(NamedTuple):

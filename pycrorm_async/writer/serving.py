@@ -31,10 +31,10 @@ class Serving(Source):
         *,
         settings: Settings,
         on_append: Callable[[], None],
-        on_give_up: Callable[[str], None],
+        say: Callable[[str], None],
     ) -> None:
         self.held = held
-        self._drain = Drain(self, destination, settings=settings, on_append=on_append, on_give_up=on_give_up)
+        self._drain = Drain(self, destination, settings=settings, on_append=on_append, say=say)
         self._unshown: deque[tuple[int, dict[str, int]]] = (
             deque()
         )  # position, and each episode's last sequence up to it
@@ -65,7 +65,7 @@ class Serving(Source):
             behind: by episode, how far the tables show it, of those that do not show all yet.
             stopped: by episode, why it is refused or parked.
         """
-        shown = 0
+        shown, stopped = 0, {**self.state.refused, **stopped}
         while self._unshown and self._unshown[0][0] <= appended:
             position, lasts = self._unshown[0]
             if any(behind.get(episode, last) < last for episode, last in lasts.items()):
@@ -92,6 +92,9 @@ class Serving(Source):
 
     async def acknowledge(self, position: int) -> None:
         await self.held.acknowledge(position)
+
+    def set_aside(self, records: Sequence[Record]) -> bool:
+        return self.held.set_aside(records)
 
     def give_up(self, reason: str) -> None:
         self.held.give_up(reason)

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import parse_episode_id
+from pycrorm_async.queue.refused import RefusedRecords
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.queue.writing import overwrite
 
@@ -146,3 +149,30 @@ def test_what_is_no_spool_is_one_line(tmp_path: Path, verb: str) -> None:
         assert reason in one_line_of(done)
     nothing = pycrorm("spool", verb, cwd=tmp_path)
     assert nothing.returncode == 2
+
+
+def test_what_the_database_refused_is_told_with_its_place_by_status_and_inspect(tmp_path: Path) -> None:
+    folder = tmp_path
+    assert pycrorm("writer", "--once", cwd=folder).returncode == 0
+    spool = folder / "pycrorm.db.spool"
+    recorder, identity = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
+    refused = RefusedRecords(spool / recorder)
+    refused.put([Record(1, parse_episode_id(identity), 5, "NodeStarted", 1, 7, 8, b"{}")])
+    refused.release()
+    place = spool / f"{recorder}.{identity}.refused"
+    document = answer("status", cwd=folder, code=1)
+    assert document["refused"] == [
+        {"episode": identity, "folder": str(place), "bytes": (place / "00000001.segment").stat().st_size}
+    ]
+    assert document["recorders"] == []
+    told = pycrorm("status", cwd=folder)
+    assert (told.returncode, one_line_of(told)) == (
+        1,
+        f"pycrorm: what the database refused of episode {identity} is kept in {place}",
+    )
+    [inspected] = answer("spool", "inspect", spool, cwd=folder)["recorders"]
+    assert (inspected["name"], inspected["types"]) == (place.name, {"NodeStarted": 1})
+    assert pycrorm("episodes", cwd=folder).stderr == ""  # no news each time
+    once = answer("writer", "--once", cwd=folder, code=1)
+    assert list(once["stopped"].values()) == ["events 1 to 4 did not arrive before event 5"]
+    assert place.exists()

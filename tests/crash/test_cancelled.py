@@ -234,7 +234,7 @@ async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, 
                 if "has ended" in line:
                     leave.set()
 
-            look = _Folders(Spool(spool), destination.log_id)
+            look = _Folders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
 
             def look_and_note(but: Collection[str]) -> Found:
                 found = look(but)

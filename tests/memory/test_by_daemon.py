@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import re
+import shutil
 import sqlite3
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
@@ -16,6 +17,7 @@ from pycrorm_async import Memory, Reading, Settings, UserView, recover
 from pycrorm_async.daemon import serve
 from pycrorm_async.errors import (
     CallerError,
+    DatabaseForeign,
     DatabaseUnavailable,
     EpisodeParked,
     FlushTimeout,
@@ -186,24 +188,92 @@ async def test_an_episode_that_is_parked_is_told_by_flush_once_and_the_others_go
         assert await texts(memory) == ["a", "c"]
 
 
-async def test_an_episode_that_is_refused_is_told_and_its_records_are_kept(
+async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later_daemon_when_it_can_be(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
-    async with daemon() as started:
-        async with memory_at(database_url, spool) as memory:
-            async with memory.episode(description="refused") as refused:
+    async with memory_at(database_url, spool) as memory:
+        async with memory.episode(description="refused") as refused:
+            async with daemon():
                 await NoteActionPerformable("a").perform()
                 await memory.flush()
+                [[head]] = ask(database_url, "SELECT head FROM episode")
                 ask_to_change(database_url, "UPDATE episode SET folded = 1, head = 1")  # as after an older backup
                 await NoteActionPerformable("b").perform()
                 with pytest.raises(EpisodeParked, match=f"{refused}: events 2 to .* did not arrive before"):
                     await memory.flush()
-            async with memory.episode(description="other"):
+            async with daemon() as started:  # which goes on where the one before was
                 await NoteActionPerformable("c").perform()
+                await memory.flush()
+                await started.says(f"episode {refused} was refused: events 2 to .*; its events are kept in the spool")
+        async with daemon() as started:
+            async with memory.episode(description="other"):
+                await NoteActionPerformable("d").perform()
             await memory.flush()
-        await started.says("tried again now and then")
-    [kept] = Spool(spool).recorders()
-    assert not kept.alive
+            status = memory.status
+            assert status.written == status.stored == status.folded
+            await memory.__aexit__(None, None, None)
+            [kept] = Spool(spool).recorders()
+            assert kept.refused == str(refused)
+            await started.says(f"recorder {kept.name}: episode {refused} .*; tried again by the next writer")
+            segments = {path: path.read_bytes() for path in kept.path.glob("*.segment")}
+    assert (len(segments), kept.alive) == (3, False)
+    report = await recover(database_url, spool=spool)
+    assert list(report.drained.stopped) == [str(refused)]
+    assert {path: path.read_bytes() for path in kept.path.glob("*.segment")} == segments
+    ask_to_change(database_url, f"UPDATE episode SET folded = {head}, head = {head} WHERE number = 1")
+    async with daemon() as started:
+        await started.says(f"recorder {kept.name} is recovered; ")
+    assert Spool(spool).recorders() == []
+    async with Reading.open(database_url) as reading:
+        assert sorted(await texts(reading)) == ["a", "b", "c", "d"]
+
+
+async def test_one_round_tells_a_living_recorder_which_of_its_own_episodes_are_refused_or_parked(
+    database_url: str, spool: Path
+) -> None:
+    settings = replace(QUICK, connect_timeout_s=60)
+    async with Memory.open(database_url, spool=spool, settings=settings) as memory:
+        async with memory.episode(description="of another"):
+            await NoteActionPerformable("a").perform()
+        await memory.flush()
+    ask_to_change(database_url, "UPDATE episode SET parked = 'long ago'")
+    async with memory_at(database_url, spool) as memory, memory.episode(description="parked") as parked:
+        await NoteActionPerformable("b").perform()
+        await memory.synced()
+        await recover(database_url, spool=spool)
+        await memory.flush()
+        ask_to_change(database_url, "UPDATE episode SET parked = 'by hand' WHERE number = 2")
+        await NoteActionPerformable("c").perform()
+        await memory.synced()
+        await recover(database_url, spool=spool)
+        with pytest.raises(EpisodeParked) as told:
+            await memory.flush()
+        assert told.value.reasons == {str(parked): "by hand"}
+
+
+async def test_a_daemon_whose_file_is_replaced_by_another_ends_and_one_whose_file_is_only_gone_waits(
+    tmp_path: Path, spool: Path
+) -> None:
+    file = tmp_path / "memory.db"
+    url = f"sqlite:///{file}"
+    started = Daemon(url, spool)
+    async with memory_at(url, spool, replace(QUICK, flush_timeout_s=0.5)):
+        await NoteActionPerformable("a").perform()
+        await started.says("appeared")
+        file.rename(tmp_path / "away.db")
+        await NoteActionPerformable("b").perform()
+        await started.says("the database is away: .*removed or replaced")
+        (tmp_path / "away.db").rename(file)
+        await started.says("the database is back")
+        shutil.copy(file, tmp_path / "copy.db")
+        (tmp_path / "copy.db").replace(file)
+        await NoteActionPerformable("c").perform()
+        async with asyncio.timeout(60):
+            with pytest.raises(DatabaseForeign, match=r"memory\.db was replaced while it was open: start"):
+                await started.task
+    assert not any("Traceback" in line for line in started.said)
+    report = await recover(url, spool=spool)
+    assert report.failed == {}
 
 
 async def test_a_second_daemon_on_the_same_spool_is_refused_in_one_line(

@@ -20,10 +20,16 @@ __all__ = ["KeptSource", "CountingFold", "Passing", "LosesReplies", "opener"]
 
 
 class KeptSource(Source):
-    """Keeps records until they are acknowledged; filled from one thread, drained in the loop of another."""
+    """Keeps records until they are acknowledged; filled from one thread, drained in the loop of another.
 
-    def __init__(self, records: Iterable[Record] = (), *, closed: bool = False, name: str = "robot") -> None:
+    `aside` is what was set aside, or None where what is refused is to stay.
+    """
+
+    def __init__(
+        self, records: Iterable[Record] = (), *, closed: bool = False, name: str = "robot", stays: bool = False
+    ) -> None:
         self._name = name
+        self.aside: list[Record] | None = None if stays else []
         self._kept = list(records)
         self._given = 0  # how many of these were given out
         self._closed = closed
@@ -70,13 +76,19 @@ class KeptSource(Source):
             self._given -= len(forgotten)
             self.acknowledgements.append(position)
 
+    def set_aside(self, records: Sequence[Record]) -> bool:
+        if self.aside is None:
+            return False
+        self.aside += records
+        return True
+
     def give_up(self, reason: str) -> None:
         self.given_up.append(reason)
 
     def reopened(self) -> KeptSource:
         """What the next process finds: everything that was not acknowledged, closed."""
         with self._lock:
-            return KeptSource(self._kept, closed=True, name=self._name)
+            return KeptSource(self._kept, closed=True, name=self._name, stays=self.aside is None)
 
     @property
     def kept(self) -> list[int]:

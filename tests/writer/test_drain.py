@@ -5,11 +5,12 @@ import os
 import random
 import sqlite3
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import pytest
 
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DatabaseUnavailable, LogDamaged
+from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.log import EventLog
@@ -134,16 +135,48 @@ async def test_a_state_that_was_taken_stays_as_it_was(log: EventLog) -> None:
     assert before.refused == {}
 
 
-async def test_nothing_is_acknowledged_from_the_first_refused_record_on(log: EventLog) -> None:
+async def test_refused_records_are_set_aside_before_they_are_acknowledged_and_the_others_go_on(
+    log: EventLog, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Watching(KeptSource):
+        async def acknowledge(self, position: int) -> None:
+            assert self.aside is not None
+            seen.append((position, [each.sequence for each in self.aside]))
+            await super().acknowledge(position)
+
+    seen: list[tuple[int, list[int]]] = []
+    source = Watching(
+        [
+            *run_of(episode(1), 1, 4, position=1),
+            *run_of(episode(1), 6, 9, position=5),
+            *run_of(episode(2), 1, 10, position=9),
+            *run_of(episode(1), 10, 11, position=19),
+        ],
+        closed=True,
+    )
+    drain = Drain(source, CountingFold(log), settings=TENS)
+    await drain.run()
+    assert seen == [(10, [1, 2, 3, 4, 6, 7, 8, 9]), (20, [1, 2, 3, 4, 6, 7, 8, 9, 10, 11])]
+    assert (source.kept, source.given_up, drain.state.acknowledged, drain.state.records) == ([], [], 20, 10)
+    reason = "event 5 did not arrive before event 6"
+    assert drain.state.refused == {name(1): reason}
+    assert ask(log.address.path, STORED) == [(1, 4, 1, 4), (2, 10, 1, 10)]
+    assert [(each.levelname, each.getMessage()) for each in caplog.records] == [
+        ("ERROR", f"recorder robot: episode {name(1)} was refused: {reason}; its events are kept in the spool")
+    ]
+
+
+async def test_nothing_is_acknowledged_from_the_first_refused_record_on_that_is_to_stay(log: EventLog) -> None:
     broken = [*run_of(episode(1), 1, 4, position=11), *run_of(episode(1), 6, 9, position=15)]
     records = [
         *run_of(episode(2), 1, 10, position=1),
         *broken,  # positions 11 to 18, in the second batch
         *run_of(episode(2), 11, 30, position=19),
     ]
-    source = KeptSource(records, closed=True)
+    source = KeptSource(records, closed=True, stays=True)
     drain = Drain(source, CountingFold(log), settings=TENS)
     await drain.run()
+    assert source.given_up == []
     reason = "event 5 did not arrive before event 6"
     assert drain.state.refused == {name(1): reason}
     assert ask(log.address.path, STORED) == [(1, 30, 1, 30), (2, 4, 1, 4)]
@@ -164,18 +197,26 @@ async def test_nothing_is_acknowledged_from_the_first_refused_record_on(log: Eve
     assert await log.stopped() == []
 
 
-async def test_a_source_is_told_once_and_at_once_that_it_cannot_be_emptied(
+async def test_a_source_that_cannot_set_aside_is_told_once_and_at_once_that_it_cannot_be_emptied(
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source = KeptSource([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9, position=5)])
+    class Full(KeptSource):
+        def set_aside(self, records: Sequence[Record]) -> bool:
+            raise SpoolUnavailable(Path("/spool/1.refused"), "No space left on device")
+
+    source = Full([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9, position=5)])
     running = asyncio.create_task(Drain(source, CountingFold(log), settings=TENS).run())
-    refused = f"episode {name(1)} was refused: event 5 did not arrive before event 6"
+    refused = (
+        f"episode {name(1)} was refused: event 5 did not arrive before event 6;"
+        " its events cannot be set aside: spool /spool/1.refused: No space left on device"
+    )
     async with asyncio.timeout(60):
         while not source.given_up:  # noqa: ASYNC110 - what is waited for is not ours to signal
             await asyncio.sleep(0.001)
     source.put([*run_of(episode(1), 11, 12, position=9), *run_of(episode(2), 1, 20, position=11)])
     source.close()
     await running
+    assert source.kept == list(range(1, 31))
     assert source.given_up == [refused]
     assert [(each.levelname, each.getMessage()) for each in caplog.records] == [
         ("ERROR", f"nothing more is acknowledged to recorder robot: {refused}")

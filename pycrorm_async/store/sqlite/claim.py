@@ -8,13 +8,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from pycrorm_async.errors import DatabaseUnavailable
+
 __all__ = ["claim"]
 
 
 @contextmanager
 def claim(path: Path) -> Iterator[bool]:
-    """Whether this file could be locked; it is until the context is left or the process dies."""
-    file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    """Whether this file could be locked; it is until the context is left or the process dies.
+
+    Raises `DatabaseUnavailable` where no file can be made.
+    """
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        raise DatabaseUnavailable(f"{path} cannot be made: {error.strerror}") from error
     try:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

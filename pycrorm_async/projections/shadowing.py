@@ -1,0 +1,27 @@
+"""A connection that sees other views than everybody: its own, temporary ones, which a database looks for first."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+
+from pycrorm_async.store.dialects import dialect_of
+
+__all__ = ["with_views"]
+
+
+@asynccontextmanager
+async def with_views(engine: AsyncEngine, views: Mapping[str, str]) -> AsyncIterator[AsyncConnection]:
+    """A connection that sees these views in place of everybody's of the same names. No transaction is begun in it.
+
+    A view may stand on those before it. The connection is closed with all of them when it is given back.
+    """
+    async with engine.connect() as connection:
+        await dialect_of(connection).shadow_views(connection, views)
+        await connection.commit()
+        try:
+            yield connection
+        finally:
+            await connection.invalidate()  # it never goes back to the pool
