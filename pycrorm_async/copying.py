@@ -102,7 +102,7 @@ async def _made(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tup
         if log.log_id == source.log_id:
             raise CallerError(f"{source.address} and {address} are the same memory: there is nothing to copy")
         projector = Projector(log)
-        await projector.open()
+        await answer_of(projector.open, backoff=BRIEF)  # another copy may be making the tables
         yield log, LogAndTables(log, projector)
     finally:
         await log.close()

@@ -91,13 +91,16 @@ def power_cuts(rounds: int, rng: random.Random, folder: Path, step: Step) -> Out
     for number in range(rounds):
         with disk.mounted():
             plan = Speaker(_walk_until_the_end, url, str(spool), f"plan{number}", rng.randrange(2**31))
-            plan.wait_for("synced")
-            until = time.monotonic() + rng.random() * _LONGEST_LIFE_S
-            while time.monotonic() < until:
-                disk.push_out(rng)
-                time.sleep(0.002)
-            disk.fail()
-            walked.add(plan.stop(), when_synced=True)
+            try:
+                plan.wait_for("synced")
+                until = time.monotonic() + rng.random() * _LONGEST_LIFE_S
+                while time.monotonic() < until:
+                    disk.push_out(rng)
+                    time.sleep(0.002)
+                disk.fail()
+            finally:
+                said = plan.stop()  # also when the bench is told to end: the disk can be unmounted then
+            walked.add(said, when_synced=True)
         with disk.mounted():
             asyncio.run(recover(url, spool=spool))
             events = outcome.events

@@ -12,6 +12,7 @@ import random
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from bench.breaking.databases import start_again
@@ -27,6 +28,8 @@ from tests.databases import Server, ask
 __all__ = ["killed_plans", "killed_daemons", "walk", "Walked", "compare_steps"]
 
 _LONGEST_LIFE_S = 0.2
+_SETTINGS = replace(SETTINGS, connect_timeout_s=3600.0, flush_timeout_s=3600.0)
+"""Nothing here is about being slow: on a busy machine only opening a database may take a minute."""
 _STEPS = (
     "SELECT place, step, status FROM step_action JOIN task_tree_node ON step_action.id = task_tree_node.id"
     " ORDER BY step_action.id"
@@ -43,7 +46,7 @@ def walk(url: str, spool: str, writer: Writer, name: str, seed: int) -> None:
 
 
 async def _walk(url: str, spool: Path, writer: Writer, name: str, rng: random.Random) -> None:
-    async with Memory.open(url, spool=spool, writer=writer, settings=SETTINGS) as memory:
+    async with Memory.open(url, spool=spool, writer=writer, settings=_SETTINGS) as memory:
         for number in itertools.count():
             place = f"{name}.{number}"
             async with memory.episode(description=place):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
 import threading
@@ -68,6 +69,7 @@ async def _until_told_to_leave(url: str, spool: Path | None) -> Moved:
 
 
 def _once(url: str, spool: Path | None, *, as_json: bool) -> int:
+    logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)  # the report tells all of it, once
     with stderr.status("recovering what dead processes left …"):
         report = asyncio.run(recover(url, spool=spool))
     if as_json:

@@ -12,7 +12,7 @@ import pytest
 from tests.commands import answer, pycrorm
 
 README = (Path(__file__).parent.parent.parent / "README.md").read_text()
-PLAN, QUESTIONS, TIDY = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+PLAN, QUESTIONS, TIDY, THEN = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
@@ -65,10 +65,51 @@ async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.Mo
     assert await asyncio.to_thread((tmp_path / "memory.db").exists)
 
 
+async def test_a_moment_is_told_and_made_again_in_another_world(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tidy.py").write_text(TIDY)
+    assert pycrorm("run", "tidy.py", cwd=tmp_path).returncode == 0
+    names: dict[str, object] = {}
+    exec("from pycrorm_async.world import *\nfrom pycrorm_async import Memory", names)
+    setting = """
+with BulletWorld() as world:
+    robot = Object("pr2", ObjectType.ROBOT)
+    Object("kitchen", ObjectType.ENVIRONMENT)
+    milk = Object("milk", ObjectType.MILK, pose=Pose([0, 0, 5]))
+    async with Memory.open("sqlite:///pycrorm.db") as memory:
+"""
+    body = (
+        textwrap.indent(setting, "    ") + textwrap.indent(THEN, "            ") + "            return then, milk.pose"
+    )
+    exec(f"async def asked():\n{body}", names)
+    asked = names["asked"]
+    then, pose = await asked()  # type: ignore[operator]
+    assert [each.dtype for each in then.running][:2] == [None, "TransportAction"]
+    assert then.world.object("milk").pose.position == pytest.approx(pose.position)
+    with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
+        question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'milk' AND object.id < ?"
+        *_, there = plain.execute(f"{question} ORDER BY object.id", ((1 << 31) + (116 << 5),)).fetchall()
+    assert pose.position == pytest.approx(there)
+
+
 def test_every_verb_the_readme_names_exists(tmp_path: Path) -> None:
     verbs = set(re.findall(r"^pycrorm (\w+)", README, re.MULTILINE))
-    assert verbs == {"demo", "run", "episodes", "show", "writer", "status", "spool"}
+    assert verbs == {
+        "demo",
+        "run",
+        "episodes",
+        "show",
+        "events",
+        "copy",
+        "writer",
+        "status",
+        "spool",
+        "verify",
+        "rebuild",
+    }
     for verb in sorted(verbs):
         done = pycrorm(verb, "--help", cwd=tmp_path)
         assert done.returncode == 0
-        assert ("repair" if verb == "spool" else "--url") in done.stdout
+        assert {"spool": "repair", "copy": "--from"}.get(verb, "--url") in done.stdout

@@ -1,0 +1,207 @@
+"""A spool that cannot be used, or holds what it should not: one line, the documented exit code, nothing lost."""
+
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.commands import answer, environment, one_line_of, pycrorm
+from tests.databases import ask
+
+PLAN = '''
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+    async def perform(self): ...
+
+async def plan():
+    """Take three notes."""
+    for text in "abc":
+        await NoteActionPerformable(text).perform()
+'''
+NOTES = "SELECT text FROM note_action ORDER BY id"
+EVENTS = 11
+"""Of the plan, with the declaration."""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "notes.py").write_text(PLAN)
+    return tmp_path
+
+
+def left_in(spool: Path, folder: Path) -> Path:
+    """The folder of a recorder that nobody drained."""
+    assert pycrorm("run", "notes.py", "--writer", "daemon", "--spool", spool, cwd=folder).returncode == 0
+    return recorder_in(spool)
+
+
+def recorder_in(spool: Path) -> Path:
+    [recorder] = [path for path in spool.iterdir() if path.is_dir()]
+    return recorder
+
+
+def notes(folder: Path) -> list[str]:
+    return [text for (text,) in ask(folder / "pycrorm.db", NOTES)]
+
+
+# --- a disk that takes nothing ------------------------------------------------------------------------------------
+
+REFUSING = """
+import errno, os, sys
+place, fault = sys.argv.pop(1), getattr(errno, sys.argv.pop(1))
+def refusing(call):
+    def refused(path, *rest, **options):
+        where = os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.path.abspath(path)
+        if where.startswith(place):
+            raise OSError(fault, os.strerror(fault), where)
+        return call(path, *rest, **options)
+    return refused
+os.posix_fallocate = refusing(os.posix_fallocate)
+if fault == errno.EROFS:
+    os.mkdir = refusing(os.mkdir)
+from pycrorm_async.cli.main import main
+main()
+"""
+"""The command, on a machine where nothing can be made below a place: for those that give no right to mount one."""
+
+
+class Disk:
+    """A disk of its own, or a folder that is said to be one."""
+
+    def __init__(self, place: Path, size: str) -> None:
+        self.place = place
+        place.mkdir()
+        self._mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
+        self.mounted = False
+
+    def mount(self) -> None:
+        self.mounted = subprocess.run(self._mount, capture_output=True, check=False).returncode == 0
+
+    def make_read_only(self, mode: str) -> None:
+        if self.mounted:
+            subprocess.run(["mount", "-o", f"remount,{mode}", str(self.place)], check=True)
+
+    def pycrorm(self, fault: str, *arguments: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
+        if self.mounted:
+            return pycrorm(*arguments, cwd=cwd)
+        return subprocess.run(
+            [sys.executable, "-c", REFUSING, str(self.place), fault, *map(str, arguments)],
+            cwd=cwd,
+            env=environment(),
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+
+    def release(self) -> None:
+        if self.mounted:
+            subprocess.run(["umount", str(self.place)], check=True)
+
+
+@pytest.fixture(params=["mounted", "simulated"])
+def disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Disk]:
+    made = Disk(tmp_path / "disk", "1m" if "full" in request.node.name else "40m")
+    if request.param == "mounted":
+        made.mount()
+    yield made
+    made.release()
+
+
+def test_a_spool_on_a_read_only_disk_is_one_line_and_nothing_in_it_is_lost(folder: Path, disk: Disk) -> None:
+    spool = disk.place / "spool"
+    left_in(spool, folder)
+    disk.make_read_only("ro")
+    calls: list[list[str | Path]] = [["run", "notes.py", "--spool", spool]]
+    if disk.mounted:
+        calls += [["writer", "--once", "--spool", spool], ["writer", "--spool", spool]]
+    for call in calls:
+        done = disk.pycrorm("EROFS", *call, cwd=folder)
+        said = one_line_of(done)
+        assert said.startswith(f"pycrorm: spool {spool}")
+        assert said.endswith("Read-only file system")
+        assert (done.returncode, done.stdout) == (3, "")
+    assert answer("spool", "inspect", spool, cwd=folder)["recorders"][0]["records"] == EVENTS
+    disk.make_read_only("rw")
+    assert answer("writer", "--once", "--spool", spool, cwd=folder)["events_stored"] == EVENTS
+    assert notes(folder) == ["a", "b", "c"]
+
+
+def test_a_spool_for_which_a_full_disk_has_no_room_is_one_line(folder: Path, disk: Disk) -> None:
+    done = disk.pycrorm("ENOSPC", "run", "notes.py", "--spool", disk.place / "spool", cwd=folder)
+    assert one_line_of(done).startswith(f"pycrorm: spool {disk.place}/spool/")
+    assert one_line_of(done).endswith("No space left on device")
+    assert (done.returncode, done.stdout) == (3, "")
+    assert [path for path in (disk.place / "spool").iterdir() if path.is_dir()] == []
+    assert pycrorm("run", "notes.py", cwd=folder).returncode == 0
+    assert notes(folder) == ["a", "b", "c"]
+
+
+# --- what is not ours ---------------------------------------------------------------------------------------------
+
+
+def test_foreign_files_in_a_spool_are_left_alone_and_nothing_is_lost(folder: Path) -> None:
+    spool = folder / "pycrorm.db.spool"
+    recorder = left_in(spool, folder)
+    strangers = [spool / "notes.txt", spool / "photos" / "robot.jpg", recorder / "core.1234"]
+    (spool / "photos").mkdir()
+    for each in strangers:
+        each.write_text("mine")
+    assert pycrorm("writer", "--once", cwd=folder).returncode == 0
+    assert notes(folder) == ["a", "b", "c"]
+    assert [each.read_text() for each in strangers] == ["mine"] * 3
+    assert pycrorm("run", "notes.py", cwd=folder).returncode == 0
+    assert notes(folder) == ["a", "b", "c"] * 2
+
+
+def test_a_folder_of_a_newer_version_is_named_and_kept_and_the_others_are_drained(folder: Path) -> None:
+    spool = folder / "pycrorm.db.spool"
+    newer = left_in(spool, folder)
+    segment = newer / "00000001.segment"
+    content = segment.read_bytes()
+    segment.write_bytes(content[:8] + (99).to_bytes(4, "little") + content[12:])
+    done = pycrorm("writer", "--once", cwd=folder)
+    said = one_line_of(done)
+    assert done.returncode == 3
+    assert str(segment) in said
+    assert "format 99" in said
+    assert pycrorm("run", "notes.py", cwd=folder).returncode == 0
+    assert notes(folder) == ["a", "b", "c"]
+    assert recorder_in(spool) == newer
+    segment.write_bytes(content)
+    assert pycrorm("writer", "--once", cwd=folder).returncode == 0
+    assert notes(folder) == ["a", "b", "c"] * 2
+
+
+# --- what contradicts what is stored ------------------------------------------------------------------------------
+
+
+def test_the_same_event_with_other_bytes_is_damage_and_both_are_kept(folder: Path) -> None:
+    spool = folder / "pycrorm.db.spool"
+    recorder = left_in(spool, folder)
+    shutil.copytree(recorder, folder / "kept" / recorder.name)
+    assert pycrorm("writer", "--once", cwd=folder).returncode == 0
+    with sqlite3.connect(folder / "pycrorm.db") as connection:  # by someone who gets round the log's own refusal
+        connection.executescript(
+            "DROP TRIGGER event_is_not_updated;"
+            "UPDATE event SET payload = replace(payload, '\"b\"', '\"B\"') WHERE sequence = 5"
+        )
+    connection.close()
+    [(changed,)] = ask(folder / "pycrorm.db", "SELECT payload FROM event WHERE sequence = 5")
+    assert '"B"' in changed
+    shutil.copytree(folder / "kept" / recorder.name, recorder)
+    done = pycrorm("writer", "--once", cwd=folder)
+    assert one_line_of(done).endswith("event 5: another event is stored under this number already")
+    assert recorder.name in one_line_of(done)
+    assert done.returncode == 4
+    assert ask(folder / "pycrorm.db", "SELECT payload FROM event WHERE sequence = 5") == [(changed,)]
+    inspected = answer("spool", "inspect", spool, cwd=folder)
+    assert [each["records"] for each in inspected["recorders"]] == [EVENTS]

@@ -1,0 +1,104 @@
+"""Memories to copy: random plans, a plan in a real world, a thought, an episode that was lost."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterable
+
+from pycrorm_async import Memory
+from pycrorm_async.config import Settings
+from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.happenings import EpisodeEnded
+from pycrorm_async.plan import NavigateAction, ParkArmsAction, SimulatedTaskTree
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world import Arms, Pose
+from tests.databases import ask
+from tests.memory.notes import NoteActionPerformable
+from tests.plan.conftest import kitchen
+from tests.projections.script import Script
+from tests.promises.test_random_plans import play
+from tests.tables import declarations_of, differences, logs_of, tables_of, united
+from tests.test_tables import episode as hand_written
+from tests.test_tables import fill
+from tests.upstream.conftest import common_plan
+
+PATIENT = Settings(connect_timeout_s=120)
+
+
+async def random_plans(url: str, seeds: Iterable[int]) -> None:
+    """Each in an episode of its own; some fail, some are cancelled."""
+    async with Memory.open(url, settings=PATIENT) as memory:
+        for seed in seeds:
+            await play(seed, memory)
+
+
+async def everything(url: str) -> None:
+    """Of every kind of event and of row some: a world, motions, a thought, random plans, one that was lost."""
+    await random_plans(url, range(12))
+    async with Memory.open(url, settings=PATIENT) as memory, memory.episode(description="in the kitchen"):
+        with kitchen() as scene:
+            await ParkArmsAction([Arms.BOTH]).resolve().perform()
+            with SimulatedTaskTree():
+                await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
+            await common_plan()
+            scene.cereal.remove()
+    await fill(url, [hand_written(3), lost(4)])
+
+
+def lost(number: int) -> Script:
+    """An episode that recovery ended, after its first node had begun."""
+    script = Script(number)
+    script.records = hand_written(number).records[:5]
+    script.put_payload(EpisodeEnded.__name__, LOST)
+    return script
+
+
+async def notes(url: str, *texts: str) -> None:
+    """An episode of these notes."""
+    async with Memory.open(url, settings=PATIENT) as memory, memory.episode(description="notes"):
+        for text in texts:
+            await NoteActionPerformable(text).perform()
+
+
+async def append(url: str, records: Iterable[Record], *, folded: bool = True) -> None:
+    """Into a log that is opened for that alone."""
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:
+        assert await log.append(list(records)) == {}
+        if folded:
+            projector = Projector(log)
+            await projector.open()
+            await projector.fold_behind()
+    finally:
+        await log.close()
+
+
+def append_in_a_thread_of_its_own(url: str, records: Iterable[Record]) -> None:
+    """The same for who cannot wait."""
+    thread = threading.Thread(target=lambda: asyncio.run(append(url, records, folded=False)))
+    thread.start()
+    thread.join()
+
+
+def assert_same(one: str, other: str) -> None:
+    """Both hold the same events, declarations and rows."""
+    assert logs_of(one) == logs_of(other)
+    assert declarations_of(one) == declarations_of(other)
+    assert differences(tables_of(one), tables_of(other)) == []
+    assert_nothing_is_behind(other)
+
+
+def assert_merged(target: str, *sources: str) -> None:
+    """The target holds what the sources hold, and nothing else."""
+    logs = [logs_of(each) for each in sources]
+    assert logs_of(target) == {episode: events for each in logs for episode, events in each.items()}
+    assert declarations_of(target) == set().union(*map(declarations_of, sources))
+    assert differences(tables_of(target), united(*map(tables_of, sources))) == []
+    assert_nothing_is_behind(target)
+
+
+def assert_nothing_is_behind(url: str) -> None:
+    assert ask(url, "SELECT id, folded, head, refused, parked FROM episode WHERE folded < head") == []

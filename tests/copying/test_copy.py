@@ -1,0 +1,407 @@
+"""What a copy holds is what its source holds, whatever happened on the way."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.config import Settings
+from pycrorm_async.copying import Copied, copy_episodes
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.events.envelope import Record
+from tests.copying.memories import (
+    PATIENT,
+    append,
+    append_in_a_thread_of_its_own,
+    assert_merged,
+    assert_same,
+    everything,
+    lost,
+    notes,
+    random_plans,
+)
+from tests.crash.forked import Forked
+from tests.databases import Server, ask, ask_to_change
+from tests.memory.notes import NoteActionPerformable, texts
+from tests.projections.script import Script, declarations, declared, field, name_of
+from tests.store.making import declaration, episode, record, run_of
+from tests.tables import Logs, differences, logs_of, tables_of
+from tests.test_tables import episode as hand_written
+from tests.test_tables import fill
+
+SMALL = Settings(batch_events_max=40, batch_bytes_max=8_000)
+"""So that a copy is many batches, and ends of them fall into episodes."""
+
+New = Callable[[], str]
+
+
+def counts(done: Copied) -> list[tuple[int, int, int, int]]:
+    assert [(each.damage, each.stopped) for each in done.episodes if each.damage or each.stopped] == []
+    return [(each.number, each.were_there, each.copied, each.head) for each in done.episodes]
+
+
+def path_of(url: str) -> Path:
+    return Path(url.removeprefix("sqlite:///"))
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+
+
+async def test_a_memory_copied_to_a_server_and_back_is_the_same_and_the_source_is_not_written(
+    new_file: New, server: Server
+) -> None:
+    source, middle, back = new_file(), server.new_database(), new_file()
+    await everything(source)
+    before = hashlib.sha256(path_of(source).read_bytes()).digest()
+    tables = tables_of(source)
+    for table in ("object", "attachment", "parameter_item", "joint_change", "simulated_episode", "object_removal"):
+        assert table in tables, f"the source has no row in {table}, so this proves little"
+    assert {row["status"] for row in tables["process_metadata"].values()} >= {"SUCCEEDED", "LOST"}
+    await copy_episodes(source, middle, settings=SMALL)
+    await copy_episodes(middle, back)
+    assert_same(source, middle)
+    assert_same(source, back)
+    assert hashlib.sha256(path_of(source).read_bytes()).digest() == before
+
+
+async def test_what_is_there_already_is_copied_once(new_url: New, new_file: New) -> None:
+    source, target = new_file(), new_url()
+    await notes(source, "a", "b")
+    await notes(source, "c")
+    assert counts(await copy_episodes(source, target)) == [(1, 0, 8, 8), (2, 0, 6, 6)]
+    assert counts(await copy_episodes(source, target)) == [(1, 8, 0, 8), (2, 6, 0, 6)]
+    assert_same(source, target)
+    await notes(source, "d")
+    assert counts(await copy_episodes(source, target)) == [(1, 8, 0, 8), (2, 6, 0, 6), (3, 0, 6, 6)]
+    assert_same(source, target)
+
+
+async def test_only_the_episodes_asked_for_are_copied_with_their_own_types(new_file: New) -> None:
+    source, target = new_file(), new_file()
+    await notes(source, "a")
+    await random_plans(source, [1])
+    await notes(source, "b")
+    ids = list(logs_of(source))
+    assert counts(await copy_episodes(source, target, episodes=["3", ids[2], "last"])) == [(3, 0, 6, 6)]
+    assert list(logs_of(target)) == [ids[2]]
+    assert ask(target, "SELECT count(*) FROM pycrorm_declaration") == [(1,)]
+    async with Reading.open(target) as reading:
+        assert await texts(reading) == ["b"]
+    await copy_episodes(source, target, episodes=[ids[1], "1"])
+    assert_same(source, target)
+
+
+async def test_an_episode_that_is_longer_in_the_target_stays_as_it_is(new_file: New) -> None:
+    source, target = new_file(), new_file()
+    records = hand_written(1).records
+    await fill(target, [hand_written(1)])
+    await append(source, [*declarations_as_records(target), *records[:4]])
+    assert counts(await copy_episodes(source, target)) == [(1, 4, 0, len(records))]
+    assert counts(await copy_episodes(target, source)) == [(1, 4, len(records) - 4, len(records))]
+    assert_same(target, source)
+
+
+async def test_an_end_that_was_computed_is_copied_as_any_event(new_url: New, new_file: New) -> None:
+    source, target = new_file(), new_url()
+    await fill(source, [hand_written(2), lost(1)])
+    await copy_episodes(source, target)
+    await copy_episodes(source, target)
+    assert_same(source, target)
+    assert ask(target, "SELECT status FROM process_metadata ORDER BY id") == [("SUCCEEDED",), ("LOST",)]
+    assert set(ask(target, "SELECT status FROM task_tree_node")) == {("SUCCEEDED",), ("LOST",)}
+
+
+# --- two sources ------------------------------------------------------------------------------------------------------
+
+
+async def test_two_memories_in_one_are_the_same_in_any_order_and_at_once(new_url: New, new_file: New) -> None:
+    one, other = new_file(), new_file()
+    await random_plans(one, range(20, 30))
+    await random_plans(other, range(25, 35))
+    await notes(other, "only here")
+    first, second, at_once = new_url(), new_url(), new_url()
+    for source in (one, other):
+        await copy_episodes(source, first)
+    for source in (other, one):
+        await copy_episodes(source, second)
+    await copy_episodes(one, at_once, episodes=["3"])  # who makes the tables is not the question here
+    await asyncio.gather(*(copy_episodes(each, at_once, settings=SMALL) for each in (one, other, one)))
+    for target in (first, second, at_once):
+        assert_merged(target, one, other)
+
+
+# --- while somebody records -------------------------------------------------------------------------------------------
+
+
+async def test_what_is_being_recorded_is_copied_as_far_as_it_is_and_then_the_rest(new_url: New, new_file: New) -> None:
+    source, target = new_file(), new_url()
+    await notes(source, "before")
+    copies = 0
+    async with Memory.open(source, settings=PATIENT) as memory:
+        async with memory.episode(description="long"):
+            for index in range(60):
+                await NoteActionPerformable(f"{index}").perform()
+                if index % 20 == 5:
+                    await memory.flush()
+                    done = await copy_episodes(source, target, settings=SMALL)
+                    copies += 1
+                    assert done.episodes[1].head == len(logs_of(target)[done.episodes[1].id]) > 2 * index
+        assert ask(target, "SELECT status FROM process_metadata ORDER BY id") == [("SUCCEEDED",), ("RUNNING",)]
+    assert copies == 3
+    await copy_episodes(source, target)
+    assert_same(source, target)
+
+
+async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(new_url: New, new_file: New) -> None:
+    source, target, alone = new_file(), new_url(), new_file()
+    await notes(alone, *map(str, range(200)))
+    await notes(source, "before")
+
+    async def record(url: str, name: str) -> None:
+        async with Memory.open(url, settings=PATIENT) as memory, memory.episode(description=name):
+            for index in range(150):
+                await NoteActionPerformable(f"{name} {index}").perform()
+                await asyncio.sleep(0.002)
+                assert memory.status.faults.total == 0
+
+    async def copy(url: str) -> None:
+        while recording:
+            await copy_episodes(url, target, settings=SMALL)
+            await asyncio.sleep(0.01)
+
+    recording = True
+    async with asyncio.TaskGroup() as group:
+        copies = [group.create_task(copy(each)) for each in (source, alone)]
+        await asyncio.gather(record(source, "here"), record(target, "there"))
+        recording = False
+        await asyncio.wait(copies)
+    await copy_episodes(source, target)
+    there = logs_of(target)
+    expected = logs_of(source) | logs_of(alone)
+    assert {episode: there[episode] for episode in expected} == expected
+    assert len(there) == 4
+    async with Reading.open(target) as reading:
+        assert sorted(await texts(reading)) == sorted(
+            [
+                "before",
+                *map(str, range(200)),
+                *(f"{name} {index}" for name in ("here", "there") for index in range(150)),
+            ]
+        )
+
+
+# --- killed -----------------------------------------------------------------------------------------------------------
+
+
+def copy_and_tell(source: str, target: str) -> None:
+    asyncio.run(copy_episodes(source, target, settings=SMALL, watch=lambda done, _: print(done)))
+
+
+async def test_a_copy_that_is_killed_and_repeated_is_whole(new_url: New, new_file: New) -> None:
+    rounds = 10
+    source, target = new_file(), new_url()
+    await random_plans(source, range(40, 56))
+    await fill(source, [hand_written(number) for number in range(30)])
+    await notes(source, *map(str, range(300)))
+    expected = logs_of(source)
+    count = sum(map(len, expected.values()))
+    seed = random.randrange(2**32)
+    dice = random.Random(seed)
+    there: Logs = {}
+    kills = 0
+    for _ in range(rounds):
+        copying = Forked(copy_and_tell, source, target)
+        copying.wait_for_its_first_words()
+        until = sum(map(len, there.values())) + dice.randrange(2 * count // rounds)
+        while copying.process.is_alive() and int(copying.said[-1] if copying.said else 0) < until:  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(dice.random() * 0.02)
+        kills += copying.process.is_alive()
+        copying.kill()
+        there = logs_of(target)
+        for name, events in there.items():
+            assert events == expected[name][: len(events)], f"seed {seed}"
+    assert kills > rounds // 3, f"seed {seed}"
+    await copy_episodes(source, target)
+    assert_same(source, target)
+
+
+async def test_what_was_appended_and_not_folded_before_a_kill_is_folded_by_the_next_copy(new_file: New) -> None:
+    source, target = new_file(), new_file()
+    await fill(source, [hand_written(1)])
+    await append(target, [*declarations_as_records(source), *hand_written(1).records], folded=False)
+    assert counts(await copy_episodes(source, target)) == [(1, 12, 0, 12)]
+    assert_same(source, target)
+
+
+def declarations_as_records(url: str) -> list[Record]:
+    rows = ask(url, "SELECT payload FROM pycrorm_declaration ORDER BY ordinal")
+    return [declaration(payload.encode()) for (payload,) in rows]
+
+
+# --- damage -----------------------------------------------------------------------------------------------------------
+
+
+async def test_other_bytes_under_one_key_are_told_and_the_other_episodes_are_copied(
+    new_url: New, new_file: New
+) -> None:
+    source, target = new_file(), new_url()
+    scripts = [hand_written(number) for number in (1, 2, 3)]
+    await fill(source, scripts)
+    other = [each._replace(wall_ns=each.wall_ns + (each.sequence == 5)) for each in scripts[1].records]
+    await append(target, [*declarations_as_records(source), *other[:9]])
+    before = logs_of(target)
+    done = await copy_episodes(source, target)
+    (bad,) = [each for each in done.episodes if each.damage]
+    identity = "00000000-0000-7000-8000-000000000002"
+    assert bad.id == identity
+    assert bad.damage is not None
+    assert bad.damage.startswith(f"episode {identity}, event 5: ")
+    assert (bad.were_there, bad.copied, bad.head) == (9, 0, 9)
+    assert [(each.copied, each.damage) for each in done.episodes if each is not bad] == [(12, None)] * 2
+    after = logs_of(target)
+    assert after.pop(identity) == before[identity]
+    there = logs_of(source)
+    del there[identity]
+    assert after == there
+
+
+async def test_other_bytes_that_come_at_the_same_moment_are_told_and_the_other_episodes_are_copied(
+    new_url: New, new_file: New
+) -> None:
+    source, target = new_file(), new_url()
+    await fill(source, [hand_written(number) for number in (1, 2, 3)])
+    other = [each._replace(monotonic_ns=4) for each in hand_written(2).records]
+    told = 0
+
+    def watch(_done: int, _of: int) -> None:  # events were read and are not appended yet
+        nonlocal told
+        if told == 0:
+            append_in_a_thread_of_its_own(target, other)
+        told += 1
+
+    done = await copy_episodes(source, target, watch=watch)
+    assert [each.damage is None for each in done.episodes] == [True, False, True]
+    assert done.episodes[1].damage is not None
+    assert "another event is stored under this number" in done.episodes[1].damage
+    assert [each.head for each in done.episodes] == [12, 12, 12]
+    there = logs_of(target)
+    assert {event[4] for event in there.pop("00000000-0000-7000-8000-000000000002")} == {4}
+    assert there == {each: events for each, events in logs_of(source).items() if each in there}
+
+
+@pytest.mark.parametrize("sequence", [1, 7, 12])
+async def test_of_an_episode_with_a_gap_what_comes_before_it_is_copied(new_file: New, sequence: int) -> None:
+    source, target = new_file(), new_file()
+    await fill(source, [hand_written(number) for number in (1, 2)])
+    ask_to_change(source, "DROP TRIGGER event_is_not_deleted")
+    ask_to_change(source, f"DELETE FROM event WHERE episode = 1 AND sequence = {sequence}")
+    for _ in range(2):
+        done = await copy_episodes(source, target)
+        (bad, good) = done.episodes
+        assert bad.damage == (f"episode 00000000-0000-7000-8000-000000000001, event {sequence}: is missing in {source}")
+        assert (bad.head, good.head, good.damage) == (sequence - 1, 12, None)
+    there = logs_of(target)
+    assert [event[0] for event in there.get(bad.id, [])] == list(range(1, sequence))
+    assert there[good.id] == logs_of(source)[good.id]
+
+
+@pytest.mark.parametrize("damaged", [0, 1])
+@pytest.mark.parametrize("sequence", [1, 7, 12])
+async def test_a_gap_in_what_both_have_is_told(new_file: New, sequence: int, damaged: int) -> None:
+    source, target = both = new_file(), new_file()
+    for url in both:
+        await fill(url, [hand_written(number) for number in (1, 2)])
+    ask_to_change(both[damaged], "DROP TRIGGER event_is_not_deleted")
+    ask_to_change(both[damaged], f"DELETE FROM event WHERE episode = 1 AND sequence = {sequence}")
+    (bad, good) = (await copy_episodes(source, target)).episodes
+    assert bad.damage == f"episode {bad.id}, event {sequence}: is missing in {both[damaged]}"
+    assert (good.were_there, good.copied, good.damage) == (12, 0, None)
+
+
+@pytest.mark.parametrize("payload", ["", "{", '{"node":"four"}', "[1]", '{"node":4,"status":"SUCCEEDED"} x'])
+async def test_of_an_episode_with_an_unreadable_event_what_comes_before_it_is_copied(
+    new_file: New, payload: str
+) -> None:
+    source, target = new_file(), new_file()
+    await fill(source, [hand_written(number) for number in (1, 2)])
+    ask_to_change(source, "DROP TRIGGER event_is_not_updated")
+    ask_to_change(source, "UPDATE event SET payload = ? WHERE episode = 1 AND sequence = 5", [payload])
+    (bad, good) = (await copy_episodes(source, target)).episodes
+    assert bad.damage is not None
+    assert bad.damage.startswith(f"episode {bad.id}, event 5: its payload cannot be read: ")
+    assert (bad.head, good.head, good.damage) == (4, 12, None)
+
+
+async def test_what_a_newer_version_recorded_is_copied_as_it_is(new_url: New, new_file: New) -> None:
+    source, target = new_file(), new_url()
+    script = Script(1)
+    script.put_payload("HandShaken", b'{"whom": "Ada", "firm": 1.50}')
+    script.put_payload("NodeStarted", b'{"designator": ["of", "another", "shape"]}', 2)
+    await append(source, script.records)
+    (done,) = (await copy_episodes(source, target)).episodes
+    assert done.damage is None
+    assert done.stopped == "event 1: HandShaken is not an event this version knows"
+    assert logs_of(target) == logs_of(source)
+
+
+async def test_an_episode_whose_type_the_target_knows_otherwise_is_copied_and_parked_there(new_file: New) -> None:
+    source, target = new_file(), new_file()
+    await notes(target, "a text")
+    number = declared("NoteAction", "note_action", field("text", "integer", 2))
+    script = hand_written(1)
+    for sequence, each in enumerate(script.records, 1):
+        if b"parameters" in each.payload and each.payload.count(b'"text"'):
+            payload = (
+                b'{"kind":"action","parent":3,"designator":"%s","parameters":{"text":5}}' % name_of(number).encode()
+            )
+            script.records[sequence - 1] = each._replace(payload=payload)
+    await append(source, [*declarations(number), *declarations_as_records(target), *script.records])
+    (done,) = (await copy_episodes(source, target)).episodes
+    assert done.damage is None
+    assert done.stopped is not None
+    assert logs_of(target)[done.id] == logs_of(source)[done.id]
+    async with Reading.open(target) as reading:
+        assert await texts(reading) == ["a text"]
+
+
+# --- wrong usage ------------------------------------------------------------------------------------------------------
+
+
+async def test_a_memory_is_not_copied_into_itself(new_url: New, tmp_path: Path) -> None:
+    url = new_url()
+    await notes(url, "a")
+    before = logs_of(url)
+    with pytest.raises(CallerError, match="are the same memory"):
+        await copy_episodes(url, url)
+    assert logs_of(url) == before
+
+
+async def test_what_cannot_be_copied_makes_no_target(new_file: New) -> None:
+    source, target = new_file(), new_file()
+    with pytest.raises(DatabaseUnavailable, match="does not exist"):
+        await copy_episodes(source, target)
+    await notes(source, "a")
+    with pytest.raises(UnknownEpisode, match="there is no episode '7'"):
+        await copy_episodes(source, target, episodes=["1", "7"])
+    assert not path_of(target).exists()
+
+
+async def test_events_that_are_large_are_copied_in_small_batches(new_file: New) -> None:
+    source, target = new_file(), new_file()
+    big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 100_000)
+    records = [record(episode(1), sequence, payload=big) for sequence in range(1, 1001)]
+    await append(source, [*records, *run_of(episode(2), 1, 30)], folded=False)
+    done: list[int] = []
+    await copy_episodes(
+        source, target, settings=Settings(batch_bytes_max=2**20), watch=lambda count, _: done.append(count)
+    )
+    assert logs_of(target) == logs_of(source)
+    assert done == [250, 500, 750, 1000, 1030]
+    assert differences(tables_of(target), {}) == []
