@@ -64,7 +64,7 @@ MAKING = "tables/making"
 GONE = "tables/gone/"
 PROJECTION = "projection/"
 
-_log = logging.getLogger("pycrorm_async")
+_log = logging.getLogger("pycrorm_async.projections")
 
 Hold: TypeAlias = Literal["share", "change"]
 """Until the transaction ends nobody else changes the note; with `change`, nobody else holds it either."""

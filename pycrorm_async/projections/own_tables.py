@@ -40,7 +40,7 @@ __all__ = ["OwnTables", "OwnMeaning", "layout_of", "make_own", "refuse_taken", "
 _LOOK_S = 1.0
 """What another process has stored is looked for so often: it costs as much as there are episodes."""
 
-_log = logging.getLogger("pycrorm_async")
+_log = logging.getLogger("pycrorm_async.projections")
 
 
 class OwnMeaning:
