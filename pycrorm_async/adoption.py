@@ -152,7 +152,8 @@ async def recover(
 ) -> RecoveryReport:
     """Append and fold all there is in the spool of a database and nobody drains, of the dead and of the living.
 
-    Of a living process what is synced at this moment. `projections` of one's own are kept up to date too. Raises as `Memory.open` does.
+    Of a living process what is synced at this moment. `projections` of one's own are kept up to date
+    too. Raises as `Memory.open` does.
     """
     failures: dict[str, PycrormError] = {}
     lost: list[str] = []

@@ -119,7 +119,7 @@ async def _rebuilt(
             events=sum(each.head for each in episodes),
             episodes=len(episodes),
             seconds=seconds,
-            parked=parked,
+            parked={each.id: parked[each.number] for each in episodes if each.number in parked},
             left=left,
         )
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import Span, StoredEvent, share_out
 
 __all__ = ["Beside", "CatchUp", "Share", "WHOLE"]
+
+_log = logging.getLogger("pycrorm_async.projections")
 
 _EPISODES_MAX = 400
 """So many episodes that have more are looked up for a batch: each costs as much as folding some of its events."""
@@ -68,6 +71,8 @@ class Beside:
 
     async def park(self, connection: AsyncConnection, number: int, reason: str) -> None:
         await progress.park(connection, self.place, number, reason)
+        if self._projection is not None:
+            _log.warning("episode %s is parked in the projection %s: %s", number, self._projection, reason)
 
 
 class CatchUp:

@@ -10,6 +10,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from sqlalchemy import Dialect
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -35,7 +36,16 @@ from pycrorm_async.projections.tables import OWN, Storage
 from pycrorm_async.projections.views import with_user_views
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["OwnTables", "OwnMeaning", "layout_of", "make_own", "refuse_taken", "fault_in_version"]
+__all__ = [
+    "OwnTables",
+    "ProjectionState",
+    "states",
+    "OwnMeaning",
+    "layout_of",
+    "make_own",
+    "refuse_taken",
+    "fault_in_version",
+]
 
 _LOOK_S = 1.0
 """What another process has stored is looked for so often: it costs as much as there are episodes."""
@@ -188,6 +198,39 @@ class OwnTables:
         if not count:
             self._looked_s = time_s
         return count > 0
+
+
+class ProjectionState(NamedTuple):
+    """How a projection is that has tables in a memory.
+
+    Attributes:
+        name, version: as its tables were made.
+        behind: events that they do not show yet.
+        parked: by episode number, why no more of it is folded.
+        fault: why it is not kept up to date by those who know it as it is here; None if it is, or is not known here.
+    """
+
+    name: str
+    version: int
+    behind: int
+    parked: Mapping[int, str]
+    fault: str | None
+
+
+async def states(log: EventLog, known: Sequence[Projection]) -> list[ProjectionState]:
+    """Of every projection in this memory. `known` are those whose code is here."""
+    here = {each.name: each for each in known}
+    found: list[ProjectionState] = []
+    with log.translated():
+        async with log.engine.connect() as connection:
+            for name, each in projections_in(await all_noted(connection)).items():
+                place = progress.place_of(each.number, name)
+                fault = None
+                if name in here:
+                    fault = fault_in_version(here[name], each, layout_of(here[name], connection.dialect))
+                left, parked = await progress.left(connection, place), await progress.parked(connection, place)
+                found.append(ProjectionState(name, each.version, left, parked, fault))
+    return found
 
 
 def _names(layout: Layout) -> list[str]:

@@ -97,13 +97,21 @@ async def total(connection: AsyncConnection, place: str) -> int:
     return int(found.scalar_one())
 
 
-async def parked(connection: AsyncConnection, place: str) -> dict[str, str]:
-    """By episode id, why no more of it is in this generation."""
+async def left(connection: AsyncConnection, place: str) -> int:
+    """How many events the log has more; without those of parked episodes."""
     found = await connection.execute(
         text(
-            f"SELECT episode.id, progress.parked FROM {place} AS progress JOIN episode ON number = progress.id"  # noqa: S608
-            " WHERE progress.parked IS NOT NULL ORDER BY number"
+            f"SELECT coalesce(sum(head - coalesce(progress.folded, 0)), 0) FROM episode LEFT JOIN {place} AS progress"  # noqa: S608
+            " ON progress.id = number WHERE progress.parked IS NULL"
         )
+    )
+    return int(found.scalar_one())
+
+
+async def parked(connection: AsyncConnection, place: str) -> dict[int, str]:
+    """By episode number, why no more of it is in this generation."""
+    found = await connection.execute(
+        text(f"SELECT id, parked FROM {place} WHERE parked IS NOT NULL ORDER BY id")  # noqa: S608
     )
     return {each.id: each.parked for each in found}
 

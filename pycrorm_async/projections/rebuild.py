@@ -161,8 +161,8 @@ class Rebuild:
             whole = (await connection.execute(_EVENTS)).scalar_one()
             return int(whole) - await progress.total(connection, self._place)
 
-    async def parked(self) -> dict[str, str]:
-        """By episode id, why not all of it could be folded."""
+    async def parked(self) -> dict[int, str]:
+        """By episode number, why not all of it could be folded."""
         async with self._log.engine.connect() as connection:
             return await progress.parked(connection, self._place)
 
