@@ -56,7 +56,7 @@ def tables_of(place: str | Path) -> Tables:
     columns: dict[str, list[str]] = {}
     for physical, column in ask(place, _COLUMNS_POSTGRESQL if on_server else _COLUMNS_SQLITE):
         name, mark, number = physical.rpartition("__")
-        if mark and number == str(generation):
+        if mark and number == str(generation) and not name.startswith("pycrorm_"):
             columns.setdefault(name, []).append(column)
     found = {
         name: _rows(place, name, f'{schema}"{name}__{generation}"', each, leaves.get(name), episodes)

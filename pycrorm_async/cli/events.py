@@ -52,8 +52,9 @@ async def _print(url: str, episode: str, after: int, kinds: frozenset[str] | Non
     try:
         row = await episode_named(log, episode)
         async for page in log.pages(row, after=after):
-            shown = [each for each in page if kinds is None or each.type in kinds]
-            sys.stdout.buffer.write(b"".join(_line(row.id, each) for each in shown))
+            for each in page:
+                if kinds is None or each.type in kinds:
+                    sys.stdout.buffer.write(_line(row.id, each))
     finally:
         await log.close()
 

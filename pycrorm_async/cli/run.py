@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from pycrorm_async.cli.interrupting import Interrupting
 from pycrorm_async.cli.loading import LoadedPlan, load_plan
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption, WriterOption
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
@@ -84,21 +85,25 @@ class _Outcome:
 async def _remembered(
     loaded: LoadedPlan, opened: Memory, description: str, seed: int | None, outcome: _Outcome
 ) -> None:
-    async with opened as memory:
-        try:
-            if loaded.takes_memory:
-                await loaded.function(memory)
-            else:
-                async with memory.episode(description=description, plan=loaded.name, seed=seed):
-                    await loaded.function()
-        except (KeyboardInterrupt, asyncio.CancelledError):
-            raise
-        except SystemExit as leaving:
-            outcome.failure = leaving if leaving.code not in (None, 0) else None
-        except BaseException as error:  # noqa: BLE001  a plan may raise anything; it is told in one line
-            outcome.failure = error
-        finally:
-            await _summarise(memory, outcome)
+    interrupting = Interrupting()
+    with interrupting.heeded():
+        async with opened as memory:
+            try:
+                if loaded.takes_memory:
+                    await loaded.function(memory)
+                else:
+                    async with memory.episode(description=description, plan=loaded.name, seed=seed):
+                        await loaded.function()
+            except (KeyboardInterrupt, asyncio.CancelledError):
+                raise
+            except SystemExit as leaving:
+                outcome.failure = leaving if leaving.code not in (None, 0) else None
+            except BaseException as error:  # noqa: BLE001  a plan may raise anything; it is told in one line
+                outcome.failure = error
+            finally:
+                interrupting.ended()
+                if not interrupting.asked:
+                    await _summarise(memory, outcome)
 
 
 async def _summarise(memory: Memory, outcome: _Outcome) -> None:

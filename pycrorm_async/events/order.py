@@ -40,6 +40,9 @@ from pycrorm_async.events.happenings import (
 __all__ = ["Finding", "OrderCheck"]
 
 
+_NODE, _OBJECT = 1, 2
+
+
 class Finding(NamedTuple):
     """What is wrong or unusual at one event."""
 
@@ -60,8 +63,10 @@ class OrderCheck:
         self._last = 0
         self._state: Literal["before", "open", "closed"] = "before"
         self._parents: dict[int, int | None] = {}
-        self._open_nodes: set[int] = set()
-        self._objects: set[int] = set()
+        """Of the nodes that are open."""
+        self._any_node = False
+        self._made = bytearray()
+        """What each event made: a byte, so that a long episode takes no more memory than that."""
 
     def read(self, sequence: int, event: Happening) -> list[Finding]:
         """The next event; what is found at it."""
@@ -89,10 +94,10 @@ class OrderCheck:
                 return self._end(event)
             case EpisodeEnded():
                 self._state = "closed"
-                if self._open_nodes and event.status != "LOST":
-                    return [("remark", f"{len(self._open_nodes)} nodes are open at the end")]
+                if self._parents and event.status != "LOST":
+                    return [("remark", f"{len(self._parents)} nodes are open at the end")]
             case ObjectAdded():
-                self._objects.add(sequence)
+                self._make(sequence, _OBJECT)
             case ObjectMoved():
                 return self._unknown_objects(event.object)
             case ObjectRemoved() | JointsMoved():
@@ -106,11 +111,12 @@ class OrderCheck:
         return []
 
     def _start(self, sequence: int, event: NodeStarted) -> list[tuple[Literal["damage", "remark"], str]]:
-        known = event.parent is None or event.parent in self._parents
-        alone = event.parent is not None or not self._parents
-        running = event.parent is None or event.parent in self._open_nodes
+        known = event.parent is None or self._is(event.parent, _NODE)
+        alone = event.parent is not None or not self._any_node
+        running = event.parent is None or event.parent in self._parents
         self._parents[sequence] = event.parent
-        self._open_nodes.add(sequence)
+        self._any_node = True
+        self._make(sequence, _NODE)
         if not known:
             return [("damage", f"its parent {event.parent} never started")]
         if not alone:
@@ -118,22 +124,28 @@ class OrderCheck:
         return [] if running else [("remark", f"its parent {event.parent} had ended")]
 
     def _end(self, event: NodeEnded) -> list[tuple[Literal["damage", "remark"], str]]:
-        if event.node not in self._parents:
+        if not self._is(event.node, _NODE):
             return [("damage", f"node {event.node} ends and never started")]
-        if event.node not in self._open_nodes:
+        if event.node not in self._parents:
             return [("damage", f"node {event.node} ends a second time")]
-        self._open_nodes.discard(event.node)
-        parent = self._parents[event.node]
-        if parent is not None and parent not in self._open_nodes:
+        parent = self._parents.pop(event.node)
+        if parent is not None and parent not in self._parents:
             return [("remark", f"node {event.node} ends after its parent {parent}")]
         return []
 
     def _unknown_node(self, node: int | None) -> list[tuple[Literal["damage", "remark"], str]]:
-        known = node is None or node in self._parents
+        known = node is None or self._is(node, _NODE)
         return [] if known else [("damage", f"node {node} never started")]
 
     def _unknown_objects(self, *objects: int) -> list[tuple[Literal["damage", "remark"], str]]:
-        return [("damage", f"object {each} was never added") for each in objects if each not in self._objects]
+        return [("damage", f"object {each} was never added") for each in objects if not self._is(each, _OBJECT)]
+
+    def _make(self, sequence: int, what: int) -> None:
+        self._made.extend(bytes(max(sequence + 1 - len(self._made), 0)))
+        self._made[sequence] = what
+
+    def _is(self, sequence: int, what: int) -> bool:
+        return 0 < sequence < len(self._made) and self._made[sequence] == what
 
 
 def _gap(last: int, sequence: int) -> str:

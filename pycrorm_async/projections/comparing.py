@@ -1,21 +1,21 @@
 """What a fold makes against what the tables show, row by row, part after part of the log.
 
-Nodes that have not ended where a part ends are carried to the next one, so that a part can be any piece of an episode,
-and memory stays flat however long that is.
+A part can be any piece of an episode: nodes that have not ended where it ends are looked at in a later one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from operator import itemgetter
+from typing import Any, NamedTuple, Protocol
 
-from sqlalchemy import ColumnElement, Table, select
+from sqlalchemy import ColumnElement, Table, column, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.projections.generations import Generation
-from pycrorm_async.projections.rows import Row, Rows
-from pycrorm_async.projections.tables import COLUMNS, CORE, Storage, make_table
+from pycrorm_async.projections.rows import Row
+from pycrorm_async.projections.tables import CORE, Storage, make_table
 
 __all__ = ["Comparison", "Difference", "Range"]
 
@@ -48,38 +48,54 @@ class Difference(NamedTuple):
         return f"{self.table}.{self.column} is {self.stored!r}, and should be {self.expected!r}"
 
 
-class Range(NamedTuple):
-    """The rows with an id from `low` on and below `high`; and the episodes from number `first` on and below `end`."""
+class Made(Protocol):
+    """What a fold makes of events."""
 
-    low: int
-    high: int
-    first: int
-    end: int
+    def to_insert(self) -> Mapping[tuple[str, tuple[str, ...]], Sequence[Row]]:
+        """Rows by (table, columns)."""
+        ...
+
+
+class Range(NamedTuple):
+    """The rows with an id from `low` on and below `high`; and the episodes from number `first` on and below `end`.
+
+    None: whatever there is on that side.
+    """
+
+    low: int | None
+    high: int | None
+    first: int | None
+    end: int | None
 
 
 class Comparison:
-    """Compares the tables of one generation with what folds make.
+    """Compares the tables of one generation with what folds make: those of its layout, and `core`.
 
     Attributes:
+        generation: whose tables these are.
         count: of the rows that were looked at.
         tables: their names in the database.
     """
 
-    def __init__(self, generation: Generation) -> None:
+    def __init__(self, generation: Generation, core: Mapping[str, dict[str, Storage]] = CORE) -> None:
+        self.generation = generation
         self.count = 0
-        self.tables: list[str] = []
         self._tables: dict[str, Table] = {}
-        self._columns: dict[str, tuple[str, ...]] = dict(COLUMNS)
         leaves: dict[str, dict[str, Storage]] = {
             name: {"id": "key", **columns} for name, columns in generation.layout.leaves.items()
         }
-        for name, columns in (CORE | leaves).items():
+        for name, columns in (dict(core) | leaves).items():
             self._tables[name] = make_table(name, columns, generation.number)
-            self.tables.append(self._tables[name].name)
-            self._columns[name] = tuple(columns)
+        self.tables = [each.name for each in self._tables.values()]
 
     async def differences(
-        self, connection: AsyncConnection, rows: Rows, within: Range, *, carried: Sequence[int], settled: Sequence[int]
+        self,
+        connection: AsyncConnection,
+        rows: Made,
+        within: Range,
+        *,
+        carried: Collection[int],
+        settled: Collection[int],
     ) -> list[Difference]:
         """What is different in a part of the log.
 
@@ -91,56 +107,92 @@ class Comparison:
             settled: ids of nodes that were carried and are looked at now.
         """
         expected = self._expected(rows)
-        later = set(carried)
         found: list[Difference] = []
         for name, table in self._tables.items():
-            made = expected.get(name, {})
-            key = list(table.primary_key.columns)
+            made = expected.pop(name, {})
             first, end = (within.first, within.end) if name in _EPISODE_KEYED else (within.low, within.high)
-            there = await self._read(connection, table, key, key[0] >= first, key[0] < end)
+            there = await self._read(connection, table, first, end)
             if name == _NODES:
-                for start in range(0, len(settled), _KEYS_AT_ONCE):
-                    some = settled[start : start + _KEYS_AT_ONCE]
-                    there |= await self._read(connection, table, key, key[0].in_(some))
-                for each in later:
+                there |= await self._nodes(connection, table, [*settled])
+                for each in carried:
                     made.pop((each,), None)
                     there.pop((each,), None)
             self.count += len(there)
-            found += self._compared(name, made, there)
+            found += _compared(name, [each.name for each in table.columns], made, there)
+        for name, made in expected.items():  # of a type that came later than these tables
+            found += _compared(name, [], made, {})
         return found
 
-    async def _read(
-        self, connection: AsyncConnection, table: Table, key: Sequence[ColumnElement[Any]], *where: ColumnElement[bool]
-    ) -> dict[Row, Row]:
-        width = len(key)
-        answer = await connection.execute(select(*key, *table.columns).where(*where))
-        return {tuple(row[:width]): tuple(row[width:]) for row in answer}
+    async def _nodes(self, connection: AsyncConnection, table: Table, keys: list[int]) -> dict[Row, Row]:
+        read: dict[Row, Row] = {}
+        for start in range(0, len(keys), _KEYS_AT_ONCE):
+            read |= await _rows(connection, table, table.c.id.in_(keys[start : start + _KEYS_AT_ONCE]))
+        return read
 
-    def _expected(self, rows: Rows) -> dict[str, dict[Row, Row]]:
+    async def _read(
+        self, connection: AsyncConnection, table: Table, first: int | None, end: int | None
+    ) -> dict[Row, Row]:
+        key = next(iter(table.primary_key.columns))
+        where = [key >= first] if first is not None else []
+        return await _rows(connection, table, *where, *([key < end] if end is not None else []))
+
+    def _expected(self, rows: Made) -> dict[str, dict[Row, Row]]:
         expected: dict[str, dict[Row, Row]] = {}
         for (name, columns), made in rows.to_insert().items():
-            whole = self._columns[name]
-            places = [columns.index(each) if each in columns else None for each in whole]
-            keys = [whole.index(each.name) for each in self._tables[name].primary_key.columns]
+            table = self._tables.get(name)
+            whole = columns if table is None else tuple(each.name for each in table.columns)
             into = expected.setdefault(name, {})
+            keys = _key_of(columns, table)
+            if whole == columns:
+                into.update((keys(row), row) for row in made)
+                continue
+            places = [columns.index(each) if each in columns else None for each in whole]
             for row in made:
-                values = tuple(None if place is None else row[place] for place in places)
-                into[tuple(values[key] for key in keys)] = values
+                into[keys(row)] = tuple(None if place is None else row[place] for place in places)
         return expected
 
-    def _compared(self, name: str, made: Mapping[Row, Row], there: Mapping[Row, Row]) -> Iterator[Difference]:
-        for key in _ordered(made.keys() | there.keys()):
-            stored, expected = there.get(key), made.get(key)
-            if stored == expected:
-                continue
-            number, sequence = (key[0], 1) if name in _EPISODE_KEYED else row_key(key[0])[:2]
-            if stored is None or expected is None:
-                yield Difference(number, sequence, name, None, stored, expected)
-                continue
-            for column, one, other in zip(self._columns[name], stored, expected, strict=True):
-                if one != other:
-                    yield Difference(number, sequence, name, column, one, other)
+
+async def _rows(connection: AsyncConnection, table: Table, *where: ColumnElement[bool]) -> dict[Row, Row]:
+    """By their keys. Without their types: what a database holds is compared, not what is made of it."""
+    columns = tuple(each.name for each in table.columns)
+    untyped: list[ColumnElement[Any]] = [column(each) for each in columns]
+    answer = await connection.execute(select(*untyped).select_from(table).where(*where))
+    keys = _key_of(columns, table)
+    return {keys(row): row for row in map(tuple, answer)}
 
 
-def _ordered(keys: Iterable[Row]) -> list[Row]:
-    return sorted(keys, key=lambda key: tuple(map(str, key)) if len(key) > 1 else key)
+def _key_of(columns: Sequence[str], table: Table | None) -> Callable[[Row], Row]:
+    """The key of a row of these columns."""
+    names = ["id"] if table is None else [each.name for each in table.primary_key.columns]
+    places = [columns.index(each) for each in names]
+    if len(places) == 1:
+        (only,) = places
+        return lambda row: (row[only],)
+    return itemgetter(*places)
+
+
+def _compared(
+    name: str, columns: Sequence[str], made: Mapping[Row, Row], there: Mapping[Row, Row]
+) -> Iterator[Difference]:
+    if made == there:
+        return
+    for key in sorted(made.keys() | there.keys(), key=_comparable):
+        stored, expected = there.get(key), made.get(key)
+        if stored == expected:
+            continue
+        number, sequence = (key[0], 1) if name in _EPISODE_KEYED else _event_of(key[0])
+        if stored is None or expected is None:
+            yield Difference(number, sequence, name, None, stored, expected)
+            continue
+        for title, one, other in zip(columns, stored, expected, strict=True):
+            if one != other:
+                yield Difference(number, sequence, name, title, one, other)
+
+
+def _event_of(key: Any) -> tuple[int, int]:
+    """Episode and event that make the row; SQLite also keeps what is no number where a number belongs."""
+    return row_key(key)[:2] if isinstance(key, int) else (0, 0)
+
+
+def _comparable(key: Row) -> list[tuple[str, Any]]:
+    return [(type(each).__name__, each) for each in key]

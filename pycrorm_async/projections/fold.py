@@ -36,17 +36,25 @@ from pycrorm_async.projections.rows import EpisodeEnd, NodeEnd, Row, Rows
 from pycrorm_async.projections.values import CannotFold, json_text, microseconds, pose_columns, row
 from pycrorm_async.store.rows import StoredEvent
 
-__all__ = ["fold", "happening_of", "CannotFold"]
+__all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "Undecodable"]
+
+
+class Undecodable(CannotFold):
+    """The payload is none of its type and version: nobody has written it like that."""
 
 
 def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
     """Adds what this event means to `rows`. Raises `CannotFold`, and then has added nothing."""
-    happening = happening_of(event)
+    fold_happening(event, happening_of(event), designators, rows)
+
+
+def fold_happening(event: StoredEvent, happening: Happening, designators: Designators, rows: Rows) -> None:
+    """The same for whoever has read already what happened."""
     _FOLDS[event.type](event, happening, designators, rows)
 
 
 def happening_of(event: StoredEvent) -> Happening:
-    """What happened, of an event of an episode: for every fold there is. Raises `CannotFold`."""
+    """What happened, of an event of an episode: for every fold there is. Raises `CannotFold`, `Undecodable`."""
     shape = EVENT_TYPES.get(event.type)
     if shape is None or event.type not in _FOLDS:
         raise CannotFold(f"{event.type} is not an event this version knows")
@@ -54,8 +62,8 @@ def happening_of(event: StoredEvent) -> Happening:
         raise CannotFold(f"{event.type} has version {event.version}, this version knows {shape.version}")
     try:
         return decode(event.type, event.payload)
-    except msgspec.DecodeError as error:
-        raise CannotFold(f"{event.type} cannot be decoded: {error}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise Undecodable(f"{event.type} cannot be decoded: {error}") from None
 
 
 # --- episodes -------------------------------------------------------------------------------------------------

@@ -61,7 +61,9 @@ class OwnRows:
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
         """All rows to insert, by (table, columns)."""
         return {
-            (table, tuple(self._columns[table])): [tuple(map(each.get, self._columns[table])) for each in rows.values()]
+            (f"{OWN}{table}", tuple(self._columns[table])): [
+                tuple(map(each.get, self._columns[table])) for each in rows.values()
+            ]
             for table, rows in self._inserts.items()
             if rows
         }
@@ -70,7 +72,7 @@ class OwnRows:
         """All of it, in this transaction. Raises `RowRefused`."""
         dialect, quote = dialect_of(connection), connection.dialect.identifier_preparer.quote
         for (table, columns), made in self.to_insert().items():
-            await dialect.insert_rows(connection, physical_name(f"{OWN}{table}", generation), columns, made)
+            await dialect.insert_rows(connection, physical_name(table, generation), columns, made)
         for table, rows in self._updates.items():
             alike: dict[tuple[str, ...], list[Row]] = {}
             for id_, values in rows.items():

@@ -69,7 +69,8 @@ _PAUSE_S = 0.02
 _LATE_EVENTS_MAX = 2_000
 """So many events may be left to fold when the new tables are shown: they are folded while everybody waits."""
 _SHOW_ATTEMPTS = 50
-_DROP_ATTEMPTS = 6
+_DROP_PAUSES_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
+"""Before each attempt: a question that was asked before the new tables were shown is answered by then."""
 _EVENTS = text("SELECT coalesce(sum(head), 0) FROM episode")
 
 
@@ -282,9 +283,9 @@ async def clear(log: EventLog) -> list[str]:
     """Drops what is not shown any more, little by little; gives the names of the tables that had to be left."""
     left: list[str] = []
     with log.translated():
-        await _sweep(log)
         async with log.engine.connect() as connection:
             there = await _known(log, connection)
+        await _sweep(log)
         for key, generation in there.items():
             if key == SHOWN:
                 await _drop(log, progress.place_of(generation.number))
@@ -299,7 +300,7 @@ async def clear(log: EventLog) -> list[str]:
                 progress.TABLE if ours else f"{progress.TABLE}_{of.removeprefix(PROJECTION)}",
             ]
             named = [physical_name(each, generation.number) for each in tables]
-            kept = [each for each in named if not await _drop(log, each)]
+            kept = await _drop_all(log, named)
             left += kept
             if not kept:
                 async with log.engine.begin() as connection:
@@ -324,6 +325,17 @@ async def _sweep(log: EventLog) -> None:
         await dialect_of(connection).sweep(connection)
 
 
+async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
+    """Those of them that somebody uses, and goes on using."""
+    for pause_s in _DROP_PAUSES_S:
+        await asyncio.sleep(pause_s)
+        await _sweep(log)  # where a view that was replaced cannot go yet, its tables cannot
+        tables = [each for each in tables if not await _drop(log, each)]
+        if not tables:
+            break
+    return tables
+
+
 async def _drop(log: EventLog, table: str) -> bool:
     dialect = dialect_of(log.engine)
     async with log.engine.connect() as connection:
@@ -335,12 +347,9 @@ async def _drop(log: EventLog, table: str) -> bool:
             full = await dialect.empty(connection, table, rows_max=_SLICE_ROWS)
         if full:
             await asyncio.sleep(_PAUSE_S)
-    for attempt in range(_DROP_ATTEMPTS):
-        try:
-            async with log.engine.begin() as connection:
-                await dialect.drop(connection, table)
-        except dialect.faults:
-            await asyncio.sleep(0.05 * attempt)  # somebody reads it still
-        else:
-            return True
-    return False
+    try:
+        async with log.engine.begin() as connection:
+            await dialect.drop(connection, table)
+    except dialect.faults:
+        return False  # somebody reads it still
+    return True

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -38,6 +39,9 @@ from pycrorm_async.queue.syncer import Syncer
 __all__ = ["RecorderQueue"]
 
 _LAST_SYNC_S = 30.0
+_log = logging.getLogger("pycrorm_async")
+_SAY_S = 2.0
+"""Who waits longer for room is told why."""
 _LOOK_S = 0.05
 """How often the sync thread looks what another process has drained, while that may make a difference."""
 
@@ -130,8 +134,19 @@ class RecorderQueue:
 
         Raises `SpoolStuck` when there is no use in waiting (`give_up`).
         """
-        await self._room_bell.until(lambda: self._room_is_decided(reserved=False))
+        saying = asyncio.get_running_loop().call_later(_SAY_S, self._say_it_waits)
+        try:
+            await self._room_bell.until(lambda: self._room_is_decided(reserved=False))
+        finally:
+            saying.cancel()
         self._refuse_to_wait(reserved=False)
+
+    def _say_it_waits(self) -> None:
+        _log.warning(
+            "the plan waits: %s is full, or its disk, and goes on when the database has taken some of it"
+            " (`pycrorm status` says how that is)",
+            self.folder.parent,
+        )
 
     def block_until_room(self, timeout_s: float) -> bool:
         """Block this thread until a reserved event fits; False if the time is over. Raises `SpoolStuck` as `room` does.

@@ -111,8 +111,8 @@ class Dialect(Protocol):
         """Whatever is read in the transaction that begins now is of one moment."""
         ...
 
-    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
-        """Until the transaction ends, none of these tables is dropped."""
+    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
+        """Until the transaction ends, none of these tables is dropped; False, and the transaction over, if one is."""
         ...
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:

@@ -15,7 +15,9 @@ from multiprocessing.connection import Connection
 __all__ = ["Forked"]
 
 _FORKED = multiprocessing.get_context("forkserver")
-_FORKED.set_forkserver_preload(["tests.crash.recording", "tests.crash.chores", "tests.crash.walking"])
+_FORKED.set_forkserver_preload(
+    ["tests.crash.recording", "tests.crash.chores", "tests.crash.walking", "tests.crash.remaking"]
+)
 _HANGS_S = 300.0
 
 

@@ -103,10 +103,16 @@ class PostgreSQL:
     async def hold_still(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
 
-    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
+    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
         quote = connection.dialect.identifier_preparer.quote
         named = ", ".join(f"{TABLES_SCHEMA}.{quote(each)}" for each in tables)
-        await connection.exec_driver_sql(f"LOCK TABLE {named} IN ACCESS SHARE MODE")
+        try:
+            await connection.exec_driver_sql(f"LOCK TABLE {named} IN ACCESS SHARE MODE")
+        except DBAPIError as error:
+            if faults.is_missing_table(error):
+                return False
+            raise
+        return True
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:  # noqa: ARG002
         return []  # a server looks after its pages itself

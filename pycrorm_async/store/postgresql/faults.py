@@ -9,7 +9,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError
 
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
 
-__all__ = ["FAULTS", "ROW_FAULTS", "ours"]
+__all__ = ["FAULTS", "ROW_FAULTS", "ours", "is_missing_table"]
 
 FAULTS: tuple[type[Exception], ...] = (
     DBAPIError,
@@ -56,6 +56,11 @@ def ours(error: Exception, database: str) -> PycrormError:
     if not code or isinstance(error, InterfaceError):  # between us and the server: refused, reset, timed out, closed
         return DatabaseUnavailable(f"{database}: {text}")
     return InternalError(f"{database}: {text}")
+
+
+def is_missing_table(error: DBAPIError) -> bool:
+    """Whether a table that was named is not there."""
+    return error.orig is not None and _code(error.orig) == "42P01"
 
 
 def _code(fault: BaseException) -> str:

@@ -108,8 +108,9 @@ class SQLite:
     async def hold_still(self, connection: AsyncConnection) -> None:
         """A transaction is a snapshot."""
 
-    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
-        """They are of the snapshot."""
+    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:  # they are of the snapshot
+        there = (await connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'")).scalars()
+        return set(tables) <= set(there)
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
         found = list((await connection.exec_driver_sql("PRAGMA quick_check")).scalars())

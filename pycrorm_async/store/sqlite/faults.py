@@ -36,6 +36,8 @@ def ours(error: DBAPIError, database: str) -> PycrormError:
     """The error to raise in its place."""
     fault = error.orig
     code = getattr(fault, "sqlite_errorcode", None)
+    if code is None and str(fault).startswith("Could not decode to UTF-8"):
+        return DamageError(f"{database} is damaged: {fault}")
     if code is None:  # raised by the driver between us and SQLite: a connection that is gone
         return DatabaseUnavailable(f"{database}: {fault}")
     primary = code & 0xFF

@@ -1,0 +1,76 @@
+"""Ctrl-C while a plan runs, and while what it recorded is being stored."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from pycrorm_async.cli.output import note, problem
+
+__all__ = ["Interrupting"]
+
+_SAY_S = 1.0
+_PATIENCE = 2
+"""A plan that is interrupted may have to wait for room to say so."""
+
+
+class Interrupting:
+    """Once ends the plan, as asyncio does; then what it recorded is stored. Once more leaves at once.
+
+    To be used in the loop's own thread. Nothing is lost by leaving: what is not in the database is in the spool.
+    """
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._storing = False
+
+    @contextmanager
+    def heeded(self) -> Iterator[None]:
+        """While the plan runs, and after it."""
+        task, loop = asyncio.current_task(), asyncio.get_running_loop()
+        assert task is not None
+
+        def told(_number: int, _frame: FrameType | None) -> None:
+            self._count += 1
+            if self._storing or self._count > _PATIENCE:
+                problem("interrupted; what is not stored yet is safe in the spool, and the next start brings it in")
+                os._exit(130)
+            if self._count > 1:  # a plan that never suspends, or does not let itself be cancelled
+                raise KeyboardInterrupt
+            task.cancel()
+            loop.call_soon_threadsafe(lambda: None)  # it may be asleep
+
+        before = signal.getsignal(signal.SIGINT)
+        if before is not signal.default_int_handler and not _is_asyncios(before):  # ignored, or somebody else's
+            yield
+            return
+        signal.signal(signal.SIGINT, told)
+        try:
+            yield
+        except asyncio.CancelledError:
+            if self._count:
+                raise KeyboardInterrupt from None
+            raise
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    @property
+    def asked(self) -> bool:
+        """Whether somebody asked the plan to end."""
+        return self._count > 0
+
+    def ended(self) -> None:
+        """The plan is over: from now on there is only storing to interrupt."""
+        if self._count:
+            asyncio.get_running_loop().call_later(
+                _SAY_S, note, "what was recorded is being stored. Ctrl-C again leaves at once, and loses nothing"
+            )
+        self._storing = True
+
+
+def _is_asyncios(handler: object) -> bool:
+    return getattr(getattr(handler, "func", handler), "__module__", None) == "asyncio.runners"

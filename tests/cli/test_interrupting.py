@@ -1,0 +1,67 @@
+"""Ctrl-C while what a plan recorded cannot be stored: it leaves at once, and nothing is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from tests.commands import answer, pycrorm
+
+PLAN = """
+import pathlib, time
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class WaitingAction(ActionAbstract):
+    name: str
+
+    async def perform(self):
+        pathlib.Path("waits").touch()
+        while not pathlib.Path("go").exists():
+            time.sleep(0.01)
+
+async def plan():
+    await WaitingAction("for a sign").perform()
+    pathlib.Path("done").touch()
+"""
+
+
+def _appears(path: Path) -> bool:
+    end = time.monotonic() + 120
+    while not path.exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    return path.exists()
+
+
+def test_a_plan_whose_database_is_away_at_its_end_is_left_with_ctrl_c_and_stored_later(tmp_path: Path) -> None:
+    (tmp_path / "waits.py").write_text(PLAN)
+    running = subprocess.Popen(
+        [sys.executable, "-m", "pycrorm_async", "run", "waits.py"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert _appears(tmp_path / "waits")
+        with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=60)) as other:
+            other.execute("BEGIN IMMEDIATE")
+            (tmp_path / "go").touch()
+            assert _appears(tmp_path / "done")
+            time.sleep(1)  # it has begun to wait for the database
+            running.send_signal(signal.SIGINT)
+            _, told = running.communicate(timeout=60)  # and not the five minutes that closing would wait
+    finally:
+        running.kill()
+    assert running.returncode == 130
+    assert "what is not stored yet is safe in the spool" in told
+    assert pycrorm("writer", "--once", cwd=tmp_path).returncode == 0
+    (episode,) = answer("episodes", cwd=tmp_path)
+    assert episode["nodes"] == 2
+    assert [node["status"] for node in answer("show", "1", cwd=tmp_path)["tree"]] == ["SUCCEEDED", "SUCCEEDED"]

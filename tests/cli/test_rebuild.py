@@ -1,0 +1,114 @@
+"""`pycrorm rebuild` as a user meets it: in a process of its own that knows nothing of the plan."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sqlite3
+import subprocess
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.projections.rebuild import claimed
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.databases import ask
+from tests.projections.remade import TYPES, parking, picking, store, str_of, traces
+from tests.tables import differences, tables_of
+
+PLAN = '''
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class WeighActionPerformable(ActionAbstract):
+    what: str
+    grams: float
+    async def perform(self): ...
+
+async def plan():
+    """Weigh it."""
+    await WeighActionPerformable("milk", 0.1).perform()
+'''
+
+
+def test_it_needs_no_code_of_the_plan_and_says_what_it_made(tmp_path: Path) -> None:
+    (tmp_path / "weighing.py").write_text(PLAN)
+    assert pycrorm("run", "weighing.py", cwd=tmp_path).returncode == 0
+    (tmp_path / "weighing.py").unlink()
+    url = f"sqlite:///{tmp_path}/pycrorm.db"
+    before = tables_of(url)
+    assert next(iter(before["weigh_action"].values()))["grams"] == 0.1
+    done = answer("rebuild", "--workers", "2", cwd=tmp_path)
+    assert {**done, "seconds": 0} == {
+        "generation": 2, "events": 6, "episodes": 1, "seconds": 0, "parked": {}, "left": []
+    }  # fmt: skip
+    assert differences(before, tables_of(url)) == []
+    assert traces(url) == []
+    told = pycrorm("rebuild", cwd=tmp_path)
+    assert (told.returncode, told.stderr) == (0, "")
+    assert told.stdout.startswith("generation 3: 6 events of 1 episodes in ")
+
+
+def test_an_episode_that_cannot_be_folded_is_told_and_is_a_problem(tmp_path: Path) -> None:
+    asyncio.run(store(f"sqlite:///{tmp_path}/pycrorm.db", [*TYPES, *picking(1).records, *parking(2).records]))
+    done = pycrorm("rebuild", cwd=tmp_path)
+    assert done.returncode == 1
+    assert one_line_of(done).startswith(f"episode {str_of(2)} is parked: event 3: ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "line"),
+    [
+        (["--url", "sqlite:///none.db"], 3, "none.db does not exist"),
+        (["--url", "sqlite://"], 2, "sqlite:// is gone with its process"),
+        (["--url", "sqlite:///text.db"], 3, "is not a database"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path: Path, arguments: Sequence[str], code: int, line: str) -> None:
+    (tmp_path / "text.db").write_text("no database at all, " * 100)
+    done = pycrorm("rebuild", *arguments, cwd=tmp_path)
+    assert done.returncode == code
+    assert line in one_line_of(done)
+    assert [each.name for each in tmp_path.iterdir()] == ["text.db"]
+
+
+async def test_a_second_one_is_refused_with_one_line(database_url: str, tmp_path: Path) -> None:
+    await store(database_url, [*TYPES, *picking(1).records])
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    async with claimed(log):
+        done = await asyncio.to_thread(pycrorm, "rebuild", "--url", database_url, cwd=tmp_path)
+    await log.close()
+    assert done.returncode == 2
+    assert one_line_of(done).endswith("another `pycrorm rebuild` is at work: wait for it to end")
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_interrupted_it_leaves_with_130_and_the_next_one_goes_on(tmp_path: Path, workers: str) -> None:
+    url = f"sqlite:///{tmp_path}/pycrorm.db"
+    asyncio.run(store(url, [*TYPES, *(each for number in range(1, 100) for each in picking(number).records)]))
+    before = tables_of(url)
+    command = [*COMMAND, "rebuild", "--workers", workers]
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment(), stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
+    blocker = sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=60)
+    while not ask(url, "SELECT 1 FROM pycrorm_generation WHERE projection = 'tables/making'"):
+        time.sleep(0.001)
+    blocker.execute("BEGIN IMMEDIATE")  # nobody gets any further
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
+    output, errors = process.communicate(timeout=120)
+    blocker.execute("ROLLBACK")
+    blocker.close()
+    assert (process.returncode, output) == (130, ""), errors
+    assert errors == "pycrorm: interrupted; what was recorded up to here is kept\n"
+    assert differences(before, tables_of(url)) == []
+    assert answer("rebuild", cwd=tmp_path)["generation"] == 2
+    assert differences(before, tables_of(url)) == []
+    assert traces(url) == []

@@ -1,0 +1,125 @@
+"""A rebuild is killed anywhere, and runs beside processes that record and read: nobody sees less than before."""
+
+from __future__ import annotations
+
+import random
+import time
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.rebuilding import rebuild_memory
+from tests.crash.forked import Forked
+from tests.crash.remaking import read_until_told, rebuild_until, record_until_told
+from tests.databases import ask
+from tests.projections.remade import TYPES, folded_elsewhere, picking, store, traces
+from tests.tables import differences, tables_of
+
+EPISODES = 30
+BATCH_EVENTS = 60
+
+
+async def filled(url: str, episodes: int = EPISODES) -> None:
+    records = (each for number in range(1, episodes + 1) for each in picking(number).records)
+    await store(url, [*TYPES, *records])
+
+
+def killed_at(url: str, last: int, *, workers: int) -> None:
+    process = Forked(rebuild_until, url, last, workers, BATCH_EVENTS)
+    assert process.wait() in (-9, 0), process.said
+
+
+async def kill_again_and_again(url: str, kills: int, *, workers: int) -> None:
+    await filled(url)
+    before = tables_of(url)
+    whole = Forked(rebuild_until, url, 0, workers, BATCH_EVENTS)
+    assert whole.wait() == 0
+    count = int(whole.said[-1])
+    assert differences(before, tables_of(url)) == []
+    seed = random.randrange(2**31)
+    print("seed", seed, "statements", count)
+    rng = random.Random(seed)
+    for _ in range(kills):
+        # Half of them at the end, where the new tables are put in place and the old ones dropped.
+        last = rng.randint(1, count) if rng.random() < 0.5 else rng.randint(count * 2 // 3, count)
+        killed_at(url, last, workers=workers)
+        assert differences(before, tables_of(url)) == [], f"killed at statement {last}"
+        if rng.random() < 0.5:
+            assert (await rebuild_memory(url)).left == []
+            assert differences(before, tables_of(url)) == [], f"after a kill at statement {last}"
+            assert traces(url) == [], f"after a kill at statement {last}"
+    assert (await rebuild_memory(url)).left == []
+    assert differences(before, tables_of(url)) == []
+    assert traces(url) == []
+
+
+async def test_killed_anywhere_people_see_the_same_and_the_next_rebuild_leaves_no_trace(database_url: str) -> None:
+    await kill_again_and_again(database_url, 8, workers=1)
+
+
+async def test_so_it_is_when_workers_fold(tmp_path: Path) -> None:
+    await kill_again_and_again(f"sqlite:///{tmp_path}/memory.db", 2, workers=2)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("workers", [1, 2])
+async def test_killed_at_fifty_points_people_see_the_same(database_url: str, workers: int) -> None:
+    await kill_again_and_again(database_url, 50, workers=workers)
+
+
+async def test_a_worker_that_is_killed_costs_time_and_no_event(
+    database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from multiprocessing.context import SpawnProcess
+
+    await filled(database_url)
+    before = tables_of(database_url)
+    original = SpawnProcess.start
+
+    def start(self: SpawnProcess) -> None:
+        original(self)
+        self.kill()
+
+    monkeypatch.setattr(SpawnProcess, "start", start)
+    done = await rebuild_memory(database_url, workers=2)
+    assert (done.generation, done.left) == (2, [])
+    assert differences(before, tables_of(database_url)) == []
+
+
+async def beside_others(url: str, folder: Path, *, episodes: int, rebuilds: int, readers: int) -> None:
+    await filled(url, episodes)
+    others = [Forked(record_until_told, url), *(Forked(read_until_told, url) for _ in range(readers))]
+    for each in others:
+        each.wait_for_its_first_words()
+    began = time.monotonic()
+    for _ in range(rebuilds):
+        assert (await rebuild_memory(url)).left == []
+    took_s = time.monotonic() - began
+    for each in others:
+        each.tell_to_stop()
+    codes = [each.wait() for each in others]
+    assert codes == [0] * len(others), [each.said[-3:] for each in others]
+    for each in others[1:]:
+        *counts, waited = each.said
+        seen = [tuple(map(int, line.split()[1:])) for line in counts]
+        assert seen[0][0] >= episodes
+        assert seen[0][3] >= 5 * episodes
+        assert all(a <= b for one, other in pairwise(seen) for a, b in zip(one, other, strict=True)), seen
+        print(f"read {len(seen)} times, {waited} s at most")
+    _, recorded, longest_s = others[0].said[-1].split()
+    print(f"{recorded} episodes recorded in {took_s:.1f} s, flushed in {longest_s} s at most")
+    assert ask(url, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
+    assert ask(url, "SELECT count(*) FROM process_metadata") == [(episodes + int(recorded),)]
+    assert differences(tables_of(url), await folded_elsewhere(url, folder)) == []
+    await rebuild_memory(url)
+    assert traces(url) == []
+
+
+async def test_processes_that_record_and_read_meanwhile_see_nothing_of_it(database_url: str, tmp_path: Path) -> None:
+    await beside_others(database_url, tmp_path, episodes=300, rebuilds=2, readers=2)
+
+
+@pytest.mark.soak
+async def test_processes_that_record_and_read_for_long_see_nothing_of_it(database_url: str, tmp_path: Path) -> None:
+    await beside_others(database_url, tmp_path, episodes=10_000, rebuilds=5, readers=4)

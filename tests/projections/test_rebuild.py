@@ -1,0 +1,297 @@
+"""Tables made anew from the log: the same rows, nothing missing for whoever reads or records meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from sqlalchemy import func, select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
+from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
+from pycrorm_async.projections import rebuild as steps
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.rebuild import Rebuild, claimed
+from pycrorm_async.projections.views import UserView
+from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.databases import Server, ask, ask_to_change
+from tests.projections.remade import TYPES, folded_elsewhere, lost, parking, picking, store, str_of, traces, whispering
+from tests.promises.test_random_plans import play
+from tests.tables import differences, tables_of
+
+PATIENT = Settings(connect_timeout_s=120, flush_timeout_s=300)
+STOPPED = "SELECT number, folded, parked FROM episode ORDER BY number"
+OUR_VIEW = UserView("Failed", select(TaskTreeNode.id, TaskTreeNode.reason).where(TaskTreeNode.reason.is_not(None)))
+
+
+async def some_of_everything(url: str) -> None:
+    """Random plans with types of their own and failures, a thought, one that was lost, one that cannot be folded."""
+    async with Memory.open(url, views=[OUR_VIEW], settings=PATIENT) as memory:
+        for seed in range(6):
+            await play(seed, memory)
+        await memory.flush()
+    scripts = [*map(picking, range(1, 8)), picking(8, simulated=True), lost(9), parking(10)]
+    await store(url, [*TYPES, *(each for script in scripts for each in script.records)])
+    await store(url, whispering(11))
+
+
+async def test_tables_made_anew_hold_row_for_row_what_was_kept_up_to_date(database_url: str, tmp_path: Path) -> None:
+    await some_of_everything(database_url)
+    before, stopped, failed = tables_of(database_url), ask(database_url, STOPPED), ask(database_url, FAILED)
+    assert len([why for _, _, why in stopped if why]) == 1
+    assert failed
+    # Whatever became of the tables: they are made of the log, not of themselves.
+    at = "memory_tables." if database_url.startswith("postgresql:") else ""
+    for change in ("DELETE FROM {}pose__1", "UPDATE {}task_tree_node__1 SET status = 'RUNNING'"):
+        ask_to_change(database_url, change.format(at))
+    assert differences(before, tables_of(database_url)) != []
+    done = await rebuild_memory(database_url)
+    assert differences(before, tables_of(database_url)) == []
+    assert differences(before, await folded_elsewhere(database_url, tmp_path)) == []
+    assert ask(database_url, STOPPED) == stopped
+    assert ask(database_url, FAILED) == failed
+    assert (done.generation, done.left, list(done.parked)) == (2, [], [str_of(10)])
+    assert traces(database_url) == []
+    again = await rebuild_memory(database_url, workers=2, views=[UserView("All", select(TaskTreeNode.id))])
+    assert differences(before, tables_of(database_url)) == []
+    assert (again.generation, again.left) == (3, [])
+    assert ask(database_url, 'SELECT count(*) FROM "All"') == ask(database_url, "SELECT count(*) FROM task_tree_node")
+    assert ask(database_url, FAILED) == failed
+    assert traces(database_url) == []
+
+
+FAILED = 'SELECT * FROM "Failed" ORDER BY id'
+
+
+async def test_tables_that_nobody_ever_made_are_made(database_url: str) -> None:
+    await store(database_url, [*TYPES, *picking(1).records, *parking(2).records], folded=False)
+    done = await rebuild_memory(database_url)
+    assert (done.generation, done.events, done.episodes) == (1, 19, 2)
+    assert [(number, folded) for number, folded, _ in ask(database_url, STOPPED)] == [(1, 15), (2, 2)]
+    assert ask(database_url, "SELECT count(*) FROM pick_up_action") == [(5,)]
+    assert traces(database_url) == []
+
+
+async def test_what_is_folded_beside_rebuilds_is_in_the_tables_and_no_reader_misses_anything(
+    database_url: str, tmp_path: Path
+) -> None:
+    await beside(database_url, tmp_path, rebuilds=4)
+
+
+@pytest.mark.soak
+async def test_what_is_folded_beside_many_rebuilds_is_in_the_tables(database_url: str, tmp_path: Path) -> None:
+    await beside(database_url, tmp_path, rebuilds=50)
+
+
+async def beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
+    await store(database_url, [*TYPES, *(each for number in range(1, 30) for each in picking(number).records)])
+    over = asyncio.Event()
+    seen: list[tuple[int, ...]] = []
+
+    async def record() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(database_url), create=True, busy_timeout_s=60)
+        projector = Projector(log, batch_events=50)
+        await projector.open()
+        number = 30
+        while not over.is_set():
+            # In pieces, so that an episode is switched in its middle; a type that is new while tables are made.
+            records = whispering(number) if number == 40 else picking(number).records
+            for place in range(0, len(records), 4):
+                assert await log.append(records[place : place + 4]) == {}
+                await projector.fold_some()
+            await asyncio.sleep(0.01)
+            number += 1
+        await projector.fold_behind()
+        await log.close()
+
+    async def read() -> None:
+        asked = [
+            select(func.count()).select_from(each) for each in (TaskTreeNode, PickUpAction, TaskTreeNode.__table__)
+        ]
+        async with Reading.open(database_url) as reading:
+            while not over.is_set():
+                async with reading.session() as session:
+                    counts = [(await session.scalars(each)).one() for each in asked]
+                    counts.append(len((await session.scalars(select(Action.id))).all()))
+                seen.append((len(await reading.episodes()), *counts))
+                await asyncio.sleep(0)
+
+    async with asyncio.TaskGroup() as group:
+        group.create_task(record())
+        group.create_task(read())
+        for _ in range(rebuilds):
+            assert (await rebuild_memory(database_url)).left == []
+        over.set()
+    assert len(seen) > rebuilds
+    for one, next_one in pairwise(seen):
+        assert all(before <= after for before, after in zip(one, next_one, strict=True)), (one, next_one)
+    assert ask(database_url, "SELECT count(*) FROM episode WHERE folded < head OR parked IS NOT NULL") == [(0,)]
+    assert differences(tables_of(database_url), await folded_elsewhere(database_url, tmp_path)) == []
+    await rebuild_memory(database_url)
+    assert traces(database_url) == []
+
+
+async def test_what_is_shown_while_the_new_tables_are_put_in_place_is_in_them(
+    database_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    await store(database_url, [*TYPES, *picking(1).records])
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    projector = Projector(log)
+    await projector.open()
+    # As many episodes as are looked up at once, and some more, of one event each.
+    monkeypatch.setattr(steps, "_LATE_EVENTS_MAX", 10)
+    original, done = Rebuild._show_if_complete, 0
+
+    async def late(self: Rebuild) -> bool:
+        nonlocal done
+        if done < 3:  # after the last look, before everybody is stopped
+            first = 100 * done
+            done += 1
+            count = (13, 11, 3)[done - 1]
+            records = [each for number in range(first + 2, first + 2 + count) for each in picking(number).records[:1]]
+            assert await log.append(records) == {}
+            await projector.fold_behind()
+        return await original(self)
+
+    monkeypatch.setattr(Rebuild, "_show_if_complete", late)
+    await rebuild_memory(database_url)
+    assert done == 3
+    assert ask(database_url, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
+    assert ask(database_url, "SELECT count(*) FROM process_metadata") == [(1 + 13 + 11 + 3,)]
+    assert differences(tables_of(database_url), await folded_elsewhere(database_url, tmp_path)) == []
+    # And who folded before goes on in the new ones.
+    assert await log.append(picking(999).records) == {}
+    await projector.fold_behind()
+    assert ask(database_url, "SELECT count(*) FROM process_metadata") == [(29,)]
+    await log.close()
+
+
+class EndedError(Exception):
+    """Whatever may end it."""
+
+
+async def test_interrupted_it_is_taken_up_where_it_was(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(steps, "_BATCH_EVENTS", 40)
+    await store(database_url, [*TYPES, *(each for number in range(1, 21) for each in picking(number).records)])
+    before = tables_of(database_url)
+
+    def interrupted(what: str, done: int, total: int) -> None:
+        if done >= total // 2:
+            raise EndedError
+
+    with pytest.raises(EndedError):
+        await rebuild_memory(database_url, tell=interrupted)
+    assert differences(before, tables_of(database_url)) == []
+    told: list[int] = []
+    done = await rebuild_memory(database_url, tell=lambda _what, done, _total: told.append(done))
+    assert told[0] > 150
+    assert done.generation == 2
+    assert differences(before, tables_of(database_url)) == []
+    assert traces(database_url) == []
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------
+
+
+async def test_only_one_rebuilds_at_a_time(database_url: str) -> None:
+    await store(database_url, [*TYPES, *picking(1).records])
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    async with claimed(log):
+        with pytest.raises(CallerError, match="another `pycrorm rebuild` is at work: wait for it to end"):
+            await rebuild_memory(database_url)
+    await log.close()
+    assert (await rebuild_memory(database_url)).generation == 2
+
+
+async def test_tables_of_a_newer_version_are_left_alone(database_url: str) -> None:
+    await store(database_url, [*TYPES, *picking(1).records])
+    at = "memory_tables." if database_url.startswith("postgresql:") else ""
+    ask_to_change(database_url, f"UPDATE {at}pycrorm_generation SET version = 999, layout = '[]'")
+    with pytest.raises(DatabaseForeign, match=r"made by version 999 of the fold, this is version \d: use a newer"):
+        await rebuild_memory(database_url)
+    assert ask(database_url, "SELECT count(*) FROM pick_up_action") == [(5,)]
+
+
+async def test_tables_of_an_older_version_are_replaced(database_url: str) -> None:
+    await store(database_url, [*TYPES, *picking(1).records])
+    before = tables_of(database_url)
+    at = "memory_tables." if database_url.startswith("postgresql:") else ""
+    ask_to_change(database_url, f"UPDATE {at}pycrorm_generation SET version = 1")
+    with pytest.raises(DatabaseForeign, match="run `pycrorm rebuild`"):
+        await store(database_url, [])
+    assert (await rebuild_memory(database_url)).generation == 2
+    assert differences(before, tables_of(database_url)) == []
+    assert traces(database_url) == []
+
+
+async def test_what_is_no_memory_is_left_as_it_is(tmp_path: Path, server: Server) -> None:
+    with pytest.raises(DatabaseUnavailable, match=r"none\.db does not exist"):
+        await rebuild_memory(f"sqlite:///{tmp_path}/none.db")
+    assert list(tmp_path.iterdir()) == []
+    other = f"sqlite:///{tmp_path}/other.db"
+    ask_to_change(other, "CREATE TABLE theirs (a)")
+    with pytest.raises(DatabaseForeign, match="of another program"):
+        await rebuild_memory(other)
+    assert ask(other, "SELECT name FROM sqlite_master") == [("theirs",)]
+    with pytest.raises(DatabaseUnavailable, match="holds no memory yet"):
+        await rebuild_memory(server.new_database())
+
+
+async def test_an_event_that_is_gone_from_the_log_is_damage_and_ends_it(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await store(url, [*TYPES, *picking(1).records, *picking(2).records])
+    before = tables_of(url)
+    ask_to_change(url, "DROP TRIGGER event_is_not_deleted")
+    ask_to_change(url, "DELETE FROM event WHERE episode = 2 AND sequence IN (1, 7)")
+    with pytest.raises(LogDamaged, match=f"episode {str_of(2)}, event 1: is missing in"):
+        await rebuild_memory(url)
+    assert differences(before, tables_of(url)) == []
+
+
+# --- what only PostgreSQL knows -------------------------------------------------------------------------------------
+
+
+async def test_a_reader_in_a_transaction_goes_on_and_the_next_rebuild_drops_what_it_reads(server: Server) -> None:
+    url = server.new_database()
+    await store(url, [*TYPES, *picking(1).records])
+    before = tables_of(url)
+    async with Reading.open(url) as reading:
+        async with reading.session() as session:
+            assert len((await session.scalars(select(PickUpAction.id))).all()) == 5
+            done = await rebuild_memory(url)
+            assert "pick_up_action__1" in done.left
+            assert "tables/gone/1" in traces(url)
+            assert len((await session.scalars(select(PickUpAction.id))).all()) == 5
+        assert differences(before, tables_of(url)) == []
+        assert (await rebuild_memory(url)).left == []
+    assert traces(url) == []
+
+
+async def test_a_view_of_somebody_on_ours_keeps_what_it_stands_on_and_that_is_told(server: Server) -> None:
+    url = server.new_database()
+    await store(url, [*TYPES, *picking(1).records])
+    ask_to_change(url, "CREATE VIEW public.mine AS SELECT id FROM memory.pick_up_action")
+    done = await rebuild_memory(url)
+    assert done.left == ["pick_up_action__1"]
+    assert ask(url, "SELECT count(*) FROM public.mine") == [(5,)]
+    ask_to_change(url, "DROP VIEW public.mine")
+    assert (await rebuild_memory(url)).left == []
+    assert traces(url) == []
+
+
+async def test_a_table_of_somebody_in_the_schema_of_the_views_is_one_line_and_stays(server: Server) -> None:
+    url = server.new_database()
+    await store(url, [*TYPES, *picking(1).records])
+    ask_to_change(url, "CREATE TABLE memory.mine (a int)")
+    with pytest.raises(DatabaseError, match=r"memory\.mine is not of the memory.*: move it to another schema"):
+        await rebuild_memory(url)
+    assert ask(url, "SELECT count(*) FROM memory.mine") == [(0,)]
+    ask_to_change(url, "DROP TABLE memory.mine")
+    assert (await rebuild_memory(url)).left == []
+    assert traces(url) == []
