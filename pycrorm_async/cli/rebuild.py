@@ -44,7 +44,8 @@ def rebuild(
     done = {name: asyncio.run(_rebuild(url, workers, known.get(name))) for name in chosen}
     if as_json:
         tables = done["tables"]._asdict() if "tables" in done else {}
-        print_json({**tables, "projections": {name: each._asdict() for name, each in done.items() if name in known}})
+        others = {name: each._asdict() for name, each in done.items() if name in known}
+        print_json({**tables, "projections": others} if others else tables)
     for name, each in done.items():
         if not as_json:
             rate = each.events / max(each.seconds, 1e-9)

@@ -108,20 +108,20 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
         )
     else:
         _print(place, recorders, episodes, has_daemon=has_daemon, known=fault is None)
-        for each in projections:
-            late = f"{each.behind} events behind" if each.behind else "shows all that is stored"
-            stdout.print(f"The projection {each.name}, version {each.version}, {late}.", markup=False)
+        for projection in projections:
+            late = f"is {projection.behind} events behind" if projection.behind else "shows all that is stored"
+            stdout.print(f"The projection {projection.name}, version {projection.version}, {late}.", markup=False)
     if fault is not None:
         problem(fault)
         return 3
     stopped = [each for each in episodes if each.refused or each.parked]
     for episode in stopped:
         problem(f"episode {episode.number} ({episode.id}) is stopped: {episode.refused or episode.parked}")
-    for each in projections:
-        if each.fault is not None:
-            problem(each.fault)
-        for number, reason in each.parked.items():
-            problem(f"episode {number} is stopped in the projection {each.name}: {reason}")
+    for projection in projections:
+        if projection.fault is not None:
+            problem(projection.fault)
+        for number, reason in projection.parked.items():
+            problem(f"episode {number} is stopped in the projection {projection.name}: {reason}")
     given_up = [each for each in recorders if each.given_up]
     for recorder in given_up:
         problem(f"nothing more of recorder {recorder.name} is stored: {recorder.given_up}")

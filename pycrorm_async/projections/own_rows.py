@@ -60,13 +60,12 @@ class OwnRows:
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
         """All rows to insert, by (table, columns)."""
-        return {
-            (f"{OWN}{table}", tuple(self._columns[table])): [
-                tuple(map(each.get, self._columns[table])) for each in rows.values()
-            ]
-            for table, rows in self._inserts.items()
-            if rows
-        }
+        found: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
+        for table, rows in self._inserts.items():
+            columns = tuple(self._columns[table])
+            if rows:
+                found[f"{OWN}{table}", columns] = [tuple(map(each.get, columns)) for each in rows.values()]
+        return found
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:
         """All of it, in this transaction. Raises `RowRefused`."""

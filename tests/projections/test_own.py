@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import asyncio
+import multiprocessing
+import os
+import signal
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
 import pytest
 from sqlalchemy import column, func, select, table, text
+from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.happenings import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.memory import Memory
+from pycrorm_async.projections.comparing import Difference
 from pycrorm_async.projections.fold import CannotFold
 from pycrorm_async.projections.own import Changes, Event, Projection
 from pycrorm_async.projections.own_rows import OwnRows
 from pycrorm_async.projections.own_tables import states
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.projections.asking import ask, names
 from tests.projections.script import PICK_UP, SAYING, Script, declarations, declared, field, mixed, name_of, row
@@ -347,3 +354,93 @@ def test_a_projection_that_cannot_be_is_refused_at_once(attributes: dict[str, An
     kind: type[Projection] = type("Mine", (GraspRate,), attributes)
     with pytest.raises(CallerError, match=f"the projection Mine: {reason}"):
         Memory.open("sqlite://", projections=[kind()])
+
+
+async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pycrorm_async.projections.own_verify._PART_EVENTS", 10)  # several parts
+    records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 5)))]
+    await folded(log, [*records, *tries(5).records[:6]], GraspRate())
+    found = await verify(log, projections=[GraspRate()])
+    assert (found.drift, found.damage, found.not_compared) == (0, 0, {})
+    assert found.rows == (await verify(log)).rows + 4 * 4 + 2
+    assert (await verify(log)).not_compared == {"grasp_rate": "its code is not here"}
+    table = "pycrorm_own_grasp_try__1"
+    first, second = rows_of(2)[:2]
+    async with log.engine.begin() as connection:
+        for change in (
+            f"UPDATE {table} SET arm = 'BOTH' WHERE id = {first[0]}",
+            f"DELETE FROM {table} WHERE id = {second[0]}",
+            f"INSERT INTO {table} (id, process_metadata_id) VALUES ({row(5, number=9)}, 9)",
+        ):
+            await connection.exec_driver_sql(change)
+    found = await verify(log, projections=[GraspRate()])
+    assert found.differences == [
+        Difference(2, 3, "grasp_try", "arm", "BOTH", "LEFT"),
+        Difference(2, 5, "grasp_try", None, None, second),
+        Difference(9, 5, "grasp_try", None, (row(5, number=9), 9, None, None, None), None),
+    ]
+    (only,) = [each for each in await log.episodes() if each.number == 1]
+    assert (await verify(log, episode=only, projections=[GraspRate()])).drift == 0
+    await rebuilt(log, GraspRate())
+    assert (await verify(log, projections=[GraspRate()])).drift == 0
+
+
+async def test_verify_tells_of_a_fold_that_means_something_else_under_the_same_version(log: EventLog) -> None:
+    await folded(log, [*declarations(PICK_UP), *tries().records], GraspRate())
+    found = await verify(log, projections=[NoLeftHand()])
+    (told,) = map(str, found.differences)
+    assert told == (
+        "grasp_rate.fold is 'shown in the tables', and should be"
+        " 'parked: grasp_rate raised ZeroDivisionError: no right hand'"
+    )
+    assert (await verify(log, projections=[NextGraspRate()])).not_compared.keys() == {"grasp_rate"}
+
+
+def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
+    """Folds four events at a time; dies when the rows of that many batches are written, the last not committed."""
+    write, count = OwnRows.write, 0
+
+    async def written(self: OwnRows, connection: AsyncConnection, generation: int) -> None:
+        nonlocal count
+        await write(self, connection, generation)
+        count += 1
+        if count == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    async def fold() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+        if rebuilding:
+            async with claimed(log):
+                await (await Rebuild.begin(log, projection=GraspRate())).show()
+        await folded(log, [], GraspRate(), batch_events=4)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OwnRows, "write", written)
+        patch.setattr("pycrorm_async.projections.rebuild._BATCH_EVENTS", 4)
+        asyncio.run(fold())
+
+
+@pytest.mark.parametrize("rebuilding", [False, True])
+async def test_killed_in_the_middle_it_goes_on_where_it_was(
+    log: EventLog, database_url: str, *, rebuilding: bool
+) -> None:
+    await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], *([GraspRate()] if rebuilding else []))
+    for last in (1, 2):
+        process = multiprocessing.get_context("spawn").Process(
+            target=_die_in_batch, args=(database_url, last), kwargs={"rebuilding": rebuilding}
+        )
+        process.start()
+        await asyncio.to_thread(process.join)
+        assert process.exitcode == -signal.SIGKILL
+    if rebuilding:
+        assert await shown(log) == [*rows_of(1), *rows_of(2)]
+        async with claimed(log):
+            assert await (await Rebuild.begin(log, projection=GraspRate())).left() == 18 - 4
+        await rebuilt(log, GraspRate())
+    else:
+        assert await shown(log) == rows_of(1)[:1]
+        await folded(log, [], GraspRate())
+    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert (await verify(log, projections=[GraspRate()])).drift == 0
