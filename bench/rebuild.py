@@ -80,9 +80,9 @@ def rebuild_and_say(url: str, workers: int) -> None:
     print(json.dumps(said))
 
 
-def waits(url: str, *, rebuilding: bool) -> dict[str, float]:
+def waits(url: str, spool: Path, *, rebuilding: bool) -> dict[str, float]:
     """The longest waits of one that records and of one that reads."""
-    recorder, reader = (Forked(target, url) for target in (record_until_told, read_until_told))
+    recorder, reader = Forked(record_until_told, url, spool), Forked(read_until_told, url)
     for each in (recorder, reader):
         each.wait_for_its_first_words()
     if rebuilding:
@@ -132,8 +132,8 @@ def main() -> None:
                 "cost": round(costs[-1] / costs[0], 2),
                 "mb": round(found[-1]["mb"] - found[0]["mb"], 1),
             }
-        answer["waits_calm"] = waits(url, rebuilding=False)
-        answer["waits_rebuilding"] = waits(url, rebuilding=True)
+        answer["waits_calm"] = waits(url, folder / "spool", rebuilding=False)
+        answer["waits_rebuilding"] = waits(url, folder / "spool", rebuilding=True)
     print(json.dumps(answer))
 
 

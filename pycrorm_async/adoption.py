@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import CallerError, PycrormError
+from pycrorm_async.errors import CallerError, PycrormError, TablesOutdated
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.projections.own import Projection
@@ -48,24 +48,43 @@ _log = logging.getLogger("pycrorm_async")
 
 
 class LogAndTables:
-    """The writer's far end: the log, and the tables behind it. Implements the writer's `Destination` and `Shown`."""
+    """The writer's far end: the log, and the tables behind it. Implements the writer's `Destination` and `Shown`.
+
+    While the tables are those of an older version events are appended, and folding raises `TablesOutdated`.
+    """
 
     def __init__(self, log: EventLog, projector: Projector) -> None:
         self.log_id = log.log_id
         self._log = log
         self._projector = projector
+        self._outdated = False
         # SQLite has one writer at a time, and whoever waits for it sleeps and tries again: better to wait in turn here.
         self._appending = asyncio.Semaphore(1 if log.address.is_sqlite else _APPENDS_AT_ONCE)
+
+    async def open_tables(self) -> None:
+        """Raises as `Projector.open`, but for `TablesOutdated`: then this is tried again before each fold."""
+        try:
+            await self._projector.open()
+        except TablesOutdated as error:
+            self._outdated = True
+            _log.warning("%s; events are recorded meanwhile", error)
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         async with self._appending:
             return await self._log.append(records)
 
     async def fold(self) -> int:
+        await self._await_rebuild()
         return await self._projector.fold_behind()
 
     async def fold_some(self) -> bool:
+        await self._await_rebuild()
         return await self._projector.fold_some()
+
+    async def _await_rebuild(self) -> None:
+        if self._outdated:
+            await self._projector.open()
+            self._outdated = False
 
     async def behind(self) -> Mapping[str, int]:
         return {each.id: each.folded for each in await self._log.behind()}
@@ -91,8 +110,9 @@ async def open_destination(
     try:
         spool.bind(log.log_id)
         projector = Projector(log, views=views, projections=projections, found=installed_besides(projections))
-        await projector.open()
-        yield LogAndTables(log, projector)
+        destination = LogAndTables(log, projector)
+        await destination.open_tables()
+        yield destination
     finally:
         await log.close()
 

@@ -27,6 +27,7 @@ __all__ = [
     "DatabaseError",
     "DatabaseUnavailable",
     "DatabaseForeign",
+    "TablesOutdated",
     "EpisodeParked",
     "FlushTimeout",
     "DamageError",
@@ -127,6 +128,10 @@ class DatabaseUnavailable(DatabaseError):
 
 class DatabaseForeign(DatabaseError):
     """A database of another program, or of a newer version of this one."""
+
+
+class TablesOutdated(DatabaseForeign):
+    """The tables were made by an older fold: recording goes on, and they are shown again after `pycrorm rebuild`."""
 
 
 class EpisodeParked(DatabaseError):

@@ -30,7 +30,7 @@ from pycrorm_async import __version__
 from pycrorm_async.adoption import dead_queues, open_destination
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings, Writer
-from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError
+from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesOutdated
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter, Faults
 from pycrorm_async.hooks.episode import Episode
@@ -222,7 +222,8 @@ class Memory:
         reading = Reading(address)
         self._stack.push_async_callback(reading.close)
         if not by_daemon:
-            await reading.refresh()
+            with suppress(TablesOutdated):  # recording goes on; who asks, or flushes, is told
+                await reading.refresh()
         emitter = Emitter(queue, self._settings)
         told = Recorder(emitter, clock=self._clock, software=__version__)
         return _Parts(queue, writer, reading, emitter, told, PickUpExperience(reading))

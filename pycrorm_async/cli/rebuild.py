@@ -53,8 +53,11 @@ def rebuild(
                 f"{f'{name}, ' if name in known else ''}generation {each.generation}: {each.events} events of"
                 f" {each.episodes} episodes in {duration(int(each.seconds * 1e9))}, {rate:,.0f} events/s"
             )
-        for table in each.left:
-            note(f"{table} is not shown any more, and somebody uses it still: the next rebuild drops it")
+        if each.left:
+            note(
+                f"{len(each.left)} tables that are not shown any more are used still, by a long transaction or a view:"
+                f" {each.left[0]}, … (the next rebuild drops them)"
+            )
         for episode, reason in each.parked.items():
             note(f"episode {episode} is parked{f' in {name}' if name in known else ''}: {reason}")
     return 1 if any(each.parked for each in done.values()) else 0

@@ -2,20 +2,31 @@
 
 `encode` is the border. What JSON cannot hold without changing its meaning is refused with the path to it: NaN and
 infinities (which the encoder alone would turn into null), lone surrogates, U+0000 (which PostgreSQL text refuses),
-and a payload above the limit.
+and a payload above the limit. `decode` reads what any version wrote up to the present one (`upcasters`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 
 from pycrorm_async.events.happenings import EVENT_TYPES, DesignatorTypeDeclared, Happening
+from pycrorm_async.events.upcasters import UPCASTERS, Upcaster
 
-__all__ = ["NotEncodable", "encode", "decode", "fingerprint", "declaration_of", "unwritable"]
+__all__ = [
+    "NotEncodable",
+    "UnknownShape",
+    "Decoder",
+    "encode",
+    "decode",
+    "fingerprint",
+    "declaration_of",
+    "unwritable",
+]
 
 
 class NotEncodable(ValueError):
@@ -27,8 +38,65 @@ class NotEncodable(ValueError):
         self.reason = reason
 
 
+class UnknownShape(LookupError):
+    """This version knows no such event, or not in this version of it; most likely a newer one wrote it."""
+
+
+class Decoder:
+    """Reads payloads of these event types, those of older versions through their upcasters.
+
+    Args:
+        types: event types by name, in their present shape.
+        upcasters: for each older version of each of them, what makes it the next one.
+    """
+
+    def __init__(self, types: Mapping[str, type[Happening]], upcasters: Mapping[tuple[str, int], Upcaster]) -> None:
+        self._versions = {name: kind.version for name, kind in types.items()}
+        self._shapes = {name: msgspec.json.Decoder(kind) for name, kind in types.items()}
+        self._upcasters = dict(upcasters)
+        older = {(name, each) for name, version in self._versions.items() for each in range(1, version)}
+        assert self._upcasters.keys() == older, self._upcasters.keys() ^ older
+
+    def decode(self, type_name: str, payload: bytes, version: int | None = None) -> Happening:
+        """The event in these bytes, which are of this version (None: the present one), in its present shape.
+
+        Raises `UnknownShape`; `msgspec.DecodeError` for bytes that are not of that shape.
+        """
+        present = self._versions.get(type_name)
+        if present is None:
+            raise UnknownShape(f"{type_name} is not an event this version knows")
+        if version is not None and version != present:
+            if not 1 <= version < present:
+                raise UnknownShape(f"{type_name} has version {version}, this version knows {present}")
+            payload = self._upcast(type_name, payload, version, present)
+        event: Happening = self._shapes[type_name].decode(payload)
+        return event
+
+    def declaration_of(self, payload: bytes) -> DesignatorTypeDeclared:
+        """The declaration in these bytes. Raises as `decode` does."""
+        version = msgspec.json.decode(payload, type=_Versioned).version
+        event = self.decode("DesignatorTypeDeclared", payload, version)
+        assert isinstance(event, DesignatorTypeDeclared)
+        return event
+
+    def _upcast(self, type_name: str, payload: bytes, version: int, present: int) -> bytes:
+        document = msgspec.json.decode(payload, type=dict[str, Any])
+        for old in range(version, present):
+            try:
+                document = self._upcasters[type_name, old](document)
+            except (LookupError, TypeError, ValueError, AttributeError) as error:
+                raise msgspec.DecodeError(f"not of version {old}: {error!r}") from error
+        return msgspec.json.encode(document)
+
+
+class _Versioned(msgspec.Struct):
+    version: int = 1
+
+
 _encoder = msgspec.json.Encoder()
-_decoders = {name: msgspec.json.Decoder(kind) for name, kind in EVENT_TYPES.items()}
+_present = Decoder(EVENT_TYPES, UPCASTERS)
+decode = _present.decode
+declaration_of = _present.declaration_of
 
 
 def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
@@ -49,22 +117,9 @@ def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
     return payload
 
 
-def decode(type_name: str, payload: bytes) -> Happening:
-    """The event that `encode` wrote. `KeyError` for an unknown type, `msgspec.DecodeError` for other bytes."""
-    event: Happening = _decoders[type_name].decode(payload)
-    return event
-
-
 def fingerprint(declaration: bytes) -> str:
     """The name of a declaration: 128 bits of BLAKE2b over its payload, as 32 hexadecimal digits."""
     return hashlib.blake2b(declaration, digest_size=16).hexdigest()
-
-
-def declaration_of(payload: bytes) -> DesignatorTypeDeclared:
-    """The declaration in these bytes."""
-    event = decode("DesignatorTypeDeclared", payload)
-    assert isinstance(event, DesignatorTypeDeclared)
-    return event
 
 
 def unwritable(value: Any) -> str | None:

@@ -1,4 +1,4 @@
-"""What can happen, as frozen values: the payloads of the log, version 1.
+"""What can happen, as frozen values: the payloads of the log.
 
 Each class is one event type; its name is the type's name in the log and its `version` counts its shapes. Fields that
 are null or empty are left out of the JSON. World objects are named by the sequence of their `ObjectAdded`; nodes by the
@@ -209,6 +209,7 @@ class DesignatorTypeDeclared(Happening, frozen=True):
         concept: the SOMA concept, where one is known.
         bases: dtypes of the recorded classes it descends from, nearest first.
         fields: in the order of declaration.
+        aliases: dtypes it had before it was renamed.
     """
 
     kind: NodeKind
@@ -217,6 +218,7 @@ class DesignatorTypeDeclared(Happening, frozen=True):
     concept: str | None = None
     bases: tuple[str, ...] = ()
     fields: tuple[FieldDeclared, ...] = ()
+    aliases: tuple[str, ...] = ()
 
 
 class ObjectAdded(Happening, frozen=True):

@@ -28,6 +28,8 @@ __all__ = ["DeclaredType", "Field", "Declarations", "declared_type"]
 
 
 _OUR_PACKAGE = "pycrorm_async."
+_TAKEN = "is {!r} already (set a class attribute `dtype` on one of them)"
+_ALIASED = "was {!r} already (only one of them can have that alias)"
 
 
 class Field(NamedTuple):
@@ -61,6 +63,7 @@ class Declarations:
     def __init__(self) -> None:
         self._declared: weakref.WeakKeyDictionary[type, DeclaredType] = weakref.WeakKeyDictionary()
         self._classes: dict[str, weakref.ref[type]] = {}
+        self._former: dict[str, weakref.ref[type]] = {}
         self._shapes: dict[str, dict[str, str]] = {}
 
     def of(self, designator: type[Designator], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
@@ -70,30 +73,34 @@ class Declarations:
             return known
         declared = declared_type(designator)
         self._refuse_contradiction(designator, declared)
-        for name in (declared.declaration.dtype, declared.declaration.table):
-            reference = self._classes.get(name)
-            other = reference() if reference is not None else None
-            if other is not None and _path(other) != _path(designator):
-                raise DeclarationRefused(
-                    _path(designator),
-                    f"{_path(other)} is {name!r} already (set a class attribute `dtype` on one of them)",
-                )
+        names = (declared.declaration.dtype, declared.declaration.table)
+        self._refuse_taken(designator, self._classes, names, _TAKEN)
+        former = declared.declaration.aliases
+        self._refuse_taken(designator, self._former, former, _ALIASED)
         on_new(declared)
-        for name in (declared.declaration.dtype, declared.declaration.table):
-            self._classes[name] = weakref.ref(designator)
+        self._classes |= dict.fromkeys(names, weakref.ref(designator))
+        self._former |= dict.fromkeys(former, weakref.ref(designator))
         self._declared[designator] = declared
         self._shapes.setdefault(declared.declaration.dtype, {}).update(_shape_of(declared))
         return declared
+
+    def _refuse_taken(
+        self, designator: type, taken: Mapping[str, weakref.ref[type]], names: Sequence[str], reason: str
+    ) -> None:
+        for name in names:
+            reference = taken.get(name)
+            other = reference() if reference is not None else None
+            if other is not None and _path(other) != _path(designator):
+                raise DeclarationRefused(_path(designator), f"{_path(other)} {reason.format(name)}")
 
     def _refuse_contradiction(self, designator: type[Designator], declared: DeclaredType) -> None:
         """A class defined again, or one with the name of a built-in, must not give a field another type."""
         known = dict(self._shapes.get(declared.declaration.dtype, {}))
         if not designator.__module__.startswith(_OUR_PACKAGE):
-            for other in _descendants(Designator):
-                if other.__module__.startswith(_OUR_PACKAGE) and getattr(other, "dtype", None) == designator.dtype:
-                    raise DeclarationRefused(
-                        _path(designator), f"{_path(other)} is {other.dtype!r} already (set a class attribute `dtype`)"
-                    )
+            for other in _ours(designator.dtype):
+                raise DeclarationRefused(
+                    _path(designator), f"{_path(other)} is {other.dtype!r} already (set a class attribute `dtype`)"
+                )
         for name, kind in _shape_of(declared).items():
             if known.setdefault(name, kind) != kind:
                 raise DeclarationRefused(
@@ -136,6 +143,7 @@ def declared_type(designator: type[Designator]) -> DeclaredType:
         concept=designator.concept,
         bases=_bases(designator),
         fields=tuple(field.declared for field in fields),
+        aliases=_aliases(designator),
     )
     payload = encode(declaration)
     return DeclaredType(declaration, payload, fingerprint(payload), fields)
@@ -155,6 +163,39 @@ def _bases(designator: type[Designator]) -> tuple[str, ...]:
         for base in designator.__mro__[1:]
         if issubclass(base, Designator) and not getattr(base, "__abstractmethods__", None)
     )
+
+
+def _aliases(designator: type[Designator]) -> tuple[str, ...]:
+    """The class attribute `aliases`: names that the type itself had before, so a subclass does not inherit them."""
+    given = vars(designator).get("aliases", ())
+    if dataclasses.is_dataclass(designator) and "aliases" in {each.name for each in dataclasses.fields(designator)}:
+        return ()
+    if not isinstance(given, tuple | list) or not all(isinstance(each, str) for each in given):
+        raise DeclarationRefused(_path(designator), f"its aliases {given!r} are no tuple of names: ('OldAction',)")
+    for each in given:
+        fault = _fault_in_alias(each, designator)
+        if fault is not None:
+            raise DeclarationRefused(_path(designator), f"its alias {each!r} {fault}")
+    return tuple(given)
+
+
+def _fault_in_alias(alias: str, designator: type[Designator]) -> str | None:
+    if _fault_in_dtype(alias) is not None:
+        return "is not a name (letters, digits and single underscores)"
+    if alias == designator.dtype:
+        return "is its present name"
+    if alias in _bases(designator):
+        return "is that of a class it descends from, which is another type"
+    for other in _ours(alias):
+        return f"is that of {_path(other)}"
+    return None
+
+
+def _ours(dtype: str) -> typing.Iterator[type[Designator]]:
+    """The built-in classes of that name."""
+    for other in _descendants(Designator):
+        if other.__module__.startswith(_OUR_PACKAGE) and getattr(other, "dtype", None) == dtype:
+            yield other
 
 
 def _fields(designator: type) -> typing.Iterator[Field]:

@@ -1,7 +1,8 @@
 """Classes for types that have none: made from the declarations in a memory, and belonging to that memory alone.
 
     classes = DynamicClasses()
-    classes.learn(unite(layout, payloads).accepted.values())
+    united = unite(layout, payloads)
+    classes.learn(united.accepted.values(), united.layout.renamed)
     classes.use_in(engine)                          # this engine's rows of SayingAction become SayingAction objects
     SayingAction = classes.of("SayingAction")
     classes.dispose()
@@ -13,7 +14,8 @@ own, and only the engines that use it know that identity.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from sqlalchemy import BigInteger, Boolean, Column, Double, ForeignKey, MetaData, Table, Text
@@ -51,17 +53,21 @@ class DynamicClasses:
         self._fields: dict[str, set[str]] = {}
         self._engines: list[AsyncEngine] = []
         self._declared: dict[str, list[DesignatorTypeDeclared]] = {}
+        self._renamed: dict[str, str] = {}
 
-    def learn(self, declarations: Iterable[DesignatorTypeDeclared]) -> None:
+    def learn(
+        self, declarations: Iterable[DesignatorTypeDeclared], renamed: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         """Makes classes for the declared types that have none, and gives known ones their new fields.
 
         Only what the tables accepted, all of it, in the order of its arrival: classes of what contradicts each other
-        would make every question for a common base fail.
+        would make every question for a common base fail. `renamed` gives the present names of types that had others.
         """
+        self._renamed = dict(renamed)
         self._declared = {}
         for each in declarations:
-            self._declared.setdefault(each.dtype, []).append(each)
-        grown = False
+            self._declared.setdefault(self._present_name(each.dtype), []).append(each)
+        grown = self._rename()
         for dtype in self._declared:
             if self._shared(dtype) is None:
                 grown |= self._make(dtype)
@@ -80,7 +86,7 @@ class DynamicClasses:
         """The mapped class of a dtype, a table or a designator class, built-in ones too. Raises `CallerError`."""
         wanted = getattr(name, "dtype", name.__name__) if isinstance(name, type) else name
         of_table = (dtype for dtype, known in self._declared.items() if any(each.table == wanted for each in known))
-        for dtype in (wanted, *of_table):
+        for dtype in map(self._present_name, (wanted, *of_table)):
             found = self._classes.get(dtype) or self._shared(dtype)
             if found is not None:
                 return found
@@ -104,6 +110,17 @@ class DynamicClasses:
             mapper._expire_memoizations()  # noqa: SLF001  there is no public way, and classes would never be freed
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _present_name(self, dtype: str) -> str:
+        return self._renamed.get(dtype, dtype)
+
+    def _rename(self) -> bool:
+        """Whether a class made before its type was renamed is that of the new name now."""
+        moved = [(old, new) for old, new in self._renamed.items() if old in self._classes and new not in self._classes]
+        for old, new in moved:
+            if new not in self._classes:
+                self._classes[new], self._fields[new] = self._classes.pop(old), self._fields.pop(old)
+        return bool(moved)
 
     def _shared(self, dtype: str) -> type[Designator] | None:
         """The class every memory of this process shares, known by the type's name or one of its tables."""
@@ -145,7 +162,7 @@ class DynamicClasses:
         """The class of the nearest type it descends from. One of another kind does not count, nor a descendant (two
         processes may have it the other way round)."""
         root = _ROOTS[declared.kind]
-        for dtype in declared.bases:
+        for dtype in map(self._present_name, declared.bases):
             found = self._classes.get(dtype) or self._shared(dtype)
             if found is None and dtype in self._declared and dtype not in descendants:
                 self._make(dtype, descendants)

@@ -34,6 +34,7 @@ class Designator(Composable, ABC):
         kind: what its nodes are.
         dtype: its name in a memory, by default from the class' name, also for a class that descends from a
             named one: two types never share a name by accident. Set it to keep a name when a class is renamed.
+        aliases: a tuple of the names it had before; what was recorded under these is asked for with it. Not inherited.
         concept: the SOMA concept it stands for, if one is known.
         orm_class: a mapped class of one's own to ask for it with.
 

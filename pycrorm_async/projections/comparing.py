@@ -73,7 +73,7 @@ class Comparison:
 
     Attributes:
         generation: whose tables these are.
-        count: of the rows that were looked at.
+        count: of the rows that were looked at last.
         tables: their names in the database.
     """
 
@@ -106,6 +106,7 @@ class Comparison:
             carried: ids of nodes that have not ended yet; they are looked at later.
             settled: ids of nodes that were carried and are looked at now.
         """
+        self.count = 0
         expected = self._expected(rows)
         found: list[Difference] = []
         for name, table in self._tables.items():
@@ -158,7 +159,7 @@ async def _rows(connection: AsyncConnection, table: Table, *where: ColumnElement
     untyped: list[ColumnElement[Any]] = [column(each) for each in columns]
     answer = await connection.execute(select(*untyped).select_from(table).where(*where))
     keys = _key_of(columns, table)
-    return {keys(row): row for row in map(tuple, answer)}
+    return {keys(row): row for row in map(tuple, answer.all())}
 
 
 def _key_of(columns: Sequence[str], table: Table | None) -> Callable[[Row], Row]:

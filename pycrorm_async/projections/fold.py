@@ -11,9 +11,8 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async.events.codec import decode
+from pycrorm_async.events.codec import UnknownShape, decode
 from pycrorm_async.events.happenings import (
-    EVENT_TYPES,
     EpisodeEnded,
     EpisodeStarted,
     Happening,
@@ -55,13 +54,12 @@ def fold_happening(event: StoredEvent, happening: Happening, designators: Design
 
 def happening_of(event: StoredEvent) -> Happening:
     """What happened, of an event of an episode: for every fold there is. Raises `CannotFold`, `Undecodable`."""
-    shape = EVENT_TYPES.get(event.type)
-    if shape is None or event.type not in _FOLDS:
+    if event.type not in _FOLDS:
         raise CannotFold(f"{event.type} is not an event this version knows")
-    if event.version != shape.version:
-        raise CannotFold(f"{event.type} has version {event.version}, this version knows {shape.version}")
     try:
-        return decode(event.type, event.payload)
+        return decode(event.type, event.payload, event.version)
+    except UnknownShape as reason:
+        raise CannotFold(str(reason)) from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Undecodable(f"{event.type} cannot be decoded: {error}") from None
 

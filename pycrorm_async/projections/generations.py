@@ -19,7 +19,7 @@ from sqlalchemy import Dialect, Integer, Text, column, delete, select, table, te
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, Index
 
-from pycrorm_async.errors import DatabaseForeign
+from pycrorm_async.errors import DatabaseForeign, TablesOutdated
 from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.materialised import kept_tables, make_kept, shown_texts
 from pycrorm_async.projections.public import own_views, public_views
@@ -106,13 +106,16 @@ class Generation:
 
 
 async def current_generation(connection: AsyncConnection, *, hold: Hold | None = None) -> Generation | None:
-    """What people see now; None in a memory without tables. Raises `DatabaseForeign` for another version's."""
+    """What people see now; None in a memory without tables. Raises `DatabaseForeign` for another version's.
+
+    `TablesOutdated` if it is an older one's, which `pycrorm rebuild` makes anew.
+    """
     found = await noted(connection, SHOWN, hold=hold)
     if found is not None and found.version != PROJECTION_VERSION:
-        raise DatabaseForeign(
-            f"the tables were made by version {found.version} of the fold, this is version {PROJECTION_VERSION}:"
-            + (" use a newer pycrorm" if found.version > PROJECTION_VERSION else " run `pycrorm rebuild`")
-        )
+        made = f"the tables were made by version {found.version} of the fold, this is version {PROJECTION_VERSION}"
+        if found.version > PROJECTION_VERSION:
+            raise DatabaseForeign(f"{made}: use a newer pycrorm")
+        raise TablesOutdated(f"{made}: run `pycrorm rebuild`")
     return found
 
 

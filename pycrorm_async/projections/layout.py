@@ -3,11 +3,14 @@
 A layout only grows. Declarations unite in the order they came: a new field is a new column; a column that would need
 two types is refused with both named, and so is the declaration that brought it. A type's view shows the rows of all
 tables of that type and of the types that descend from it, so `pick_up_action` has every careful pick-up too.
+
+A type that was renamed is one type: the declaration with its new name says the old ones (`aliases`), the tables of all
+of them are its tables, and each of their views shows all of it, whichever declaration came first.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple, Self
 
 import msgspec
@@ -66,7 +69,7 @@ class Layout(msgspec.Struct, frozen=True):
     """Leaf tables by name, designator types by dtype, and users' views of one memory.
 
     Of views the meaning as SQL, by name; the tables of those that are kept; and tables of kept views whose meaning was
-    changed.
+    changed. `renamed` gives the present name of types by those they had before.
     """
 
     leaves: dict[str, dict[str, Storage]] = {}
@@ -74,13 +77,14 @@ class Layout(msgspec.Struct, frozen=True):
     user_views: dict[str, str] = {}
     kept: dict[str, Kept] = {}
     outdated: tuple[str, ...] = ()
+    renamed: dict[str, str] = {}
 
     def with_leaves(self, leaves: Iterable[Leaf]) -> Self:
         """With the tables of these mapped classes; what is declared already wins."""
         tables, types = dict(self.leaves), dict(self.types)
         for leaf in leaves:
             tables[leaf.table] = leaf.columns | tables.get(leaf.table, {})
-            if leaf.dtype is not None and leaf.kind is not None and leaf.dtype not in types:
+            if leaf.dtype is not None and leaf.kind is not None and leaf.dtype not in {*types, *self.renamed}:
                 types[leaf.dtype] = DesignatorType(leaf.kind, (leaf.table,))
         return msgspec.structs.replace(self, leaves=tables, types=types)
 
@@ -96,29 +100,46 @@ class Layout(msgspec.Struct, frozen=True):
     def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
         """With the table of this type. Raises `Contradictory` and says why."""
         columns = {each.column: STORED_AS[each.type] for each in declared.fields if each.type in STORED_AS}
-        known = self.types.get(declared.dtype) or DesignatorType(declared.kind, ())
-        if declared.kind != known.kind:
-            raise Contradictory(f"{declared.dtype} is declared as {known.kind} and as {declared.kind}")
-        self._refuse_taken(declared)
+        dtype = self.present_name(declared.dtype)
+        former = tuple(each for each in declared.aliases if each != dtype and self.present_name(each) != dtype)
+        for each in former:
+            if self.renamed.get(each, each) not in declared.aliases:
+                raise Contradictory(f"{each} became {self.renamed[each]}, and {dtype} was {each} too: drop that alias")
+        known = self.types.get(dtype) or DesignatorType(declared.kind, ())
+        one = [known, *(self.types[each] for each in former if each in self.types)]
+        for type_ in one:
+            if declared.kind != type_.kind:
+                raise Contradictory(f"{declared.dtype} is declared as {type_.kind} and as {declared.kind}")
+        others = (table for type_ in one for table in type_.tables)
+        tables = tuple(dict.fromkeys((*known.tables, declared.table, *others)))
+        self._refuse_taken(declared, {dtype, *former})
         # All tables of a type agree, also in columns that an author's class brought: else an earlier declaration of the
         # type, accepted before, would be refused the next time.
         whole = self.leaves.get(declared.table, {}) | columns
-        for table in (declared.table, *known.tables):
-            _refuse_different(declared.dtype, self.leaves.get(table, {}), whole)
-        tables = tuple(dict.fromkeys((*known.tables, declared.table)))
+        agreed = whole
+        for table in tables:
+            _refuse_different(declared.dtype, self.leaves.get(table, {}), agreed)
+            agreed = agreed | self.leaves.get(table, {})
+        types = {name: each for name, each in self.types.items() if name not in former}
+        renamed = {old: dtype if new in former else new for old, new in self.renamed.items()}
         return msgspec.structs.replace(
             self,
             leaves=self.leaves | {declared.table: whole},
-            types=self.types | {declared.dtype: DesignatorType(declared.kind, tables, declared.bases or known.bases)},
+            types=types | {dtype: DesignatorType(declared.kind, tables, declared.bases or known.bases)},
+            renamed=renamed | dict.fromkeys(former, dtype),
         )
 
-    def _refuse_taken(self, declared: DesignatorTypeDeclared) -> None:
+    def present_name(self, dtype: str) -> str:
+        """What the type of this name is called now."""
+        return self.renamed.get(dtype, dtype)
+
+    def _refuse_taken(self, declared: DesignatorTypeDeclared, own: Collection[str]) -> None:
         fault = fault_in_table(declared.table)
         if fault is not None:
             raise Contradictory(f"{declared.dtype}: {fault}")
         asks = f"{declared.dtype} asks for the table {declared.table}"
         for dtype, each in self.types.items():
-            if declared.table in each.tables and dtype != declared.dtype:
+            if declared.table in each.tables and dtype not in own:
                 raise Contradictory(f"{asks}, which is that of {dtype} (set another dtype)")
         # Databases take names that differ in case alone for the same.
         for name in (*self.user_views, *(each for each in self.leaves if each != declared.table)):
@@ -136,18 +157,32 @@ class Layout(msgspec.Struct, frozen=True):
         ]
         return tuple(dict.fromkeys((table, *shown)))
 
+    def columns(self, table: str) -> dict[str, Storage]:
+        """The columns of the view of `table`: its own, and those of its type's other tables."""
+        tables = [table, *(other for each in self.types.values() if table in each.tables for other in each.tables)]
+        named: dict[str, tuple[str, Storage]] = {}
+        for each in tables:
+            for name, storage in self.leaves[each].items():
+                named.setdefault(name.lower(), (name, storage))
+        return dict(named.values())
+
     def lineage(self, dtype: str) -> str:
         """The names a row of this type answers to, nearest first, the last one a class that always exists."""
-        known = self.types[dtype]
-        names = [dtype, *(table for table in reversed(known.tables) if table != table_name(dtype))]
+        present = self.present_name(dtype)
+        known = self.types[present]
+        names = self._names(present, known.tables)
         for base in self._bases(known):
-            tables = self.types[base].tables if base in self.types else ()
-            names += [base, *(table for table in reversed(tables) if table != table_name(base))]
+            names += self._names(base, self.types[base].tables if base in self.types else ())
         return " ".join([*names, _BASE_OF_KIND[known.kind]])
+
+    def _names(self, dtype: str, tables: tuple[str, ...]) -> list[str]:
+        former = [old for old, present in self.renamed.items() if present == dtype]
+        return [dtype, *(table for table in reversed(tables) if table != table_name(dtype)), *former]
 
     def _bases(self, each: DesignatorType) -> list[str]:
         """Without those of another kind: a motion is never among the actions, whatever its class descends from."""
-        return [base for base in each.bases if base not in self.types or self.types[base].kind == each.kind]
+        bases = [self.present_name(base) for base in each.bases]
+        return [base for base in bases if base not in self.types or self.types[base].kind == each.kind]
 
 
 def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mapping[str, Storage]) -> None:

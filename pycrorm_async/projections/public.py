@@ -197,7 +197,7 @@ def _lineage(nodes: Table, layout: Layout) -> ColumnElement[str]:
         dtype: layout.lineage(dtype)
         for dtype, each in layout.types.items()
         if each.bases or each.tables != (table_name(dtype),)
-    }
+    } | {dtype: layout.lineage(dtype) for dtype in layout.renamed}
     return case(special, value=nodes.c.dtype, else_=ordinary) if special else ordinary
 
 
@@ -252,12 +252,12 @@ _CUT: dict[str, tuple[str, _Cut]] = {
 
 
 def _leaf(name: str, layout: Layout, generation: int, shown: Callable[[Select[Any], Table], Select[Any]]) -> View:
-    """The rows of a leaf table and of its members, with the columns of the leaf; what a member lacks is null."""
+    """The rows of a leaf table and of its members, with the columns of its type; what a member lacks is null."""
     parts = []
     for member in layout.members(name):
         rows = make_table(member, {"id": "key", **layout.leaves[member]}, generation)
         columns: list[ColumnElement[Any]] = [rows.c.id]
-        for each, storage in layout.leaves[name].items():
+        for each, storage in layout.columns(name).items():
             same = layout.leaves[member].get(each) == storage
             columns.append(rows.c[each] if same else cast(null(), column_type(storage)).label(each))
         parts.append(shown(select(*columns), rows))

@@ -330,10 +330,9 @@ async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
     for pause_s in _DROP_PAUSES_S:
         await asyncio.sleep(pause_s)
         await _sweep(log)  # where a view that was replaced cannot go yet, its tables cannot
-        tables = [each for each in tables if not await _drop(log, each)]
-        if not tables:
-            break
-    return tables
+        while tables and await _drop(log, tables[0]):
+            tables = tables[1:]
+    return [each for each in tables if not await _drop(log, each)]
 
 
 async def _drop(log: EventLog, table: str) -> bool:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from pycrorm_async.events.codec import declaration_of, fingerprint
+from pycrorm_async.events.codec import UnknownShape, declaration_of, fingerprint
 from pycrorm_async.events.happenings import DesignatorTypeDeclared
 from pycrorm_async.projections.layout import Contradictory, Layout
 
@@ -38,6 +38,11 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
             accepted[name] = declared
         except Contradictory as reason:
             refused[name] = str(reason)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # a newer version's, or damaged
+        except (
+            UnknownShape,
+            msgspec.DecodeError,
+            UnicodeDecodeError,
+            RecursionError,
+        ) as error:  # a newer one, or damaged
             refused[name] = f"this version cannot read the declaration of its type: {error}"
     return Union(layout, accepted, refused)

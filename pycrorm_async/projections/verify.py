@@ -129,6 +129,7 @@ class _Check:
         self._episodes = self._events = self._rows = self._behind = 0
         self._not_compared: dict[str, str] = {}
         self._unfinished = Rereading(0)
+        self._comparison: Comparison | None = None
 
     def found(self) -> Verified:
         return Verified(
@@ -213,7 +214,9 @@ class _Check:
                     raise DatabaseUnavailable(
                         f"{self._log.address} has no tables yet: `pycrorm writer --once` makes them"
                     )
-                comparison = Comparison(generation)
+                comparison = self._comparison
+                if comparison is None or comparison.generation != generation:
+                    self._comparison = comparison = Comparison(generation)
                 if await self._dialect.keep(connection, comparison.tables):
                     return await self._look(connection, comparison, at, end, limit)
             # Between two statements tables were made anew and the old ones dropped.

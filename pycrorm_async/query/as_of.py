@@ -11,8 +11,10 @@ from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import msgspec
+
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, PycrormError, UnknownEpisode
-from pycrorm_async.events.codec import declaration_of, fingerprint
+from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.happenings import EVENT_TYPES
 from pycrorm_async.projections.fold import CannotFold
 from pycrorm_async.query.moment import Moment
@@ -51,7 +53,15 @@ async def as_of(
             break
     if then.first is None:
         raise CallerError(f"{asked} is before episode {found.number} began")
-    return then.moment({fingerprint(each): declaration_of(each).dtype for each in await log.declarations()})
+    return then.moment(
+        {fingerprint(each): msgspec.json.decode(each, type=_Named).dtype for each in await log.declarations()}
+    )
+
+
+class _Named(msgspec.Struct):
+    """What every version of a declaration says, also one that this program cannot read otherwise."""
+
+    dtype: str
 
 
 def _read(then: MomentFold, page: Sequence[StoredEvent], within: _Within, log: EventLog) -> bool:

@@ -100,7 +100,8 @@ class Reading:
         declarations = await self._log.declarations()
         if declarations != self._declarations:
             generation = await _generation(self._log)
-            self._classes.learn(unite(generation.layout, declarations).accepted.values())
+            united = unite(generation.layout, declarations)
+            self._classes.learn(united.accepted.values(), united.layout.renamed)
             self._declarations = declarations
 
     @asynccontextmanager

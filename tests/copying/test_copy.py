@@ -31,7 +31,7 @@ from tests.databases import Server, ask, ask_to_change
 from tests.memory.notes import NoteActionPerformable, texts
 from tests.projections.script import Script, declarations, declared, field, name_of
 from tests.store.making import declaration, episode, record, run_of
-from tests.tables import Logs, differences, logs_of, tables_of
+from tests.tables import Logs, logs_of, tables_of
 from tests.test_tables import episode as hand_written
 from tests.test_tables import fill
 
@@ -404,4 +404,4 @@ async def test_events_that_are_large_are_copied_in_small_batches(new_file: New) 
     )
     assert logs_of(target) == logs_of(source)
     assert done == [250, 500, 750, 1000, 1030]
-    assert differences(tables_of(target), {}) == []
+    assert len(tables_of(target)["task_tree_node"]) == 1030

@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from pathlib import Path
 
 from sqlalchemy import event, func, select
 from sqlalchemy.engine import Engine
@@ -54,14 +55,14 @@ def _told() -> threading.Event:
     return told
 
 
-def record_until_told(url: str) -> None:
+def record_until_told(url: str, spool: Path) -> None:
     """Episodes of notes, each flushed; says how many there were and the longest wait for a flush, in s."""
-    asyncio.run(_record(url, _told()))
+    asyncio.run(_record(url, spool, _told()))
 
 
-async def _record(url: str, told: threading.Event) -> None:
+async def _record(url: str, spool: Path, told: threading.Event) -> None:
     longest_s, episodes = 0.0, 0
-    async with Memory.open(url, settings=_PATIENT) as memory:
+    async with Memory.open(url, spool=spool, settings=_PATIENT) as memory:
         print("records", flush=True)
         while not told.is_set():
             async with memory.episode(description="beside a rebuild"):

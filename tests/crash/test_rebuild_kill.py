@@ -89,7 +89,7 @@ async def test_a_worker_that_is_killed_costs_time_and_no_event(
 
 async def beside_others(url: str, folder: Path, *, episodes: int, rebuilds: int, readers: int) -> None:
     await filled(url, episodes)
-    others = [Forked(record_until_told, url), *(Forked(read_until_told, url) for _ in range(readers))]
+    others = [Forked(record_until_told, url, folder / "spool"), *(Forked(read_until_told, url) for _ in range(readers))]
     for each in others:
         each.wait_for_its_first_words()
     began = time.monotonic()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pycrorm_async.events.codec import NotEncodable, decode, encode, fingerprint
+from pycrorm_async.events.codec import NotEncodable, UnknownShape, decode, encode, fingerprint
 from pycrorm_async.events.happenings import (
     EVENT_TYPES,
     NodeEnded,
@@ -79,7 +79,7 @@ def test_every_event_type_is_known_by_its_own_name() -> None:
 def test_other_bytes_are_a_decode_error() -> None:
     with pytest.raises(msgspec.DecodeError):
         decode("NodeEnded", b'{"node":"one"}')
-    with pytest.raises(KeyError):
+    with pytest.raises(UnknownShape, match="NodeDreamt is not an event this version knows"):
         decode("NodeDreamt", b"{}")
 
 

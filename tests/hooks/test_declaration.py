@@ -222,6 +222,60 @@ def test_a_dtype_that_is_no_name_is_refused(dtype: str) -> None:
         declared_type(made)
 
 
+def renamed(aliases: Any, name: str = "WelcomeAction", base: type[Any] = ActionAbstract) -> type[ActionAbstract]:
+    async def perform(self: Any) -> None:
+        """Nothing."""
+
+    return dataclass(type(name, (base,), {"aliases": aliases, "perform": perform, "__module__": __name__}))
+
+
+def test_what_a_class_was_called_is_declared_and_not_inherited() -> None:
+    welcome = renamed(("GreetAction", "SaluteAction"))
+    assert declared_type(welcome).declaration.aliases == ("GreetAction", "SaluteAction")
+    loud = type("LoudWelcomeAction", (welcome,), {"__module__": __name__})
+    assert declared_type(loud).declaration.aliases == ()
+    assert b"aliases" not in declared_type(loud).payload
+
+
+def test_a_field_may_be_called_aliases() -> None:
+    @dataclass
+    class ListAction(ActionAbstract):
+        aliases: str = "many"
+
+        async def perform(self) -> None:
+            """Nothing."""
+
+    declaration = declared_type(ListAction).declaration
+    assert ([each.name for each in declaration.fields], declaration.aliases) == (["aliases"], ())
+
+
+@pytest.mark.parametrize(
+    ("aliases", "reason"),
+    [
+        ("GreetAction", r"its aliases 'GreetAction' are no tuple of names"),
+        ((1,), r"its aliases \(1,\) are no tuple of names"),
+        (("Greet Action",), r"its alias 'Greet Action' is not a name"),
+        (("WelcomeAction",), r"its alias 'WelcomeAction' is its present name"),
+        (
+            ("PickUpAction",),
+            r"its alias 'PickUpAction' is that of pycrorm_async\.plan\.actions\.PickUpActionPerformable",
+        ),
+        (("EverythingAction",), r"its alias 'EverythingAction' is that of a class it descends from"),
+    ],
+)
+def test_an_alias_that_cannot_be_one_is_refused(aliases: Any, reason: str) -> None:
+    with pytest.raises(DeclarationRefused, match=reason):
+        declared_type(renamed(aliases, base=EverythingActionPerformable))
+
+
+def test_two_live_classes_that_had_one_name_are_refused() -> None:
+    live = Declarations()
+    welcome, hello = renamed(("GreetAction",)), renamed(("GreetAction",), "HelloAction")
+    live.of(welcome, lambda _: None)
+    with pytest.raises(DeclarationRefused, match=r"WelcomeAction was 'GreetAction' already"):
+        live.of(hello, lambda _: None)
+
+
 def test_a_mapped_class_of_ones_own_belongs_to_its_designator_and_not_to_its_descendants() -> None:
     class Mapped:
         __tablename__ = "my_sayings"

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import pytest
+from msgspec.structs import replace
 
 from pycrorm_async.events.happenings import DesignatorTypeDeclared
 from pycrorm_async.projections.layout import Contradictory, Layout, Leaf
@@ -96,3 +99,82 @@ def test_mapped_classes_add_what_is_missing_and_never_change_what_is_declared() 
     )
     assert layout.leaves == {"saying_action": {"text": "text", "volume": "real"}, "ORMLog": {}}
     assert layout.types["SayingAction"].tables == ("saying_action",)
+
+
+# --- types that were renamed --------------------------------------------------------------------------------------
+
+GREET = declared("GreetAction", "greet_action", field("whom", "text", 2), field("loud", "boolean", 3))
+WELCOME = replace(
+    declared("WelcomeAction", "welcome_action", field("whom", "text", 2), field("language", "text", 3)),
+    aliases=("GreetAction",),
+)
+HELLO = replace(declared("HelloAction", "hello_action", field("whom", "text", 2)), aliases=("WelcomeAction",))
+LOUD = declared("LoudGreetAction", "loud_greet_action", bases=("GreetAction",))
+
+
+@pytest.mark.parametrize("order", list(permutations([GREET, WELCOME, HELLO, LOUD])))
+def test_a_type_and_what_it_was_called_are_one_type_whichever_was_declared_first(
+    order: tuple[DesignatorTypeDeclared, ...],
+) -> None:
+    layout = layout_of(*order)
+    assert layout_of(*order, *order) == layout
+    assert layout.renamed == {"GreetAction": "HelloAction", "WelcomeAction": "HelloAction"}
+    assert set(layout.types) == {"HelloAction", "LoudGreetAction"}
+    assert set(layout.types["HelloAction"].tables) == {"greet_action", "welcome_action", "hello_action"}
+    for table in ("greet_action", "welcome_action", "hello_action"):
+        assert layout.members(table)[0] == table
+        assert set(layout.members(table)) == {"greet_action", "welcome_action", "hello_action", "loud_greet_action"}
+        assert layout.columns(table) == {"whom": "text", "loud": "boolean", "language": "text"}
+    assert layout.members("loud_greet_action") == ("loud_greet_action",)
+    for name in ("GreetAction", "WelcomeAction", "HelloAction"):
+        lineage = layout.lineage(name).split()
+        assert (lineage[0], lineage[-1]) == ("HelloAction", "Action")
+        assert {"GreetAction", "WelcomeAction", "greet_action", "welcome_action"} < set(lineage)
+    assert layout.lineage("LoudGreetAction").split()[:2] == ["LoudGreetAction", "HelloAction"]
+
+
+def test_a_name_that_two_types_say_they_had_is_that_of_the_first() -> None:
+    bow = replace(declared("BowAction", "bow_action"), aliases=("GreetAction",))
+    layout = layout_of(GREET, WELCOME)
+    with pytest.raises(Contradictory, match="GreetAction became WelcomeAction, and BowAction was GreetAction too"):
+        layout.with_declaration(bow)
+    # Who says both names continues both.
+    both = layout.with_declaration(replace(bow, aliases=("GreetAction", "WelcomeAction")))
+    assert both.renamed == {"GreetAction": "BowAction", "WelcomeAction": "BowAction"}
+
+
+def test_a_type_that_gets_an_earlier_name_back_stays_one_type() -> None:
+    back = replace(GREET, aliases=("WelcomeAction",))
+    layout = layout_of(GREET, WELCOME, back)
+    assert layout == layout_of(GREET, WELCOME)
+    assert layout_of(GREET, WELCOME, back, GREET, WELCOME, back) == layout
+
+
+@pytest.mark.parametrize(
+    ("former", "reason"),
+    [
+        (
+            declared("GreetAction", "greet_action", field("whom", "integer", 2)),
+            "whom is declared as integer and as text",
+        ),
+        (
+            declared("GreetAction", "greet_action", field("Whom", "text", 2)),
+            "the column Whom and with whom: rename one",
+        ),
+        (declared("GreetAction", "greet_action", kind="motion"), "declared as motion and as action"),
+    ],
+)
+def test_what_a_type_cannot_have_been_is_refused_and_changes_nothing(
+    former: DesignatorTypeDeclared, reason: str
+) -> None:
+    layout = layout_of(former)
+    with pytest.raises(Contradictory, match=reason):
+        layout.with_declaration(WELCOME)
+    assert layout_of(WELCOME).types["WelcomeAction"].tables == ("welcome_action",)
+
+
+def test_tables_that_become_those_of_one_type_must_all_agree() -> None:
+    own = replace(declared("WelcomeAction", "ORMWelcome"), aliases=("GreetAction",))
+    layout = layout_of(GREET, declared("WelcomeAction", "welcome_action", field("loud", "text", 2)))
+    with pytest.raises(Contradictory, match="loud"):
+        layout.with_declaration(own)

@@ -30,9 +30,9 @@ STOPPED = "SELECT number, folded, parked FROM episode ORDER BY number"
 OUR_VIEW = UserView("Failed", select(TaskTreeNode.id, TaskTreeNode.reason).where(TaskTreeNode.reason.is_not(None)))
 
 
-async def some_of_everything(url: str) -> None:
+async def some_of_everything(url: str, spool: Path) -> None:
     """Random plans with types of their own and failures, a thought, one that was lost, one that cannot be folded."""
-    async with Memory.open(url, views=[OUR_VIEW], settings=PATIENT) as memory:
+    async with Memory.open(url, spool=spool, views=[OUR_VIEW], settings=PATIENT) as memory:
         for seed in range(6):
             await play(seed, memory)
         await memory.flush()
@@ -42,7 +42,7 @@ async def some_of_everything(url: str) -> None:
 
 
 async def test_tables_made_anew_hold_row_for_row_what_was_kept_up_to_date(database_url: str, tmp_path: Path) -> None:
-    await some_of_everything(database_url)
+    await some_of_everything(database_url, tmp_path / "spool")
     before, stopped, failed = tables_of(database_url), ask(database_url, STOPPED), ask(database_url, FAILED)
     assert len([why for _, _, why in stopped if why]) == 1
     assert failed
@@ -278,7 +278,7 @@ async def test_a_view_of_somebody_on_ours_keeps_what_it_stands_on_and_that_is_to
     await store(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE VIEW public.mine AS SELECT id FROM memory.pick_up_action")
     done = await rebuild_memory(url)
-    assert done.left == ["pick_up_action__1"]
+    assert "pick_up_action__1" in done.left
     assert ask(url, "SELECT count(*) FROM public.mine") == [(5,)]
     ask_to_change(url, "DROP VIEW public.mine")
     assert (await rebuild_memory(url)).left == []

@@ -113,7 +113,7 @@ class SQLite:
         return set(tables) <= set(there)
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
-        found = list((await connection.exec_driver_sql("PRAGMA quick_check")).scalars())
+        found = list((await connection.exec_driver_sql("PRAGMA integrity_check")).scalars())
         return [] if found == ["ok"] else found
 
     # --- folding ------------------------------------------------------------------------------------------------

@@ -1,0 +1,150 @@
+"""`pycrorm verify` as an operator meets it: what it prints, its exit codes, and who may ask."""
+
+from __future__ import annotations
+
+import asyncio
+import sqlite3
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.postgresql.roles import GRANTS
+from tests.commands import answer, one_line_of, pycrorm
+from tests.databases import Server, ask, ask_to_change
+from tests.projections.verifying import fold_in_batches, full, opened, shown
+
+ID = "00000000-0000-7000-8000-00000000000{}"
+
+
+async def memory(url: str) -> None:
+    log = await opened(url)
+    await fold_in_batches(log, [full(1), full(2), full(3, simulated=True)], 10_000)
+    await log.close()
+
+
+@pytest.fixture
+async def folder(tmp_path: Path) -> Path:
+    """With a memory of three episodes of twenty events, the last only thought through."""
+    await memory(f"sqlite:///{tmp_path}/pycrorm.db")
+    return tmp_path
+
+
+def number_of_rows(url: str) -> int:
+    counts: list[int] = [ask(url, f"SELECT count(*) FROM {each.physical}")[0][0] for each in shown(url)]
+    return sum(counts)
+
+
+def test_a_memory_that_is_as_it_should_be(folder: Path) -> None:
+    rows = number_of_rows(f"sqlite:///{folder}/pycrorm.db")
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == f"60 events of 3 episodes and {rows} rows: all as it should be\n"
+    assert answer("verify", cwd=folder) == {
+        "episodes": 3, "events": 60, "rows": rows, "behind": 0, "damage": 0, "drift": 0, "remarks": 0,
+        "damages": [], "differences": [],
+    }  # fmt: skip
+
+
+def test_what_differs_is_told_with_both_values_and_ends_with_1_and_damage_with_4(folder: Path) -> None:
+    file = folder / "pycrorm.db"
+    ask_to_change(file, "UPDATE detection__1 SET name = '[b]mïlk' WHERE id >> 31 = 2 AND position = 0")
+    ask_to_change(file, "DELETE FROM object_removal__1 WHERE id >> 31 = 3")
+    ask_to_change(file, "UPDATE pose__1 SET frame = x'fe00' WHERE id = (SELECT min(id) FROM pose__1)")
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stderr) == (1, "")
+    lines = done.stdout.splitlines()
+    assert lines[0] == "drift: episode 1, event 3: pose.frame is b'\\xfe\\x00', and should be 'map'"
+    assert lines[1] == "drift: episode 2, event 9: detection.name is '[b]mïlk', and should be 'milk'"
+    assert lines[2].startswith("drift: episode 3, event 18: object_removal lacks a row: (6442451520, 3, ")
+    assert lines[3].endswith("the log is whole, the tables differ from it: `pycrorm rebuild` makes them anew")
+    assert len(lines) == 4
+    assert pycrorm("verify", "--episode", ID.format(2), cwd=folder).stdout.splitlines()[0] == lines[1]
+    # `last` is the last that really happened.
+    document = answer("verify", "--episode", "last", cwd=folder, code=1)
+    assert (document["episodes"], document["drift"]) == (1, 1)
+    [difference] = document["differences"]
+    assert difference == {
+        "episode": ID.format(2), "number": 2, "sequence": 9, "table": "detection", "column": "name",
+        "stored": "[b]mïlk", "expected": "milk",
+    }  # fmt: skip
+    for (name,) in ask(file, "SELECT name FROM sqlite_master WHERE type = 'trigger'"):
+        ask_to_change(file, f"DROP TRIGGER {name}")
+    ask_to_change(file, "DELETE FROM event WHERE episode = 1 AND sequence = 9")
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stderr) == (4, "")
+    assert done.stdout.splitlines()[0] == "damage: episode 1, event 9: is missing"
+    document = answer("verify", cwd=folder, code=4)
+    assert document["damages"] == [{"episode": ID.format(1), "number": 1, "sequence": 9, "reason": "is missing"}]
+    assert (document["damage"], document["drift"]) == (1, 3)
+
+
+def test_of_many_findings_the_first_are_shown_and_all_are_counted(folder: Path) -> None:
+    ask_to_change(folder / "pycrorm.db", "UPDATE task_tree_node__1 SET simulated = 1 - simulated, start_ns = 0")
+    ask_to_change(folder / "pycrorm.db", "UPDATE pose__1 SET x = -x - 1, time = 0, frame = NULL")
+    done = pycrorm("verify", cwd=folder)
+    assert done.returncode == 1
+    count = 12 * 2 + 3 * ask(folder / "pycrorm.db", "SELECT count(*) FROM pose__1")[0][0]
+    lines = done.stdout.splitlines()
+    assert len(lines) == 22
+    assert lines[20] == f"and {count - 20} more"
+    document = answer("verify", cwd=folder, code=1)
+    assert (document["drift"], len(document["differences"])) == (count, min(count, 100))
+
+
+def test_what_cannot_be_verified_is_one_line(folder: Path) -> None:
+    done = pycrorm("verify", "--episode", "7", cwd=folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "there is no episode '7'" in one_line_of(done)
+    ask_to_change(folder / "pycrorm.db", "UPDATE pycrorm_generation SET version = version - 1")
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert one_line_of(done).endswith("run `pycrorm rebuild`")
+    ask_to_change(folder / "pycrorm.db", "UPDATE pycrorm_generation SET version = version + 1")
+    ask_to_change(folder / "pycrorm.db", "DROP TABLE state_sample__1")
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "a table is gone: run `pycrorm rebuild`" in one_line_of(done)
+
+
+def test_a_log_without_tables_and_what_is_no_memory_at_all_are_one_line(tmp_path: Path) -> None:
+    async def made() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/bare.db"), create=True)
+        await log.append(full(1).records)
+        await log.close()
+
+    asyncio.run(made())
+    other = sqlite3.connect(tmp_path / "other.db")
+    other.execute("CREATE TABLE cake (a)")
+    other.commit()
+    other.close()
+    for name, reason in (
+        ("bare", "has no tables yet: `pycrorm writer --once` makes them"),
+        ("other", "is a database of another program"),
+        ("none", "does not exist"),
+    ):
+        done = pycrorm("verify", "--url", f"sqlite:///{name}.db", cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (3, "")
+        assert reason in one_line_of(done)
+
+
+async def test_on_postgresql_whoever_may_read_may_verify(server: Server, tmp_path: Path) -> None:
+    url = server.new_database()
+    database = urlsplit(url).path.removeprefix("/")
+    await memory(url)
+    for statement in GRANTS:
+        ask(url, statement)
+    ask(url, f"CREATE ROLE ada_of_{database} LOGIN IN ROLE pycrorm_reader")
+    # Tables that a folder makes later are his to read too.
+    ask(url, f"CREATE ROLE robot_of_{database} LOGIN IN ROLE pycrorm_folder")
+    ask(url, f"ALTER ROLE robot_of_{database} IN DATABASE {database} SET role = 'pycrorm_folder'")
+    reader = server.url(database, user=f"ada_of_{database}")
+    assert answer("verify", "--url", reader, cwd=tmp_path)["events"] == 60
+    folder = server.url(database, user=f"robot_of_{database}")
+    assert pycrorm("rebuild", "--url", folder, cwd=tmp_path).returncode == 0
+    ask(url, "UPDATE memory_tables.state_sample__2 SET value = 2.5 WHERE channel = 'torso' AND id >> 31 = 2")
+    done = pycrorm("verify", "--url", reader, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.splitlines()[0] == "drift: episode 2, event 12: state_sample.value is 2.5, and should be 0.2"

@@ -1,0 +1,360 @@
+"""Verify finds every change of every table and nothing else, whatever the log and the parts it is read in."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async import Memory
+from pycrorm_async.events.happenings import EpisodeEnded, NodeStarted
+from pycrorm_async.projections import verify as verifying
+from pycrorm_async.projections.comparing import Difference
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.store.log import EventLog
+from tests.databases import ask, ask_to_change
+from tests.projections.script import Script
+from tests.projections.verifying import (
+    TYPES,
+    another,
+    assert_clean,
+    at_once,
+    delete,
+    event_of,
+    findings,
+    fold_in_batches,
+    full,
+    in_parts,
+    insert,
+    look,
+    lost,
+    named,
+    opened,
+    parked,
+    rebuilt,
+    rows_of,
+    running,
+    set_columns,
+    shown,
+)
+from tests.promises.test_random_plans import play
+
+
+@pytest.fixture
+async def log(database_url: str) -> AsyncIterator[EventLog]:
+    """On each kind of database, with episodes of every kind of end; the third is only thought through."""
+    made = await opened(database_url)
+    scripts = [full(1), full(2), full(3, simulated=True), lost(4), running(5), parked(6), full(7)]
+    await fold_in_batches(made, scripts, 10_000)
+    yield made
+    await made.close()
+
+
+# --- nothing is found where nothing is -----------------------------------------------------------------------------
+
+
+async def test_random_plans_with_failures_are_as_they_should_be(
+    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        for seed in range(25):
+            await play(seed, memory)
+    log = await opened(database_url)
+    found = await look(log)
+    assert_clean(found)
+    assert (found.episodes, found.behind) == (25, 0)
+    assert found.events == ask(database_url, "SELECT count(*) FROM event")[0][0]
+    assert found.rows == sum(len(rows_of(database_url, table)) for table in shown(database_url))
+    for events in (60, 400):
+        assert findings(await in_parts(log, events, monkeypatch)) == findings(found)
+    await log.close()
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+async def test_batches_that_part_starts_from_ends_are_as_they_should_be(
+    database_url: str, batch: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = await opened(database_url)
+    await fold_in_batches(log, [full(1), lost(2), full(3, simulated=True), running(4)], batch)
+    assert_clean(await look(log))
+    assert_clean(await in_parts(log, 10, monkeypatch))
+    await log.close()
+
+
+async def test_what_the_tables_do_not_show_yet_is_no_fault(log: EventLog, database_url: str) -> None:
+    found = await look(log)
+    assert_clean(found)
+    head = len(full(1).records)
+    assert (found.episodes, found.behind, found.remarks) == (7, head - 10, 0)
+    await log.append(full(5).records)
+    assert_clean(await look(log))
+    assert (await look(log)).behind == 2 * head - 26
+    assert_clean(await look(log, episode=5))
+    assert (await look(log, episode=5)).behind == head - 16
+    assert (await look(log, episode=3)).rows == sum(
+        event_of(table, row)[0] == 3 for table in shown(database_url) for row in rows_of(database_url, table)
+    )
+
+
+@pytest.mark.parametrize("events", [7, 25])
+async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault(
+    database_url: str, events: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = await opened(database_url)
+    scripts = [full(1, rounds=2), lost(2), full(3, simulated=True)]
+    await fold_in_batches(log, [], 1)
+    await log.append([*TYPES, *(each for script in scripts for each in script.records)])
+    monkeypatch.setattr(verifying, "_PART_EVENTS", events)
+    looks = 0
+
+    async def fold() -> None:
+        other = await opened(database_url)
+        projector = Projector(other, batch_events=6)
+        await projector.open()
+        await projector.fold_some()
+        await other.close()
+
+    while (await log.behind()) and looks < 50:
+        # Some is folded in the first parts of each look: the tables are behind what is read, or ahead of it.
+        left = iter([*range(3)])
+        assert_clean(
+            await verify(log, tell=lambda *_, left=left: at_once(fold) if next(left, None) is not None else None)
+        )
+        looks += 1
+    assert looks > 1
+    assert_clean(await look(log))
+    await log.close()
+
+
+async def test_tables_that_are_made_anew_between_two_parts_are_no_fault(
+    log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verifying, "_PART_EVENTS", 10)
+    told = 0
+
+    async def rebuild() -> None:
+        other = await opened(database_url)
+        await rebuilt(other)
+        await other.close()
+
+    def tell(_done: int, _total: int) -> None:
+        nonlocal told
+        told += 1
+        if told in (2, 5, 6):
+            at_once(rebuild)
+
+    assert_clean(await verify(log, tell=tell))
+    assert {table.physical.rpartition("__")[2].strip('"') for table in shown(database_url)} == {"4"}
+
+
+async def test_an_episode_that_grows_between_two_parts_is_no_fault(
+    database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = await opened(database_url)
+    whole, beginning = full(1, rounds=3), Script(1)
+    stored = 12
+    beginning.records = whole.records[:stored]
+    await fold_in_batches(log, [beginning], 10_000)
+    monkeypatch.setattr(verifying, "_PART_EVENTS", 5)
+
+    async def record() -> None:
+        other = await opened(database_url)
+        await other.append(whole.records[stored : stored + 6])
+        projector = Projector(other)
+        await projector.open()
+        await projector.fold_behind()
+        await other.close()
+
+    def tell(_done: int, _total: int) -> None:
+        nonlocal stored
+        at_once(record)
+        stored += 6
+
+    found = await verify(log, tell=tell)
+    assert_clean(found)
+    assert (found.events, found.behind) == (len(whole.records), 0)
+    await log.close()
+
+
+# --- every change is found -----------------------------------------------------------------------------------------
+
+
+async def test_every_value_that_was_changed_is_told_and_nothing_else(log: EventLog, database_url: str) -> None:
+    filled = 0
+    for table in shown(database_url):
+        rows = rows_of(database_url, table)
+        if not rows:
+            continue
+        filled += 1
+        row = rows[len(rows) // 2]
+        values = {each: another(row[each], table.kinds[each]) for each in table.columns if each not in table.key}
+        if not values:
+            continue
+        set_columns(database_url, table, row, values)
+        found = await look(log)
+        number, sequence = event_of(table, row)
+        assert found.differences == [
+            Difference(number, sequence, table.name, column, value, row[column]) for column, value in values.items()
+        ]
+        assert (found.drift, found.damage) == (len(values), 0)
+        set_columns(database_url, table, row, {each: row[each] for each in values})
+    assert filled == 16
+    assert_clean(await look(log))
+
+
+async def test_a_single_value_is_enough_also_null_for_something_and_something_for_null(
+    log: EventLog, database_url: str
+) -> None:
+    if database_url.startswith("postgresql:"):
+        pytest.skip("the comparison is the same; one by one it takes long there")
+    for table in shown(database_url):
+        for row in rows_of(database_url, table)[:1]:
+            for column in table.columns:
+                if column in table.key:
+                    continue
+                value = another(None, table.kinds[column]) if row[column] is None else None
+                set_columns(database_url, table, row, {column: value})
+                number, sequence = event_of(table, row)
+                expected = Difference(number, sequence, table.name, column, value, row[column])
+                assert (await look(log)).differences == [expected]
+                set_columns(database_url, table, row, {column: row[column]})
+    assert_clean(await look(log))
+
+
+async def test_a_row_that_was_deleted_is_told(log: EventLog, database_url: str) -> None:
+    for table in shown(database_url):
+        for row in rows_of(database_url, table)[-1:]:
+            delete(database_url, table, row)
+            number, sequence = event_of(table, row)
+            whole = tuple(row[each] for each in table.columns)
+            assert (await look(log)).differences == [Difference(number, sequence, table.name, None, None, whole)]
+            insert(database_url, table, row)
+    assert_clean(await look(log))
+
+
+@pytest.mark.parametrize(
+    ("number", "sequence"),
+    [(1, 999), (6, 11), (8, 1), (2**22 - 1, 5), (0, 0), (0, 7), (2**22, 1), (-1, 3)],
+    ids=["after its last event", "parked", "later", "last", "zero", "of nobody", "too large", "negative"],
+)
+async def test_a_row_that_no_event_makes_is_told_wherever_it_is(
+    log: EventLog, database_url: str, number: int, sequence: int
+) -> None:
+    expected = []
+    for table in shown(database_url):
+        added: dict[str, Any] = dict.fromkeys(table.columns)
+        added |= {each: "x" if "text" in table.kinds[each] else 0 for each in table.key}
+        of_episode = table.name in ("process_metadata", "simulated_episode")
+        if of_episode and number in (1, 6):
+            continue
+        added["id" if "id" in table.key else table.key[0]] = number if of_episode else number * 2**31 + sequence * 32
+        insert(database_url, table, added)
+        told = (number, 1) if of_episode else (number, sequence)
+        expected.append(Difference(*told, table.name, None, tuple(added[each] for each in table.columns), None))
+    found = await look(log)
+    assert sorted(found.differences, key=repr) == sorted(expected, key=repr)
+    assert found.drift == len(expected) > 30
+    if number in (1, 6):
+        assert (await look(log, episode=number)).drift == len(expected)
+    assert (await look(log, episode=7)).drift == 0
+
+
+async def test_a_key_that_was_changed_is_a_row_that_lacks_and_one_too_many(log: EventLog, database_url: str) -> None:
+    ask_to_change(
+        database_url,
+        f"UPDATE {named(database_url, 'joint_change')} SET joint = 'neck' WHERE id = 2147484000 AND joint = 'head'",
+    )
+    [too_many, lacking] = sorted((await look(log)).differences, key=lambda each: each.stored is None)
+    assert (lacking.number, lacking.sequence, lacking.table, lacking.column) == (1, 11, "joint_change", None)
+    assert (lacking.expected[1], lacking.stored) == ("head", None)
+    assert (too_many.number, too_many.sequence, too_many.stored[1], too_many.expected) == (1, 11, "neck", None)
+
+
+@pytest.mark.parametrize("events", [1, 7, 20])
+async def test_an_episode_in_many_parts_gives_what_it_gives_in_one(
+    database_url: str, events: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = await opened(database_url)
+    await fold_in_batches(log, [full(1), lost(2), full(3, simulated=True)], 10_000)
+    for place, table in enumerate(shown(database_url)):
+        rows = rows_of(database_url, table)
+        if table.name == "simulated_episode" or not rows:
+            continue
+        delete(database_url, table, rows[place % len(rows)])
+        changed = rows[(place + 1) % len(rows)]
+        column = next(each for each in table.columns[1:] if each not in table.key)
+        set_columns(database_url, table, changed, {column: another(changed[column], table.kinds[column])})
+    found = await look(log)
+    assert 20 < found.drift < 100
+    assert findings(await in_parts(log, events, monkeypatch)) == findings(found)
+    await log.close()
+
+
+async def test_a_table_that_is_gone_is_told_in_a_line(log: EventLog, database_url: str) -> None:
+    ask_to_change(
+        database_url,
+        f"DROP TABLE {named(database_url, 'object_removal')} {'CASCADE' * database_url.startswith('postgresql:')}",
+    )
+    with pytest.raises(Exception, match="a table is gone: run `pycrorm rebuild`"):
+        await look(log)
+
+
+# --- beside everything else ----------------------------------------------------------------------------------------
+
+
+async def test_while_robots_record_and_tables_are_folded_and_made_anew_nothing_false_is_found(
+    log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(verifying, "_PART_EVENTS", 40)
+    done = asyncio.Event()
+
+    async def record() -> None:
+        for number in range(10, 1_000):
+            for start in range(0, 60, 7):
+                await log.append(full(number, rounds=2).records[start : start + 7])
+                if done.is_set():
+                    return
+
+    async def fold() -> None:
+        other = await opened(database_url)
+        projector = Projector(other, batch_events=15)
+        await projector.open()
+        while not done.is_set():
+            if not await projector.fold_some():
+                await asyncio.sleep(0.001)
+        await other.close()
+
+    async def rebuild() -> None:
+        other = await opened(database_url)
+        while not done.is_set():
+            await rebuilt(other)
+        await other.close()
+
+    reader = await EventLog.open(log.address, create=False)
+    async with asyncio.TaskGroup() as beside:
+        for each in (record, fold, rebuild):
+            beside.create_task(each())
+        for _ in range(6):
+            assert_clean(await look(reader))
+        done.set()
+    await reader.close()
+    generation = shown(database_url)[0].physical.rpartition("__")[2].strip('"')
+    assert int(generation) > 2
+    await Projector(log).open()
+    assert_clean(await look(log))
+
+
+async def test_an_end_that_was_lost_is_seen_in_the_tables_and_in_the_log(log: EventLog) -> None:
+    script = Script(8)
+    script.put(NodeStarted("root"))
+    script.put(EpisodeEnded("SUCCEEDED"))
+    await log.append(script.records)
+    found = await look(log)
+    assert [str(each) for each in found.damages] == [
+        "episode 8, event 1: the episode has not started",
+        "episode 8, event 2: the episode has not started",
+    ]

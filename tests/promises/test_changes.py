@@ -1,0 +1,367 @@
+"""A program changes and goes on with what an earlier one wrote: the recipes of the README, on the golden memory.
+
+The golden memory was written by `tests/golden/make.py`; what it must show is written out here by hand.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import msgspec
+import pytest
+from sqlalchemy import func, select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.adoption import recover
+from pycrorm_async.copying import copy_episodes
+from pycrorm_async.errors import DatabaseForeign, TablesOutdated
+from pycrorm_async.events.codec import Decoder
+from pycrorm_async.events.happenings import EVENT_TYPES, ObjectAdded
+from pycrorm_async.events.upcasters import Upcaster
+from pycrorm_async.orm import Action
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.projections import fold
+from pycrorm_async.projections.generations import PROJECTION_VERSION
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.schema import Birth, make_or_migrate
+from pycrorm_async.world import Arms
+from tests.databases import ask, ask_to_change
+from tests.store.making import declaration, episode, run_of
+from tests.tables import differences, tables_of
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
+
+
+@pytest.fixture
+def golden(tmp_path: Path) -> str:
+    """The URL of the golden memory, with the spool of the recorder that died beside it."""
+    with tarfile.open(GOLDEN) as packed:
+        packed.extractall(tmp_path, filter="data")
+    return f"sqlite:///{tmp_path}/memory.db"
+
+
+def id_of(number: int, sequence: int) -> int:
+    return number * 2**31 + sequence * 2**5
+
+
+# --- the classes of a later program: all of them once were `GreetAction(whom: str, loudness: float, hand: Arms)` ----
+
+
+def greeting(**fields: Any) -> type[Any]:
+    """A `GreetAction` with these fields."""
+
+    async def perform(self: Any) -> None:
+        """Says nothing."""
+
+    body = {"__annotations__": fields, "perform": perform, "__module__": __name__}
+    return dataclass(type("GreetActionPerformable", (ActionAbstract,), body))
+
+
+@dataclass
+class WelcomeActionPerformable(ActionAbstract):
+    """GreetAction under a new name, with one field less and one more."""
+
+    aliases: ClassVar[tuple[str, ...]] = ("GreetAction",)
+
+    whom: str
+    hand: Arms
+    language: str
+
+    async def perform(self) -> None:
+        """Says nothing."""
+
+
+@dataclass
+class HelloActionPerformable(ActionAbstract):
+    """The same class again, whose author has kept the name in memories."""
+
+    dtype = "GreetAction"
+
+    whom: str
+
+    async def perform(self) -> None:
+        """Says nothing."""
+
+
+async def performed(url: str, *designators: ActionAbstract) -> None:
+    """Each in an episode of its own, all of them in the tables."""
+    async with Memory.open(url) as memory:
+        for each in designators:
+            await each.perform()
+        await memory.flush()
+        assert memory.status.faults.total == 0, memory.status.faults.last
+        assert memory.status.unadopted == {}
+
+
+async def shown(url: str, name: str | type, *fields: str) -> list[tuple[Any, ...]]:
+    """These fields of all designators of a type, in order, with what each was called when it was recorded."""
+    async with Reading.open(url) as reading, reading.session() as session:
+        mapped: Any = reading.mapped(name)
+        rows = (await session.scalars(select(mapped).order_by(mapped.id))).all()
+        return [(row.dtype, *(getattr(row, field) for field in fields)) for row in rows]
+
+
+ADA, CLEO, DORA = ("GreetAction", "Ada"), ("GreetAction", "Cleo"), ("GreetAction", "Dora")
+
+
+# --- what the golden memory holds -----------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+async def every_event(request: pytest.FixtureRequest, golden: str) -> str:
+    """The golden database with its spool adopted, where it is or copied to a server."""
+    done = await recover(golden)
+    assert (done.failed, len(done.lost)) == ({}, 1)
+    if request.param == "sqlite":
+        return golden
+    url: str = request.getfixturevalue("server").new_database()
+    copied = await copy_episodes(golden, url)
+    assert [(each.copied, each.damage, each.stopped) for each in copied.episodes] == [
+        (18, None, None), (4, None, None), (6, None, None),
+    ]  # fmt: skip
+    return url
+
+
+async def test_a_memory_of_the_first_version_shows_what_it_held_and_its_spool_is_adopted(every_event: str) -> None:
+    t0 = 1_700_000_000_000_000
+    assert ask(every_event, "SELECT number, head, folded, parked, refused FROM episode ORDER BY 1") == [
+        (1, 18, 18, None, None), (2, 4, 4, None, None), (3, 6, 6, None, None),
+    ]  # fmt: skip
+    assert ask(
+        every_event, "SELECT id, description, created_by, status, created_at FROM process_metadata ORDER BY 1"
+    ) == [(1, "Everything once", "ada", "SUCCEEDED", t0 + 1_000_000), (3, "Cut short", "ada", "LOST", t0 + 1_000_000)]
+    assert ask(every_event, "SELECT id, parent_id, dtype, status, failure_message FROM task_tree_node ORDER BY id") == [
+        (id_of(1, 4), None, None, "SUCCEEDED", None),
+        (id_of(1, 5), id_of(1, 4), "PickUpAction", "SUCCEEDED", None),
+        (id_of(1, 6), id_of(1, 5), "GreetAction", "FAILED", "no answer"),
+        (id_of(3, 2), None, None, "LOST", None),
+        (id_of(3, 3), id_of(3, 2), "GreetAction", "SUCCEEDED", None),
+        (id_of(3, 5), id_of(3, 2), "GreetAction", "LOST", None),
+    ]
+    assert ask(every_event, "SELECT id, whom, loudness, hand FROM greet_action ORDER BY id") == [
+        (id_of(1, 6), "Ada", 0.25, "RIGHT"), (id_of(3, 3), "Cleo", 0.5, "LEFT"), (id_of(3, 5), "Dora", 0.75, "RIGHT"),
+    ]  # fmt: skip
+    assert ask(every_event, "SELECT id, arm, grasp, object_designator_id FROM pick_up_action") == [
+        (id_of(1, 5), "LEFT", "FRONT", id_of(1, 2))
+    ]
+    assert ask(every_event, "SELECT id, name, obj_type, identity_id, node_id FROM object ORDER BY id") == [
+        (id_of(1, 2), "milk", "MILK", id_of(1, 2), None),
+        (id_of(1, 3), "pr2", "ROBOT", id_of(1, 3), None),
+        (id_of(1, 12), "milk", "MILK", id_of(1, 2), id_of(1, 5)),
+    ]
+    assert ask(every_event, "SELECT kind, parent_id, child_id, link FROM attachment ORDER BY id") == [
+        ("attached", id_of(1, 3), id_of(1, 2), "l_gripper_tool_frame"), ("detached", id_of(1, 3), id_of(1, 12), None),
+    ]  # fmt: skip
+    assert ask(every_event, "SELECT joint, position FROM joint_change") == [("torso_lift_joint", 1e-9)]
+    assert ask(every_event, "SELECT object_id FROM object_removal") == [(id_of(1, 12),)]
+    assert ask(every_event, "SELECT channel, value FROM state_sample") == [("base.x", 0.6)]
+    assert ask(every_event, "SELECT name, visible FROM detection") == [("milk", 0.75)]
+    assert ask(every_event, "SELECT considered, offered, taken FROM location_resolution") == [(17, 2, 0)]
+    assert ask(every_event, "SELECT x, arms, grasp FROM location_candidate ORDER BY position") == [
+        (0.5, "LEFT,RIGHT", "FRONT"), (0.6, "", None),
+    ]  # fmt: skip
+    before = tables_of(every_event)
+    await rebuild_memory(every_event)
+    assert differences(before, tables_of(every_event)) == []
+    log = await EventLog.open(DatabaseAddress.parse(every_event), create=False)
+    verified = await verify(log)
+    await log.close()
+    assert (verified.episodes, verified.events, verified.damages, verified.differences) == (3, 28, [], [])
+
+
+async def test_a_log_of_the_first_version_has_the_tables_of_a_new_one(golden: str, tmp_path: Path) -> None:
+    new = f"sqlite:///{tmp_path}/new.db"
+    for url in (golden, new):
+        await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
+    of_the_log = (
+        "SELECT type, name, tbl_name, sql FROM sqlite_master WHERE tbl_name IN"
+        " ('pycrorm_log', 'pycrorm_declaration', 'episode', 'event') ORDER BY type, name"
+    )
+    assert ask(golden, of_the_log) == ask(new, of_the_log)
+    assert len(ask(new, of_the_log)) == 17
+
+
+async def test_who_has_the_log_open_goes_on_when_a_newer_program_brings_it_up_to_date_and_nobody_older_opens_it_again(
+    database_url: str,
+) -> None:
+    address = DatabaseAddress.parse(database_url)
+    older = await EventLog.open(address, create=True)
+    await older.append([declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 3)])
+    schema = "" if address.is_sqlite else "pycrorm."
+    engine = address.engine()
+    second = (f"ALTER TABLE {schema}episode ADD COLUMN robot text", f"CREATE INDEX by_robot ON {schema}episode (robot)")
+    migrations = (*dialect_of(engine).migrations, second)
+    newer = await make_or_migrate(engine, "name", birth=Birth("another", 5), migrations=migrations)
+    await engine.dispose()
+    assert newer == older.log_id
+    assert (
+        await older.append([declaration(b'{"dtype":"B"}'), *run_of(episode(1), 4, 6), *run_of(episode(2), 1, 2)]) == {}
+    )
+    assert [(each.number, each.head) for each in await older.episodes()] == [(1, 6), (2, 2)]
+    await older.close()
+    assert ask(database_url, "SELECT count(*) FROM event") == [(8,)]
+    for create in (True, False):
+        with pytest.raises(DatabaseForeign, match=r"its format is 2, this version knows 1$"):
+            await EventLog.open(address, create=create)
+
+
+# --- a designator whose fields changed ------------------------------------------------------------------------------
+
+
+async def test_a_field_that_was_added_is_null_in_old_rows_and_one_that_was_removed_in_new_ones(golden: str) -> None:
+    greet = greeting(whom=str | None, language=str, loudness=float)  # `hand` is gone, `whom` is optional
+    await performed(golden, greet(None, "en", 1.0))
+    expected = [(*ADA, "RIGHT", None), (*CLEO, "LEFT", None), (*DORA, "RIGHT", None), ("GreetAction", None, None, "en")]
+    assert await shown(golden, "GreetAction", "whom", "hand", "language") == expected
+    before = tables_of(golden)
+    await rebuild_memory(golden)
+    assert differences(before, tables_of(golden)) == []
+    assert await shown(golden, greet, "whom", "hand", "language") == expected
+
+
+async def test_a_field_that_was_renamed_is_asked_for_by_both_names(golden: str) -> None:
+    await performed(golden, greeting(guest=str)("Eve"))
+    async with Reading.open(golden) as reading, reading.session() as session:
+        greet: Any = reading.mapped("GreetAction")
+        guests = await session.scalars(select(func.coalesce(greet.guest, greet.whom)).order_by(greet.id))
+        assert list(guests) == ["Ada", "Cleo", "Dora", "Eve"]
+
+
+async def test_a_field_of_another_type_stops_its_own_episode_with_both_named_and_no_other(golden: str) -> None:
+    async with Memory.open(golden) as memory:
+        await greeting(whom=int)(7).perform()
+        with pytest.raises(Exception, match=r"GreetAction\.whom is declared as text and as integer"):
+            await memory.flush()
+    assert await shown(golden, "GreetAction", "whom") == [ADA, CLEO, DORA]
+
+
+# --- a designator that was renamed ----------------------------------------------------------------------------------
+
+
+async def test_a_class_that_keeps_its_dtype_keeps_its_rows(golden: str) -> None:
+    await performed(golden, HelloActionPerformable("Eve"))
+    expected = [ADA, CLEO, DORA, ("GreetAction", "Eve")]
+    assert await shown(golden, HelloActionPerformable, "whom") == expected
+
+
+async def test_a_class_with_an_alias_shows_what_was_recorded_under_either_name(golden: str) -> None:
+    await performed(golden, WelcomeActionPerformable("Eve", Arms.BOTH, "en"))
+    expected = [
+        (*ADA, "RIGHT", None, 0.25),
+        (*CLEO, "LEFT", None, 0.5),
+        (*DORA, "RIGHT", None, 0.75),
+        ("WelcomeAction", "Eve", "BOTH", "en", None),
+    ]
+    for _ in range(2):
+        for name in ("WelcomeAction", "GreetAction", WelcomeActionPerformable, "welcome_action", "greet_action"):
+            assert await shown(golden, name, "whom", "hand", "language", "loudness") == expected, name
+        await rebuild_memory(golden)
+    async with Reading.open(golden) as reading, reading.session() as session:
+        actions = (await session.scalars(select(Action).order_by(Action.id))).all()
+        names = ["PickUpAction", *["WelcomeAction"] * 4]
+        assert [type(each).__name__ for each in actions] == names
+        assert reading.mapped("GreetAction") is reading.mapped("WelcomeAction")
+    assert ask(golden, "SELECT count(*) FROM greet_action") == ask(golden, "SELECT count(*) FROM welcome_action")
+
+
+async def test_an_old_program_that_records_on_is_shown_under_the_new_name(golden: str) -> None:
+    await performed(golden, WelcomeActionPerformable("Eve", Arms.BOTH, "en"))
+    await performed(golden, greeting(whom=str, loudness=float)("Flo", 1.0))
+    welcomed = [(dtype, whom) for dtype, whom in await shown(golden, "WelcomeAction", "whom")]
+    assert welcomed == [ADA, CLEO, DORA, ("WelcomeAction", "Eve"), ("GreetAction", "Flo")]
+
+
+async def test_a_memory_that_is_open_learns_the_new_name_and_keeps_the_class_it_gave_out(golden: str) -> None:
+    await recover(golden)
+    async with Reading.open(golden) as reading:
+        greet: Any = reading.mapped("GreetAction")
+        await performed(golden, WelcomeActionPerformable("Eve", Arms.BOTH, "en"))
+        async with reading.session() as session:
+            assert reading.mapped("WelcomeAction") is greet
+            rows: list[Any] = list(await session.scalars(select(greet).order_by(greet.id)))
+            assert [(row.whom, row.language) for row in rows] == [
+                ("Ada", None), ("Cleo", None), ("Dora", None), ("Eve", "en"),
+            ]  # fmt: skip
+
+
+# --- an event whose shape changed -----------------------------------------------------------------------------------
+
+
+class Weighed(ObjectAdded, frozen=True, kw_only=True):
+    """A second shape of ObjectAdded: names are upper case from now on, and every object has a mass."""
+
+    version = 2
+
+    mass_kg: float
+
+
+def weighed(old: dict[str, Any]) -> dict[str, Any]:
+    return old | {"name": old["name"].upper(), "mass_kg": 1.0}
+
+
+STEPS: dict[tuple[str, int], Upcaster] = {("ObjectAdded", 1): weighed}
+
+
+async def test_events_of_an_older_shape_are_folded_rebuilt_and_looked_at_as_of_then_through_the_upcaster(
+    golden: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = "SELECT name FROM object ORDER BY id"
+    assert ask(golden, names) == [("milk",), ("pr2",), ("milk",)]
+    later = Decoder(EVENT_TYPES | {"ObjectAdded": Weighed}, STEPS)
+    monkeypatch.setattr(fold, "decode", later.decode)
+    await rebuild_memory(golden)
+    assert ask(golden, names) == [("MILK",), ("PR2",), ("milk",)]
+    async with Reading.open(golden) as reading:
+        moment = await reading.as_of(1, sequence=4)
+    assert sorted(each.name for each in moment.world.objects) == ["MILK", "PR2"]
+    log = await EventLog.open(DatabaseAddress.parse(golden), create=False)
+    assert msgspec.json.decode((await log.events(1))[1].payload)["name"] == "milk"  # the log is as it was
+    await log.close()
+
+
+# --- another version of the fold ------------------------------------------------------------------------------------
+
+
+REBUILD = (
+    rf"by version {PROJECTION_VERSION - 1} of the fold, this is version {PROJECTION_VERSION}: run `pycrorm rebuild`$"
+)
+
+
+async def test_while_tables_are_those_of_an_older_fold_events_are_recorded_and_shown_once_they_are_rebuilt(
+    golden: str,
+) -> None:
+    before = tables_of(golden)
+    ask_to_change(golden, f"UPDATE pycrorm_generation SET version = {PROJECTION_VERSION - 1}")
+    greet = greeting(whom=str)
+    with pytest.raises(TablesOutdated, match=REBUILD):  # when the memory is closed
+        async with Memory.open(golden) as memory:
+            await greet("Eve").perform()
+            for asked in (memory.flush, memory.reading.refresh, memory.reading.episodes):
+                with pytest.raises(TablesOutdated, match=REBUILD):
+                    await asked()
+    with pytest.raises(TablesOutdated, match=REBUILD):
+        await shown(golden, "GreetAction")
+    assert ask(golden, "SELECT head, folded FROM episode ORDER BY number") == [(18, 18), (4, 4), (6, 0), (6, 0)]
+    async with Memory.open(golden) as memory:
+        await greet("Flo").perform()
+        await rebuild_memory(golden)
+        await memory.flush()
+        assert await shown(golden, "GreetAction", "whom") == [
+            ADA, CLEO, DORA, ("GreetAction", "Eve"), ("GreetAction", "Flo"),
+        ]  # fmt: skip
+    after = tables_of(golden)
+    assert all(after[name].items() >= rows.items() for name, rows in before.items())
+
+
+async def test_tables_of_a_newer_fold_are_refused(golden: str) -> None:
+    ask_to_change(golden, f"UPDATE pycrorm_generation SET version = {PROJECTION_VERSION + 1}")
+    for call in (performed(golden, greeting(whom=str)("Eve")), shown(golden, "GreetAction")):
+        with pytest.raises(DatabaseForeign, match=r"use a newer pycrorm$"):
+            await call
