@@ -18,6 +18,8 @@ from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError, PycrormError, TablesOutdated
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_found import checked, installed_besides
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.queue.living import LiveQueue
@@ -93,13 +95,22 @@ class LogAndTables:
 
 @asynccontextmanager
 async def open_destination(
-    address: DatabaseAddress, spool: Spool, *, clock: Clock, views: Sequence[UserView] = ()
+    address: DatabaseAddress,
+    spool: Spool,
+    *,
+    clock: Clock,
+    views: Sequence[UserView] = (),
+    projections: Sequence[Projection] = (),
 ) -> AsyncIterator[LogAndTables]:
-    """Opens log and tables for writing, in the running loop, and binds the spool to them. Raises `SpoolForeign`."""
+    """Opens log and tables for writing, in the running loop, and binds the spool to them. Raises `SpoolForeign`.
+
+    Keeps up to date these projections and those that are installed.
+    """
     log = await EventLog.open(address, create=True, clock=clock)
     try:
         spool.bind(log.log_id)
-        destination = LogAndTables(log, Projector(log, views=views))
+        projector = Projector(log, views=views, projections=projections, found=installed_besides(projections))
+        destination = LogAndTables(log, projector)
         await destination.open_tables()
         yield destination
     finally:
@@ -152,16 +163,23 @@ class RecoveryReport(NamedTuple):
     failed: Mapping[str, PycrormError]
 
 
-async def recover(url: str, *, spool: Path | None = None, settings: Settings | None = None) -> RecoveryReport:
+async def recover(
+    url: str,
+    *,
+    spool: Path | None = None,
+    settings: Settings | None = None,
+    projections: Sequence[Projection] = (),
+) -> RecoveryReport:
     """Append and fold all there is in the spool of a database and nobody drains, of the dead and of the living.
 
-    Of a living process what is synced at this moment. Raises as `Memory.open` does.
+    Of a living process what is synced at this moment. `projections` of one's own are kept up to date
+    too. Raises as `Memory.open` does.
     """
     failures: dict[str, PycrormError] = {}
     lost: list[str] = []
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
-    async with open_destination(address, place, clock=SYSTEM_CLOCK) as destination:
+    async with open_destination(address, place, clock=SYSTEM_CLOCK, projections=checked(projections)) as destination:
         with ExitStack() as held:
             living = list(_living_queues(place, failures, held))
             sources: Iterator[Source] = chain(living, dead_queues(place, failures, lost))

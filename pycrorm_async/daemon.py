@@ -11,6 +11,8 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseForeign, PycrormError, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_found import checked
 from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
 from pycrorm_async.queue.spool import RecorderFolder, Spool
@@ -28,8 +30,11 @@ async def serve(
     leave: asyncio.Event,
     say: Callable[[str], None],
     settings: Settings | None = None,
+    projections: Sequence[Projection] = (),
 ) -> Moved:
     """Drains every recorder of the spool and folds, until `leave` is set; `say` gets one line for each notable thing.
+
+    `projections` of one's own are kept up to date too, with those that are installed.
 
     Raises `SpoolUnavailable` when another daemon drains this spool, `DatabaseForeign` when a SQLite file is replaced by
     another meanwhile, and as `Memory.open` does.
@@ -40,7 +45,9 @@ async def serve(
     if lock is None:
         raise SpoolUnavailable(place.path, "another `pycrorm writer` drains it already")
     try:
-        async with open_destination(address, place, clock=SYSTEM_CLOCK) as destination:
+        async with open_destination(
+            address, place, clock=SYSTEM_CLOCK, projections=checked(projections)
+        ) as destination:
             say(f"draining {place.path} into {address}")
             look = _Folders(place, destination.log_id, address)
             return await Daemon(destination, look, settings=settings or Settings(), say=say).run(leave)

@@ -37,6 +37,8 @@ from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.recorder import Recorder, current_episode
 from pycrorm_async.plan.experience import experience
 from pycrorm_async.plan.ports import recorder
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_found import checked
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.experience import PickUpExperience
@@ -112,12 +114,14 @@ class Memory:
         *,
         spool: Path | None,
         views: Sequence[UserView],
+        projections: Sequence[Projection],
         settings: Settings,
         clock: Clock,
     ) -> None:
         self._address = address
         self._spool = spool
         self._views = tuple(views)
+        self._projections = tuple(projections)
         self._settings = settings
         self._clock = clock
         self._unadopted: dict[str, PycrormError] = {}
@@ -133,6 +137,7 @@ class Memory:
         *,
         spool: Path | str | None = None,
         views: Sequence[UserView] = (),
+        projections: Sequence[Projection] = (),
         writer: Writer | None = None,
         settings: Settings | None = None,
         clock: Clock = SYSTEM_CLOCK,
@@ -143,6 +148,8 @@ class Memory:
             url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that is gone when closed.
             spool: folder of the write-ahead queue; by default `memory.db.spool` beside `memory.db`.
             views: questions with a name, kept beside the tables.
+            projections: of your own, kept up to date with those that installed packages offer. What one cannot fold
+                stops its episode there alone: `flush` does not raise for it, `pycrorm status` says why.
             writer: who moves events to the database, by default as the settings say: a `thread` of this process, or
                 the `daemon`, a `pycrorm writer` for the same URL and spool. With a daemon this process has no
                 connection for writing, the database need not be there yet, and `session()`, `dataframe()` and
@@ -160,12 +167,14 @@ class Memory:
             settings = replace(settings, writer=writer)
         if settings.writer == "daemon" and address.is_private:
             raise CallerError("sqlite:// is private to this process: no daemon can write it")
-        if settings.writer == "daemon" and views:
-            raise CallerError("a daemon makes the tables and knows no views of this process: use writer='thread'")
+        if settings.writer == "daemon" and (views or projections):
+            what = "views" if views else "projections"
+            raise CallerError(f"a daemon makes the tables and knows no {what} of this process: use writer='thread'")
         return cls(
             address,
             spool=Path(spool) if spool is not None else None,
             views=views,
+            projections=checked(projections),
             settings=settings,
             clock=clock,
         )
@@ -202,7 +211,9 @@ class Memory:
         else:
             writer = WriterThread(
                 source=queue,
-                open_destination=lambda: open_destination(address, spool, clock=self._clock, views=self._views),
+                open_destination=lambda: open_destination(
+                    address, spool, clock=self._clock, views=self._views, projections=self._projections
+                ),
                 adopt=lambda: dead_queues(spool, self._unadopted),
                 settings=self._settings,
             )

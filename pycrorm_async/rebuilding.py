@@ -5,22 +5,26 @@ from __future__ import annotations
 import asyncio
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from pycrorm_async.adoption import shared_address
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import PycrormError
+from pycrorm_async.projections.generations import all_noted, projections_in
+from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, clear
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["Rebuilt", "rebuild_memory"]
+__all__ = ["Rebuilt", "rebuild_memory", "rebuild_projection", "projections_of"]
+
+Tell: TypeAlias = Callable[[str, int, int], None]
 
 _LOOK_S = 0.5
 _WAIT_S = 20.0
@@ -51,7 +55,7 @@ async def rebuild_memory(
     *,
     workers: int = 1,
     views: Sequence[UserView] = (),
-    tell: Callable[[str, int, int], None] = lambda _what, _done, _total: None,
+    tell: Tell = lambda _what, _done, _total: None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> Rebuilt:
     """Makes the tables of a memory anew from its log.
@@ -66,6 +70,34 @@ async def rebuild_memory(
     Raises `DatabaseUnavailable`; `CallerError` if somebody else rebuilds this memory. Interrupted or killed, the next
     one takes up what was made.
     """
+    return await _rebuilt(url, lambda log: Rebuild.begin(log, views=views), workers, tell, clock)
+
+
+async def rebuild_projection(
+    url: str,
+    projection: Projection,
+    *,
+    tell: Tell = lambda _what, _done, _total: None,
+    clock: Clock = SYSTEM_CLOCK,
+) -> Rebuilt:
+    """The same for the tables of one projection, of whatever version they are. Raises also `DatabaseForeign`."""
+    return await _rebuilt(url, lambda log: Rebuild.begin(log, projection=projection), 1, tell, clock)
+
+
+async def projections_of(url: str) -> list[str]:
+    """The names of the projections that have tables in a memory, whether their code is here or not."""
+    log = await EventLog.open(shared_address(url), create=False)
+    try:
+        with log.translated():
+            async with log.engine.connect() as connection:
+                return [*projections_in(await all_noted(connection))]
+    finally:
+        await log.close()
+
+
+async def _rebuilt(
+    url: str, begin: Callable[[EventLog], Awaitable[Rebuild]], workers: int, tell: Tell, clock: Clock
+) -> Rebuilt:
     address = shared_address(url)
     await (await EventLog.open(address, create=False)).close()  # it makes no memory where there is none
     log = await _opened(address)
@@ -73,11 +105,12 @@ async def rebuild_memory(
         async with claimed(log):
             began = clock.monotonic_ns()
             await clear(log)
-            rebuild = await Rebuild.begin(log, views=views)
+            rebuild = await begin(log)
             await _fold(log, rebuild, workers, tell)
             tell("showing", 1, 1)
             await rebuild.show()
             seconds = (clock.monotonic_ns() - began) / 1e9
+            parked = await rebuild.parked()
             tell("clearing up", 1, 1)
             left = await clear(log)
         episodes = await log.episodes()
@@ -86,7 +119,7 @@ async def rebuild_memory(
             events=sum(each.head for each in episodes),
             episodes=len(episodes),
             seconds=seconds,
-            parked={each.id: each.parked for each in episodes if each.parked is not None},
+            parked={each.id: parked[each.number] for each in episodes if each.number in parked},
             left=left,
         )
     finally:
@@ -97,7 +130,7 @@ async def _opened(address: DatabaseAddress) -> EventLog:
     return await EventLog.open(address, create=True, busy_timeout_s=_WAIT_S if address.is_sqlite else BUSY_TIMEOUT_S)
 
 
-async def _fold(log: EventLog, rebuild: Rebuild, workers: int, tell: Callable[[str, int, int], None]) -> None:
+async def _fold(log: EventLog, rebuild: Rebuild, workers: int, tell: Tell) -> None:
     total = sum(each.head for each in await log.episodes())
     if workers > 1:
         await _share_out(log.address, rebuild, workers, lambda left: tell("rebuilding", max(total - left, 0), total))

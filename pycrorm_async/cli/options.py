@@ -9,7 +9,7 @@ import typer
 
 from pycrorm_async.config import Writer
 
-__all__ = ["UrlOption", "SpoolOption", "JsonOption", "WriterOption", "DEFAULT_URL"]
+__all__ = ["UrlOption", "SpoolOption", "JsonOption", "WriterOption", "ProjectionOption", "DEFAULT_URL"]
 
 DEFAULT_URL = "sqlite:///pycrorm.db"
 
@@ -35,6 +35,14 @@ WriterOption = Annotated[
         envvar="PYCRORM_WRITER",
         help="Who moves events to the database: a thread of this process, or the daemon `pycrorm writer`.",
         show_envvar=True,
+    ),
+]
+ProjectionOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--projection",
+        metavar="MODULE:CLASS",
+        help="A projection of your own, besides those that installed packages offer; may be given again.",
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Answer with one JSON document.")]

@@ -3,48 +3,81 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
 from pycrorm_async.cli.output import duration, note, print_json, stderr, stdout
-from pycrorm_async.rebuilding import Rebuilt, rebuild_memory
+from pycrorm_async.errors import CallerError
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_found import installed_besides, named
+from pycrorm_async.rebuilding import Rebuilt, projections_of, rebuild_memory, rebuild_projection
 
 __all__ = ["rebuild"]
 
+_TABLES = "tables"
+
 
 def rebuild(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[NAME]...", help="`tables`, or a projection; default: all.")
+    ] = None,
     url: UrlOption = DEFAULT_URL,
-    workers: Annotated[int, typer.Option("--workers", min=1, max=64, help="Processes that fold at once.")] = 1,
+    workers: Annotated[
+        int, typer.Option("--workers", min=1, max=64, help="Processes that fold the tables at once.")
+    ] = 1,
+    projection: ProjectionOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Make all tables and views anew from the log, while recording and reading go on.
+    """Make all tables and views anew from the log, or those of the named projections, while all goes on.
 
     The new tables are made beside those that people see and take their place in one moment, when they show at least as
-    much. A rebuild that was interrupted is taken up by the next one. It needs no code of a plan.
+    much. A rebuild that was interrupted is taken up by the next one. It needs no code of a plan, only that of the
+    projections: one whose code is not here is left as it is.
     """
-    done = asyncio.run(_rebuild(url, workers))
+    named_here = named(projection or ())
+    known = {each.name: each for each in (*named_here, *installed_besides(named_here))}
+    chosen = asyncio.run(_chosen(url, names or [], known))
+    done = {name: asyncio.run(_rebuild(url, workers, known.get(name))) for name in chosen}
     if as_json:
-        print_json(done._asdict())
-    else:
-        rate = done.events / max(done.seconds, 1e-9)
-        stdout.print(
-            f"generation {done.generation}: {done.events} events of {done.episodes} episodes in"
-            f" {duration(int(done.seconds * 1e9))}, {rate:,.0f} events/s"
-        )
-    if done.left:
-        note(
-            f"{len(done.left)} tables that are not shown any more are used still, by a long transaction or a view:"
-            f" {done.left[0]}, … (the next rebuild drops them)"
-        )
-    for episode, reason in done.parked.items():
-        note(f"episode {episode} is parked: {reason}")
-    return 1 if done.parked else 0
+        tables = done["tables"]._asdict() if "tables" in done else {}
+        others = {name: each._asdict() for name, each in done.items() if name in known}
+        print_json({**tables, "projections": others} if others else tables)
+    for name, each in done.items():
+        if not as_json:
+            rate = each.events / max(each.seconds, 1e-9)
+            stdout.print(
+                f"{f'{name}, ' if name in known else ''}generation {each.generation}: {each.events} events of"
+                f" {each.episodes} episodes in {duration(int(each.seconds * 1e9))}, {rate:,.0f} events/s"
+            )
+        if each.left:
+            note(
+                f"{len(each.left)} tables that are not shown any more are used still, by a long transaction or a view:"
+                f" {each.left[0]}, … (the next rebuild drops them)"
+            )
+        for episode, reason in each.parked.items():
+            note(f"episode {episode} is parked{f' in {name}' if name in known else ''}: {reason}")
+    return 1 if any(each.parked for each in done.values()) else 0
 
 
-async def _rebuild(url: str, workers: int) -> Rebuilt:
+async def _chosen(url: str, names: list[str], known: Mapping[str, Projection]) -> list[str]:
+    """What to rebuild, the tables first. Raises `CallerError`."""
+    there = await projections_of(url)
+    for name in names:
+        if name in there and name not in known:
+            raise CallerError(f"the code of the projection {name} is not here: give it with --projection module:Class")
+        if name != _TABLES and name not in known:
+            raise CallerError(f"there is no projection {name!r}: there are {', '.join([_TABLES, *sorted(known)])}")
+    for name in there:
+        if not names and name not in known:
+            note(f"the code of the projection {name} is not here: it is left as it is")
+    return [each for each in (_TABLES, *known) if not names or each in names]
+
+
+async def _rebuild(url: str, workers: int, projection: Projection | None) -> Rebuilt:
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -62,4 +95,6 @@ async def _rebuild(url: str, workers: int) -> Rebuilt:
             speed = bar.tasks[0].speed
             bar.update(task, description=what, completed=done, total=total, rate=f"{speed:,.0f}/s" if speed else "")
 
+        if projection is not None:
+            return await rebuild_projection(url, projection, tell=tell)
         return await rebuild_memory(url, workers=workers, tell=tell)

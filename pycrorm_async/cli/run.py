@@ -15,11 +15,12 @@ import typer
 
 from pycrorm_async.cli.interrupting import Interrupting
 from pycrorm_async.cli.loading import LoadedPlan, load_plan
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, WriterOption
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption, WriterOption
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
 from pycrorm_async.errors import EpisodeParked
 from pycrorm_async.hooks.values import message_of
 from pycrorm_async.memory import Memory
+from pycrorm_async.projections.own_found import named
 from pycrorm_async.query.questions import EpisodeSummary
 
 __all__ = ["run"]
@@ -38,6 +39,7 @@ def run(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Recorded with the episode; the plan itself must use it.")] = None,
     writer: WriterOption = "thread",
+    projection: ProjectionOption = None,
     show_traceback: Annotated[bool, typer.Option("--traceback", help="Of a plan that raises, on stderr.")] = False,
     as_json: JsonOption = False,
 ) -> int:
@@ -47,7 +49,7 @@ def run(
     Exit code 1 if the plan failed: everything up to there is remembered.
     """
     loaded = load_plan(plan)
-    memory = Memory.open(url, spool=spool, writer=writer)
+    memory = Memory.open(url, spool=spool, writer=writer, projections=named(projection or ()))
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         try:

@@ -12,6 +12,8 @@ from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlO
 from pycrorm_async.cli.output import print_json, print_table, problem, stdout
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError
+from pycrorm_async.projections.own_found import installed_besides
+from pycrorm_async.projections.own_tables import ProjectionState, states
 from pycrorm_async.queue.folder import DRAIN, available
 from pycrorm_async.queue.locks import is_locked
 from pycrorm_async.queue.progress import Progress
@@ -85,9 +87,10 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     refused = [RefusedState(each.refused, each.path, _bytes(each.path)) for each in folders if each.refused is not None]
     has_daemon = place.has_writer
     episodes: list[EpisodeState] = []
+    projections: list[ProjectionState] = []
     fault: str | None = None
     try:
-        episodes = asyncio.run(_episodes(address))
+        episodes, projections = asyncio.run(_episodes(address))
     except DatabaseError as error:
         fault = str(error)
     if as_json:
@@ -100,22 +103,32 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
                 "recorders": recorders,
                 "episodes": episodes,
                 "refused": refused,
+                "projections": [each._asdict() for each in projections],
             }
         )
     else:
         _print(place, recorders, episodes, has_daemon=has_daemon, known=fault is None)
+        for projection in projections:
+            late = f"is {projection.behind} events behind" if projection.behind else "shows all that is stored"
+            stdout.print(f"The projection {projection.name}, version {projection.version}, {late}.", markup=False)
     if fault is not None:
         problem(fault)
         return 3
     stopped = [each for each in episodes if each.refused or each.parked]
     for episode in stopped:
         problem(f"episode {episode.number} ({episode.id}) is stopped: {episode.refused or episode.parked}")
+    for projection in projections:
+        if projection.fault is not None:
+            problem(projection.fault)
+        for number, reason in projection.parked.items():
+            problem(f"episode {number} is stopped in the projection {projection.name}: {reason}")
     given_up = [each for each in recorders if each.given_up]
     for recorder in given_up:
         problem(f"nothing more of recorder {recorder.name} is stored: {recorder.given_up}")
     for each in refused:
         problem(f"what the database refused of episode {each.episode} is kept in {each.folder}")
-    return 1 if stopped or given_up or refused else 0
+    halted = any(each.parked or each.fault for each in projections)
+    return 1 if stopped or halted or given_up or refused else 0
 
 
 def _recorder(folder: RecorderFolder) -> RecorderState:
@@ -159,20 +172,20 @@ def _size(path: Path) -> int:
         return 0
 
 
-async def _episodes(address: DatabaseAddress) -> list[EpisodeState]:
+async def _episodes(address: DatabaseAddress) -> tuple[list[EpisodeState], list[ProjectionState]]:
     log = await EventLog.open(address, create=False)
     try:
         found = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
         now_ns = SYSTEM_CLOCK.wall_ns()
-        states = []
+        found_states = []
         for row in (found[number] for number in sorted(found)):
             following = await log.events(row.number, after=row.folded, limit=1)
             lag_s = (now_ns - following[0].wall_ns) / 1e9 if following else None
             lag_events = row.head - row.folded
-            states.append(
+            found_states.append(
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
             )
-        return states
+        return found_states, await states(log, installed_besides(()))
     finally:
         await log.close()
 

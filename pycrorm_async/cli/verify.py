@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, UrlOption
-from pycrorm_async.cli.output import print_json, stderr, stdout
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, stderr, stdout
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_found import installed_besides, named
 from pycrorm_async.projections.verify import Verified
 from pycrorm_async.projections.verify import verify as verify_log
 from pycrorm_async.store.address import DatabaseAddress
@@ -26,6 +29,7 @@ def verify(
         str | None, typer.Option("--episode", help="Only this one: its number, its id, or `last`.")
     ] = None,
     url: UrlOption = DEFAULT_URL,
+    projection: ProjectionOption = None,
     as_json: JsonOption = False,
 ) -> int:
     """Fold the log again and compare with the tables, row by row; look whether the log is whole.
@@ -33,7 +37,11 @@ def verify(
     Reads only, while recording and folding go on. Exit code 0 if all is as it should be, 1 if tables differ from the
     log (`pycrorm rebuild` makes them anew), 4 if the log itself is damaged.
     """
-    found, ids = asyncio.run(_verify(url, episode))
+    projections = named(projection or ())
+    known = [*projections, *installed_besides(projections)]
+    found, ids = asyncio.run(_verify(url, episode, known))
+    for name, reason in found.not_compared.items():
+        note(f"the projection {name} was not looked at: {reason}")
     if as_json:
         print_json(_document(found, ids))
     else:
@@ -43,7 +51,7 @@ def verify(
     return 1 if found.drift else 0
 
 
-async def _verify(url: str, episode: str | None) -> tuple[Verified, dict[int, str]]:
+async def _verify(url: str, episode: str | None, known: Sequence[Projection]) -> tuple[Verified, dict[int, str]]:
     bar = Progress(
         TextColumn("verifying"),
         BarColumn(),
@@ -59,7 +67,10 @@ async def _verify(url: str, episode: str | None) -> tuple[Verified, dict[int, st
         with bar:
             task = bar.add_task("", total=None)
             found = await verify_log(
-                log, episode=only, tell=lambda done, total: bar.update(task, completed=done, total=total)
+                log,
+                episode=only,
+                projections=known,
+                tell=lambda done, total: bar.update(task, completed=done, total=total),
             )
         return found, {each.number: each.id for each in await log.episodes()}
     finally:

@@ -7,16 +7,19 @@ import logging
 import os
 import signal
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pycrorm_async.adoption import RecoveryReport, recover
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
 from pycrorm_async.daemon import serve
 from pycrorm_async.errors import DamageError
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_found import named
 from pycrorm_async.writer.daemon import LEAVE_S, Moved
 
 __all__ = ["writer"]
@@ -31,6 +34,7 @@ def writer(
     ] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
+    projection: ProjectionOption = None,
     as_json: JsonOption = False,
 ) -> int:
     """Bring what is recorded below a spool into the database and its tables, as it comes.
@@ -42,9 +46,10 @@ def writer(
     With --once: exit code 0 also when an episode was lost with its process; 4 if files are damaged, 1 if an episode is
     stopped.
     """
+    projections = named(projection or ())
     if once:
-        return _once(url, spool, as_json=as_json)
-    moved = asyncio.run(_until_told_to_leave(url, spool))
+        return _once(url, spool, projections, as_json=as_json)
+    moved = asyncio.run(_until_told_to_leave(url, spool, projections))
     if as_json:
         print_json(moved._asdict())
     else:
@@ -52,7 +57,7 @@ def writer(
     return 0
 
 
-async def _until_told_to_leave(url: str, spool: Path | None) -> Moved:
+async def _until_told_to_leave(url: str, spool: Path | None, projections: Sequence[Projection]) -> Moved:
     leave = asyncio.Event()
 
     def told() -> None:
@@ -65,13 +70,14 @@ async def _until_told_to_leave(url: str, spool: Path | None) -> Moved:
 
     for each in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(each, told)
-    return await serve(url, spool=spool, leave=leave, say=note)
+    return await serve(url, spool=spool, leave=leave, say=note, projections=projections)
 
 
-def _once(url: str, spool: Path | None, *, as_json: bool) -> int:
+def _once(url: str, spool: Path | None, projections: Sequence[Projection], *, as_json: bool) -> int:
     logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)  # the report tells all of it, once
+    logging.getLogger("pycrorm_async.projections").setLevel(logging.WARNING)  # but of these nothing
     with stderr.status("recovering what dead processes left …"):
-        report = asyncio.run(recover(url, spool=spool))
+        report = asyncio.run(recover(url, spool=spool, projections=projections))
     if as_json:
         print_json(_document(report))
     else:

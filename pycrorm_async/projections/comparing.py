@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from operator import itemgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 from sqlalchemy import ColumnElement, Table, column, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.projections.generations import Generation
-from pycrorm_async.projections.rows import Row, Rows
+from pycrorm_async.projections.rows import Row
 from pycrorm_async.projections.tables import CORE, Storage, make_table
 
 __all__ = ["Comparison", "Difference", "Range"]
@@ -48,6 +48,14 @@ class Difference(NamedTuple):
         return f"{self.table}.{self.column} is {self.stored!r}, and should be {self.expected!r}"
 
 
+class Made(Protocol):
+    """What a fold makes of events."""
+
+    def to_insert(self) -> Mapping[tuple[str, tuple[str, ...]], Sequence[Row]]:
+        """Rows by (table, columns)."""
+        ...
+
+
 class Range(NamedTuple):
     """The rows with an id from `low` on and below `high`; and the episodes from number `first` on and below `end`.
 
@@ -61,7 +69,7 @@ class Range(NamedTuple):
 
 
 class Comparison:
-    """Compares the tables of one generation with what folds make.
+    """Compares the tables of one generation with what folds make: those of its layout, and `core`.
 
     Attributes:
         generation: whose tables these are.
@@ -69,21 +77,21 @@ class Comparison:
         tables: their names in the database.
     """
 
-    def __init__(self, generation: Generation) -> None:
+    def __init__(self, generation: Generation, core: Mapping[str, dict[str, Storage]] = CORE) -> None:
         self.generation = generation
         self.count = 0
         self._tables: dict[str, Table] = {}
         leaves: dict[str, dict[str, Storage]] = {
             name: {"id": "key", **columns} for name, columns in generation.layout.leaves.items()
         }
-        for name, columns in (CORE | leaves).items():
+        for name, columns in (dict(core) | leaves).items():
             self._tables[name] = make_table(name, columns, generation.number)
         self.tables = [each.name for each in self._tables.values()]
 
     async def differences(
         self,
         connection: AsyncConnection,
-        rows: Rows,
+        rows: Made,
         within: Range,
         *,
         carried: Collection[int],
@@ -129,7 +137,7 @@ class Comparison:
         where = [key >= first] if first is not None else []
         return await _rows(connection, table, *where, *([key < end] if end is not None else []))
 
-    def _expected(self, rows: Rows) -> dict[str, dict[Row, Row]]:
+    def _expected(self, rows: Made) -> dict[str, dict[Row, Row]]:
         expected: dict[str, dict[Row, Row]] = {}
         for (name, columns), made in rows.to_insert().items():
             table = self._tables.get(name)

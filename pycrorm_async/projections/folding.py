@@ -3,12 +3,13 @@
 Reading and folding hold no lock. The write transaction then checks that both the tables and the progress are as they
 were taken to be; if somebody else was quicker it is rolled back, and the events are read again. So any number may fold
 one memory, and none of them ever shows an event twice or half. Which generation it is and where its progress is noted
-is the `Goal`'s: of what people see (`projector`), or of what is made beside it (`rebuild`).
+is the `Goal`'s: of what people see (`projector`), or of what is made beside it (`rebuild`). What events mean
+is the `Meaning`'s: our tables here, or a projection of one's own (`own_tables`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
@@ -30,7 +31,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import Span, StoredEvent
 
-__all__ = ["Folding", "Goal", "Folded", "folded", "by_span"]
+__all__ = ["Folding", "Goal", "Meaning", "Batch", "TABLES"]
 
 
 class Goal(Protocol):
@@ -49,11 +50,31 @@ class Goal(Protocol):
     async def park(self, connection: AsyncConnection, number: int, reason: str) -> None: ...
 
 
+class Batch(Protocol):
+    """What a batch of events makes."""
+
+    def fold(self, event: StoredEvent) -> None:
+        """Raises `CannotFold`, and then has added nothing."""
+        ...
+
+    async def write(self, connection: AsyncConnection, generation: int) -> None:
+        """Raises `RowRefused`."""
+        ...
+
+
+class Meaning(Protocol):
+    """What events mean."""
+
+    def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
+        """What these declarations make of the layout, and a maker of empty batches that knows them."""
+        ...
+
+
 @dataclass(frozen=True)
-class Folded:
+class _Folded:
     """A batch after the fold: its rows, (episode, folded before, folded now) of each episode, and why some stop."""
 
-    rows: Rows
+    rows: Batch
     steps: list[Progress]
     parked: dict[int, str]
 
@@ -65,15 +86,42 @@ class _Types:
     payloads: list[bytes]
     revision: int
     layout: Layout
-    designators: Designators
+    batch: Callable[[], Batch]
+
+
+class _TableRows:
+    """Those of our own tables. Implements `Batch`."""
+
+    def __init__(self, designators: Designators) -> None:
+        self._designators = designators
+        self._rows = Rows()
+
+    def fold(self, event: StoredEvent) -> None:
+        fold(event, self._designators, self._rows)
+
+    async def write(self, connection: AsyncConnection, generation: int) -> None:
+        await write_rows(connection, self._rows, generation)
+
+
+class _Tables:
+    """Our own tables. Implements `Meaning`."""
+
+    def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
+        layout, accepted, refused = unite(layout, payloads)
+        designators = Designators(accepted, refused)
+        return layout, lambda: _TableRows(designators)
+
+
+TABLES = _Tables()
 
 
 class Folding:
     """Folds events of one log into one goal. `generation` is how it was when last looked at."""
 
-    def __init__(self, log: EventLog, goal: Goal, generation: Generation) -> None:
+    def __init__(self, log: EventLog, goal: Goal, generation: Generation, meaning: Meaning = TABLES) -> None:
         self._log = log
         self._goal = goal
+        self._meaning = meaning
         self.generation = generation
         self._types: _Types | None = None
 
@@ -84,7 +132,7 @@ class Folding:
         and the others go on.
         """
         types = await self._types_now()
-        done = folded(spans, events, types.designators)
+        done = _folded(spans, events, types.batch())
         try:
             async with self._log.engine.begin() as connection:
                 written = await self._write(connection, done, types)
@@ -99,9 +147,9 @@ class Folding:
     async def batch_in(self, connection: AsyncConnection, spans: Sequence[Span], events: Sequence[StoredEvent]) -> bool:
         """The same in the caller's transaction, which must not be committed if it says False or raises `RowRefused`."""
         types = await self._types_now()
-        return await self._write(connection, folded(spans, events, types.designators), types) is not None
+        return await self._write(connection, _folded(spans, events, types.batch()), types) is not None
 
-    async def _write(self, connection: AsyncConnection, done: Folded, types: _Types) -> Generation | None:
+    async def _write(self, connection: AsyncConnection, done: _Folded, types: _Types) -> Generation | None:
         """The generation written to; None if the tables or the progress are not what the fold took them to be."""
         growing = types.layout != self.generation.layout
         if growing:
@@ -121,7 +169,7 @@ class Folding:
                 ) from error
         if not await self._goal.advance(connection, done.steps):
             return None
-        await write_rows(connection, done.rows, generation.number)
+        await done.rows.write(connection, generation.number)
         for number, reason in done.parked.items():
             await self._goal.park(connection, number, reason)
         return generation
@@ -131,15 +179,15 @@ class Folding:
         payloads = await self._log.declarations()
         types = self._types
         if types is None or types.revision != self.generation.revision or types.payloads != payloads:
-            layout, accepted, refused = unite(self.generation.layout, payloads)
-            types = _Types(payloads, self.generation.revision, layout, Designators(accepted, refused))
+            layout, batch = self._meaning.learn(self.generation.layout, payloads)
+            types = _Types(payloads, self.generation.revision, layout, batch)
             self._types = types
         return types
 
     async def _apart(self, spans: Sequence[Span], events: Sequence[StoredEvent], refusal: RowRefused) -> int:
         """The database refused a row of this batch: find the episode it belongs to, and park that one."""
         if len(spans) > 1:
-            return sum([await self.batch([span], some) for span, some in by_span(spans, events)])
+            return sum([await self.batch([span], some) for span, some in _by_span(spans, events)])
         span = spans[0]
         if len(events) > 1:
             # Halves, so that all that comes before the event is shown.
@@ -153,16 +201,17 @@ class Folding:
         return 0
 
 
-def folded(spans: Sequence[Span], events: Sequence[StoredEvent], designators: Designators) -> Folded:
-    """The events of these spans, in their order, as rows."""
-    rows, steps, parked = Rows(), [], {}
-    for span, some in by_span(spans, events):
+def _folded(spans: Sequence[Span], events: Sequence[StoredEvent], rows: Batch) -> _Folded:
+    """The events of these spans, in their order, added to `rows`."""
+    steps: list[Progress] = []
+    parked: dict[int, str] = {}
+    for span, some in _by_span(spans, events):
         last = span.after
         for event in some:
             if event.sequence != last + 1:
                 break
             try:
-                fold(event, designators, rows)
+                rows.fold(event)
             except CannotFold as reason:
                 parked[span.number] = f"event {event.sequence}: {reason}"
                 break
@@ -170,10 +219,10 @@ def folded(spans: Sequence[Span], events: Sequence[StoredEvent], designators: De
         if last < span.last and span.number not in parked:
             parked[span.number] = f"event {last + 1} is missing in the log"
         steps.append((span.number, span.after, last))
-    return Folded(rows, steps, parked)
+    return _Folded(rows, steps, parked)
 
 
-def by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, list[StoredEvent]]]:
+def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, list[StoredEvent]]]:
     """Each span with its events, of which there may be none; one span an episode."""
     read = {number: list(some) for number, some in groupby(events, key=attrgetter("number"))}
     return ((span, read.get(span.number, [])) for span in spans)

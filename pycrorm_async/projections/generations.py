@@ -1,27 +1,31 @@
 """The tables of a generation and the views in front of them: made when missing, grown when types are declared.
 
 `pycrorm_generation` notes which generation people see (`tables`) and which one is being made beside it
-(`tables/making`) or waits to be dropped (`tables/gone/6`): its number, its layout, and a revision that counts the
+(`tables/making`) or waits to be dropped (`tables/gone/6`), and the same of each projection of somebody's own
+(`projection/NAME`, `projection/NAME/making`): its number, its layout, and a revision that counts the
 changes. Who folds has read the note before, and holds it in its own transaction: nobody shows another generation
 meanwhile. Everything here runs in the caller's transaction, tables and views too.
 """
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import msgspec
-from sqlalchemy import Integer, Text, column, delete, select, table, text
+from sqlalchemy import Dialect, Integer, Text, column, delete, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, Index
 
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
 from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.materialised import kept_tables, make_kept, shown_texts
-from pycrorm_async.projections.public import public_views
+from pycrorm_async.projections.public import own_views, public_views
 from pycrorm_async.projections.tables import (
     CORE,
+    OWN,
     Storage,
     index_name,
     indexed,
@@ -38,9 +42,12 @@ __all__ = [
     "SHOWN",
     "MAKING",
     "GONE",
+    "PROJECTION",
     "current_generation",
     "noted",
     "all_noted",
+    "projections_in",
+    "view_texts_of",
     "note",
     "forget",
     "make_generation",
@@ -55,6 +62,9 @@ PROJECTION_VERSION = 3
 SHOWN = "tables"
 MAKING = "tables/making"
 GONE = "tables/gone/"
+PROJECTION = "projection/"
+
+_log = logging.getLogger("pycrorm_async.projections")
 
 Hold: TypeAlias = Literal["share", "change"]
 """Until the transaction ends nobody else changes the note; with `change`, nobody else holds it either."""
@@ -128,6 +138,12 @@ async def all_noted(connection: AsyncConnection) -> dict[str, Generation]:
     return {row.projection: _generation(row) for row in rows}
 
 
+def projections_in(there: Mapping[str, Generation]) -> dict[str, Generation]:
+    """Of all that is noted, what people see of each projection, by its name."""
+    named = {key.removeprefix(PROJECTION): each for key, each in there.items() if key.startswith(PROJECTION)}
+    return {name: each for name, each in named.items() if "/" not in name}
+
+
 def _generation(row: Any) -> Generation:
     try:
         layout = msgspec.json.decode(row.layout, type=Layout)
@@ -182,15 +198,35 @@ async def grow_tables(connection: AsyncConnection, generation: Generation, layou
 async def show(connection: AsyncConnection, generation: Generation) -> Generation:
     """Puts views in front of its tables, in place of those of whatever was shown before."""
     before = await noted(connection, SHOWN, hold="change")
-    layout = generation.layout
-    views = {
-        name: view_text(meaning, connection.dialect)
-        for name, meaning in public_views(layout, generation.number).items()
-    } | shown_texts(layout, generation.number)
+    views = view_texts_of(generation, projections_in(await all_noted(connection)), connection.dialect)
     await dialect_of(connection).replace_views(connection, before.views if before else {}, views)
     shown = replace(generation, views=views)
     await note(connection, SHOWN, shown)
     return shown
+
+
+def view_texts_of(
+    generation: Generation, projections: Mapping[str, Generation], dialect: Dialect, *, simulated: bool = False
+) -> dict[str, str]:
+    """Name and SQL of every view in front of these tables; one stands on those before it.
+
+    With `simulated` nothing is left out. A projection that has a name of ours, which a designator type may have got
+    later, is not shown.
+    """
+    layout, number = generation.layout, generation.number
+    meanings = public_views(layout, number, simulated=simulated)
+    users = dict(layout.user_views) if simulated else shown_texts(layout, number)
+    taken = {name.lower() for name in (*meanings, *users)}
+    own: dict[str, str] = {}
+    for name, each in projections.items():
+        names = {view.removeprefix(OWN).lower() for view in (*each.layout.leaves, *each.layout.user_views)}
+        if names & taken:
+            _log.warning("the projection %s is not shown: the memory itself has %s", name, ", ".join(names & taken))
+            continue
+        taken |= names
+        meanings |= own_views(each.layout, each.number, number, simulated=simulated)
+        own |= each.layout.user_views
+    return {name: view_text(meaning, dialect) for name, meaning in meanings.items()} | users | own
 
 
 async def make_empty(connection: AsyncConnection, name: str, columns: dict[str, Storage], generation: int) -> None:

@@ -25,6 +25,8 @@ from pycrorm_async.projections.generations import (
 )
 from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.materialised import refresh_some
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_tables import OwnTables
 from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, with_user_views
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
@@ -43,20 +45,33 @@ class Projector:
     Args:
         log: open for writing.
         views: users' views to make beside the tables.
+        projections: of one's own, to be kept up to date too.
+        found: the same, but a fault in one of them is told and not raised.
         batch_events: how many events one transaction takes at most.
     """
 
-    def __init__(self, log: EventLog, *, views: Sequence[UserView] = (), batch_events: int = 10_000) -> None:
+    def __init__(
+        self,
+        log: EventLog,
+        *,
+        views: Sequence[UserView] = (),
+        projections: Sequence[Projection] = (),
+        found: Sequence[Projection] = (),
+        batch_events: int = 10_000,
+    ) -> None:
         self._log = log
         self._views = (*BUILT_IN_VIEWS, *views)
         self._batch_events = batch_events
+        self._own = OwnTables(log, projections, found, batch_events=batch_events)
+        self._has_news = True
         self._folding: Folding | None = None
         self._last_number = 0
 
     async def open(self) -> None:
         """Makes tables and views that are missing: those of every memory, of the mapped classes, of the users.
 
-        Raises `DatabaseForeign` for tables of another version, `CallerError` for a view whose name is taken.
+        Raises `DatabaseForeign` for tables of another version, `CallerError` for a view or a projection whose name
+        is taken.
         """
         with self._log.translated():
             async with self._log.engine.begin() as connection:
@@ -67,7 +82,8 @@ class Projector:
                 generation = found or await make_generation(connection, 1)
                 layout = generation.layout.with_leaves(mapped_leaves())
                 layout = with_user_views(layout, self._views, connection.dialect)
-                if found is None or layout != generation.layout:
+                changed = await self._own.set_up(connection, layout)
+                if found is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
             self._folding = Folding(self._log, _Live(), generation)
             await self._sweep()
@@ -84,6 +100,8 @@ class Projector:
                 count += await self._fold(spans)
             while await self._refresh():
                 pass
+            while await self._own.fold_some(now=True):
+                pass
         return count
 
     async def fold_some(self) -> bool:
@@ -92,7 +110,9 @@ class Projector:
             # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
             spans = await self._log.unfolded(self._batch_events, after=self._last_number)
             if not spans:
-                return await self._refresh()
+                self._has_news = await self._refresh() or await self._own.fold_some(now=self._has_news)
+                return self._has_news
+            self._has_news = True
             self._last_number = spans[-1].number
             await self._fold(spans)
         return True

@@ -35,9 +35,9 @@ from sqlalchemy.sql.selectable import CompoundSelect
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.layout import Layout
-from pycrorm_async.projections.tables import CORE, column_type, make_table
+from pycrorm_async.projections.tables import CORE, OWN, column_type, make_table
 
-__all__ = ["public_views", "View"]
+__all__ = ["public_views", "own_views", "View"]
 
 View: TypeAlias = Select[Any] | CompoundSelect[Any]
 _Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
@@ -119,6 +119,17 @@ def public_views(layout: Layout, generation: int, *, simulated: bool = False) ->
     views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
     views |= {name: _leaf(name, layout, generation, shown) for name in layout.leaves}
     views["designator_type"] = _designator_type()
+    return views
+
+
+def own_views(layout: Layout, number: int, generation: int, *, simulated: bool = False) -> dict[str, View]:
+    """The same for the tables of a projection of its generation `number`; `generation` is that of our tables."""
+    thoughts = make_table("simulated_episode", CORE["simulated_episode"], generation)
+    views: dict[str, View] = {}
+    for name, columns in layout.leaves.items():
+        rows = make_table(name, {"id": "key", **columns}, number)
+        view = select(rows)
+        views[name.removeprefix(OWN)] = view if simulated else view.where(_happened(rows, thoughts))
     return views
 
 

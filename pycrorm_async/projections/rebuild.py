@@ -14,52 +14,54 @@ dropped. It is folded from the log alone; no class of a plan is needed.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import NamedTuple, Self
+from typing import Self
 
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged
+from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError
 from pycrorm_async.projections import progress
+from pycrorm_async.projections.beside import WHOLE, Beside, CatchUp, Share
 from pycrorm_async.projections.classes import mapped_leaves
-from pycrorm_async.projections.folding import Folding
+from pycrorm_async.projections.folding import TABLES
 from pycrorm_async.projections.generations import (
-    GONE,
     MAKING,
+    PROJECTION,
     PROJECTION_VERSION,
     SHOWN,
     Generation,
-    Hold,
     all_noted,
+    current_generation,
     forget,
     grow_tables,
     make_empty,
     make_generation,
     note,
     noted,
+    projections_in,
     show,
 )
-from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.materialised import kept_tables, refresh_some
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_tables import OwnMeaning, layout_of, make_own, refuse_taken
 from pycrorm_async.projections.public import public_views
 from pycrorm_async.projections.shadowing import with_views
 from pycrorm_async.projections.tables import CORE, physical_name
 from pycrorm_async.projections.union import unite
 from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_text, with_user_views
-from pycrorm_async.store.dialect import Progress, RowRefused
+from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span, StoredEvent, share_out
+from pycrorm_async.store.rows import Span
 
 __all__ = ["Rebuild", "Share", "claimed", "clear"]
 
+_MAKING, _GONE = "/making", "/gone/"
 _BATCH_EVENTS = 4_000
 """So that nobody waits long for a turn to write: on SQLite such a batch holds the write lock for some 50 ms."""
-_EPISODES_MAX = 400
-"""So many episodes that have more are looked up for a batch: each costs as much as folding some of its events."""
 _SLICE_ROWS = 10_000
 """So many rows of a table that is not shown any more are deleted at once."""
 _PAUSE_S = 0.02
@@ -70,13 +72,6 @@ _SHOW_ATTEMPTS = 50
 _DROP_PAUSES_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 """Before each attempt: a question that was asked before the new tables were shown is answered by then."""
 _EVENTS = text("SELECT coalesce(sum(head), 0) FROM episode")
-
-
-class Share(NamedTuple):
-    """Which episodes one of several workers folds: those whose number leaves `part` when divided by `many`."""
-
-    part: int = 0
-    many: int = 1
 
 
 @asynccontextmanager
@@ -96,33 +91,51 @@ class Rebuild:
         number: of the generation.
     """
 
-    def __init__(self, log: EventLog, generation: Generation, *, share: Share) -> None:
+    def __init__(
+        self,
+        log: EventLog,
+        generation: Generation,
+        *,
+        share: Share = WHOLE,
+        projection: Projection | None = None,
+    ) -> None:
         self._log = log
         self.number = generation.number
-        self._share = share
-        self._folding = Folding(log, _Making(generation.number), generation)
-        self._after = 0
+        self._projection = projection
+        self._key = SHOWN if projection is None else f"{PROJECTION}{projection.name}"
+        name = None if projection is None else projection.name
+        self._place = progress.place_of(generation.number, name)
+        self._making = Beside(f"{self._key}{_MAKING}", name, generation.version, number=generation.number)
+        self._catch_up = CatchUp(
+            log,
+            self._making,
+            generation,
+            meaning=TABLES if projection is None else OwnMeaning(projection),
+            share=share,
+            after_tables=projection is not None,
+            batch_events=_BATCH_EVENTS,
+        )
 
     @classmethod
-    async def begin(cls, log: EventLog, *, views: Sequence[UserView] = ()) -> Self:
+    async def begin(
+        cls, log: EventLog, *, views: Sequence[UserView] = (), projection: Projection | None = None
+    ) -> Self:
         """Takes up the generation that is being made, or makes a new one, of all types that were ever declared.
 
-        The views people have registered are kept; `views` are added, or take the place of those of the same names.
+        The views people have registered are kept; `views` are added, or take the place of those of the same names. With
+        a projection it is the tables of that one alone.
         """
         with log.translated():
             payloads = await log.declarations()
             async with log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
                 there = await _known(log, connection)
-                making = there.get(MAKING)
-                if making is not None and making.version != PROJECTION_VERSION:
-                    await forget(connection, MAKING)
-                    await note(connection, f"{GONE}{making.number}", making)
-                    making = None
+                if projection is not None:
+                    return cls(log, await _begin_own(connection, there, projection), projection=projection)
+                making = await _going_on(connection, there, SHOWN, lambda each: each.version == PROJECTION_VERSION)
                 if making is None:
-                    making = await make_generation(
-                        connection, 1 + max((each.number for each in there.values()), default=0)
-                    )
+                    numbers = [each.number for key, each in there.items() if not key.startswith(PROJECTION)]
+                    making = await make_generation(connection, 1 + max(numbers, default=0))
                     await make_empty(connection, progress.TABLE, progress.COLUMNS, making.number)
                 shown = there.get(SHOWN)
                 layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
@@ -131,11 +144,11 @@ class Rebuild:
                 layout = with_user_views(layout, (*BUILT_IN_VIEWS, *views), connection.dialect)
                 making = await grow_tables(connection, making, layout)
                 await note(connection, MAKING, making)
-        return cls(log, making, share=Share())
+        return cls(log, making)
 
     @classmethod
     async def join(cls, log: EventLog, share: Share) -> Self:
-        """The rebuild that another process has begun, to fold a share of it."""
+        """The rebuild of our tables that another process has begun, to fold a share of it."""
         with log.translated():
             async with log.engine.connect() as connection:
                 making = await noted(connection, MAKING)
@@ -147,27 +160,17 @@ class Rebuild:
         """How many events of the log are not in the new tables yet."""
         async with self._log.engine.connect() as connection:
             whole = (await connection.execute(_EVENTS)).scalar_one()
-            return int(whole) - await progress.total(connection, self.number)
+            return int(whole) - await progress.total(connection, self._place)
+
+    async def parked(self) -> dict[int, str]:
+        """By episode number, why not all of it could be folded."""
+        async with self._log.engine.connect() as connection:
+            return await progress.parked(connection, self._place)
 
     async def fold_some(self) -> int | None:
         """Folds a batch; the number of events, None when none is left of this share."""
         with self._log.translated():
-            while True:
-                async with self._log.engine.connect() as connection:
-                    behind = await progress.behind(
-                        connection, self.number, after=self._after, limit=_EPISODES_MAX, share=self._share
-                    )
-                if behind:
-                    break
-                if self._after == 0:
-                    return None
-                self._after = 0
-            spans = share_out(behind, _BATCH_EVENTS)
-            events = await self._log.spans(spans)
-            if len(events) < sum(each.last - each.after for each in spans):
-                raise _damage(self._log, spans, events, {each.number: each.id for each in behind})
-            self._after = spans[-1].number
-            return await self._folding.batch(spans, events)
+            return await self._catch_up.fold_some()
 
     async def show(self) -> None:
         """Puts the new tables before the people, with all that the old ones showed. The old ones wait for `clear`."""
@@ -186,7 +189,7 @@ class Rebuild:
     async def _fill_kept(self) -> None:
         """Makes the rows of the views that are kept, from the new tables."""
         async with self._log.engine.connect() as connection:
-            making = await _Making(self.number).generation(connection, "share")
+            making = await self._making.generation(connection, "share")
         if not making.layout.kept:
             return
         dialect = self._log.engine.dialect
@@ -194,7 +197,7 @@ class Rebuild:
         async with with_views(self._log.engine, views | making.layout.user_views) as connection:
             more = True
             while more:
-                more = await refresh_some(connection, making.layout, self.number, folded=progress.folded(self.number))
+                more = await refresh_some(connection, making.layout, self.number, folded=progress.folded(self._place))
                 await connection.commit()
 
     async def _show_if_complete(self) -> bool:
@@ -202,36 +205,78 @@ class Rebuild:
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).alone(connection)
             # Whoever folds holds the note that is changed here: from now on nobody does, until this is over.
-            old = await noted(connection, SHOWN, hold="change")
-            new = await noted(connection, MAKING, hold="change")
-            if new is None:
-                raise InternalError("the new tables are gone")
-            late = await progress.late(connection, self.number, limit=_LATE_EVENTS_MAX + 1)
+            old = await noted(connection, self._key, hold="change")
+            new = await self._making.generation(connection, "change")
+            seen = progress.SEEN
+            if self._projection is not None:
+                seen = progress.folded(progress.place_of(old.number, self._projection.name) if old else self._place)
+            late = await progress.late(connection, self._place, seen=seen, limit=_LATE_EVENTS_MAX + 1)
             if sum(each.head - each.folded for each in late) > _LATE_EVENTS_MAX:
                 return False
             if late:
                 spans = [Span(each.number, each.folded, each.head) for each in late]
-                if not await self._folding.batch_in(connection, spans, await self._log.spans(spans)):
+                if not await self._catch_up.folding.batch_in(connection, spans, await self._log.spans(spans)):
                     await connection.rollback()
                     return False
-                new = await noted(connection, MAKING) or new
-            # A view that was registered meanwhile is kept; and whoever has read a revision before must see another one.
+                new = await self._making.generation(connection, "change")
             if old is not None:
-                # A view registered meanwhile that is kept has no table here: then there is more to make first.
-                missing = old.layout.user_views.keys() - new.layout.user_views.keys()
-                layout = new.layout.with_views(
-                    {name: old.layout.user_views[name] for name in missing},
-                    {name: kept for name, kept in old.layout.kept.items() if name in missing},
-                )
-                new = await grow_tables(connection, new, layout)
-                new = replace(new, revision=max(new.revision, old.revision) + 1)
-                await note(connection, f"{GONE}{old.number}", old)
-            new = await show(connection, new)
-            await progress.carry_over(connection, self.number)
-            await forget(connection, MAKING)
-            while await refresh_some(connection, new.layout, new.number):
-                pass
+                await note(connection, f"{self._key}{_GONE}{old.number}", old)
+            await forget(connection, f"{self._key}{_MAKING}")
+            if self._projection is None:
+                await self._show_tables(connection, old, new)
+            else:
+                await self._show_own(connection, old, new)
         return True
+
+    async def _show_tables(self, connection: AsyncConnection, old: Generation | None, new: Generation) -> None:
+        # A view that was registered meanwhile is kept; and whoever has read a revision before must see another one.
+        if old is not None:
+            # A view registered meanwhile that is kept has no table here: then there is more to make first.
+            missing = old.layout.user_views.keys() - new.layout.user_views.keys()
+            layout = new.layout.with_views(
+                {name: old.layout.user_views[name] for name in missing},
+                {name: kept for name, kept in old.layout.kept.items() if name in missing},
+            )
+            new = await grow_tables(connection, new, layout)
+            new = replace(new, revision=max(new.revision, old.revision) + 1)
+        new = await show(connection, new)
+        await progress.carry_over(connection, self._place)
+        while await refresh_some(connection, new.layout, new.number):
+            pass
+
+    async def _show_own(self, connection: AsyncConnection, old: Generation | None, new: Generation) -> None:
+        revision = 1 + max(new.revision, old.revision if old is not None else 0)
+        await note(connection, self._key, replace(new, revision=revision))
+        tables = await current_generation(connection, hold="change")
+        assert tables is not None, "looked for when this was begun"
+        await show(connection, replace(tables, revision=tables.revision + 1))
+
+
+async def _going_on(
+    connection: AsyncConnection, there: Mapping[str, Generation], key: str, usable: Callable[[Generation], bool]
+) -> Generation | None:
+    """The generation that an earlier rebuild has begun; one that is of no use waits to be dropped afterwards."""
+    making = there.get(f"{key}{_MAKING}")
+    if making is None or usable(making):
+        return making
+    await forget(connection, f"{key}{_MAKING}")
+    await note(connection, f"{key}{_GONE}{making.number}", making)
+    return None
+
+
+async def _begin_own(
+    connection: AsyncConnection, there: Mapping[str, Generation], projection: Projection
+) -> Generation:
+    tables = await current_generation(connection)
+    if tables is None:
+        raise DatabaseForeign("there are no tables yet: run `pycrorm rebuild` without a name")
+    layout = layout_of(projection, connection.dialect)
+    refuse_taken(projection.name, layout, tables.layout, projections_in(there))
+    key = f"{PROJECTION}{projection.name}"
+    making = await _going_on(
+        connection, there, key, lambda each: each.version == projection.version and each.layout == layout
+    )
+    return making or await make_own(connection, projection, f"{key}{_MAKING}")
 
 
 async def clear(log: EventLog) -> list[str]:
@@ -241,43 +286,38 @@ async def clear(log: EventLog) -> list[str]:
         async with log.engine.connect() as connection:
             there = await _known(log, connection)
         await _sweep(log)
-        for name, generation in there.items():
-            if name == SHOWN:
-                await _drop(log, physical_name(progress.TABLE, generation.number))
-            if not name.startswith(GONE):
+        for key, generation in there.items():
+            if key == SHOWN:
+                await _drop(log, progress.place_of(generation.number))
+            of, gone, _ = key.partition(_GONE)
+            if not gone:
                 continue
-            tables = (*CORE, *generation.layout.leaves, *kept_tables(generation.layout), progress.TABLE)
+            ours = of == SHOWN
+            tables = [
+                *(CORE if ours else ()),
+                *generation.layout.leaves,
+                *kept_tables(generation.layout),
+                progress.TABLE if ours else f"{progress.TABLE}_{of.removeprefix(PROJECTION)}",
+            ]
             named = [physical_name(each, generation.number) for each in tables]
             kept = await _drop_all(log, named)
             left += kept
             if not kept:
                 async with log.engine.begin() as connection:
-                    await forget(connection, name)
+                    await forget(connection, key)
     return left
 
 
 async def _known(log: EventLog, connection: AsyncConnection) -> dict[str, Generation]:
     """Every generation there is. Raises `DatabaseForeign` where a newer version made one: it alone knows its tables."""
     there = await all_noted(connection)
-    newest = max((each.version for each in there.values()), default=0)
+    newest = max((each.version for key, each in there.items() if not key.startswith(PROJECTION)), default=0)
     if newest > PROJECTION_VERSION:
         raise DatabaseForeign(
             f"{log.address}: there are tables made by version {newest} of the fold, this is version"
             f" {PROJECTION_VERSION}: use a newer pycrorm"
         )
     return there
-
-
-def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredEvent], ids: dict[int, str]) -> LogDamaged:
-    """What to raise of the first event that should be there."""
-    there = {(each.number, each.sequence) for each in events}
-    number, sequence = next(
-        (span.number, sequence)
-        for span in spans
-        for sequence in range(span.after + 1, span.last + 1)
-        if (span.number, sequence) not in there
-    )
-    return LogDamaged(ids[number], sequence, f"is missing in {log.address}")
 
 
 async def _sweep(log: EventLog) -> None:
@@ -312,27 +352,3 @@ async def _drop(log: EventLog, table: str) -> bool:
     except dialect.faults:
         return False  # somebody reads it still
     return True
-
-
-class _Making:
-    """The generation of this number while it is made. Implements `Goal`."""
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-
-    async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
-        making = await noted(connection, MAKING, hold=hold)
-        if making is None or making.number != self._number:
-            raise InternalError("the tables that were being made are gone")
-        return making
-
-    async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-        grown = await grow_tables(connection, generation, layout)
-        await note(connection, MAKING, grown)
-        return grown
-
-    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
-        return await progress.advance(connection, self._number, steps)
-
-    async def park(self, connection: AsyncConnection, number: int, reason: str) -> None:
-        await progress.park(connection, self._number, number, reason)

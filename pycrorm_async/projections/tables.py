@@ -12,10 +12,13 @@ from typing import Any, Literal, TypeAlias
 from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, Table, Text
 from sqlalchemy.types import TypeEngine
 
-__all__ = ["Storage", "CORE", "COLUMNS", "make_table", "physical_name", "column_type", "indexed", "index_name"]
+__all__ = ["Storage", "OWN", "CORE", "COLUMNS", "make_table", "physical_name", "column_type", "indexed", "index_name"]
 
 Storage: TypeAlias = Literal["key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json"]
 """How a column is stored: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON."""
+
+OWN = "pycrorm_own_"
+"""What the names of tables of people's projections begin with, so that no designator's table is ever in their way."""
 
 _POSE: dict[str, Storage] = {
     "x": "real",

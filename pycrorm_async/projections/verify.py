@@ -18,6 +18,8 @@ from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.projections.comparing import Comparison, Difference, Range
 from pycrorm_async.projections.generations import Generation, current_generation
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.own_verify import compared, not_compared
 from pycrorm_async.projections.parameters import Designators
 from pycrorm_async.projections.rereading import Rereading
 from pycrorm_async.projections.rows import Rows
@@ -71,6 +73,7 @@ class Verified(NamedTuple):
         damage, drift: how many findings of each kind there are.
         damages, differences: the first hundred of each.
         remarks: what is unusual in the order of events and happens in honest plans.
+        not_compared: by name, why the tables of a projection of somebody's were not looked at.
     """
 
     episodes: int
@@ -82,12 +85,14 @@ class Verified(NamedTuple):
     damages: list[Damage]
     differences: list[Difference]
     remarks: int
+    not_compared: Mapping[str, str]
 
 
 async def verify(
     log: EventLog,
     *,
     episode: EpisodeRow | None = None,
+    projections: Sequence[Projection] = (),
     tell: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Verified:
     """Looks at all of a memory, or at one episode.
@@ -95,6 +100,7 @@ async def verify(
     Args:
         log: may be open for reading only.
         episode: to look at; all of them if None.
+        projections: whose tables are looked at too.
         tell: how many events were looked at, of how many.
 
     Raises `DatabaseForeign` for tables of another version, `DatabaseUnavailable` for a memory without tables.
@@ -106,6 +112,7 @@ async def verify(
             await check.episodes(_Place(0, 0), None)
         else:
             await check.episodes(_Place(episode.number, 0), episode.number + 1)
+        await check.projections(projections, episode)
     return check.found()
 
 
@@ -120,6 +127,7 @@ class _Check:
         self._differences: list[Difference] = []
         self._damage = self._drift = self._remarks = 0
         self._episodes = self._events = self._rows = self._behind = 0
+        self._not_compared: dict[str, str] = {}
         self._unfinished = Rereading(0)
         self._comparison: Comparison | None = None
 
@@ -134,6 +142,7 @@ class _Check:
             damages=self._damages,
             differences=self._differences,
             remarks=self._remarks,
+            not_compared=self._not_compared,
         )
 
     async def whole(self) -> None:
@@ -168,6 +177,21 @@ class _Check:
                     self._damaged(fault.span.number, fault.span.last, f"cannot be read: {fault}")
                     after = _Place(fault.span.number + 1, 0)
             self._tell(self._events, max(total, self._events))
+
+    async def projections(self, known: Sequence[Projection], episode: EpisodeRow | None) -> None:
+        """The tables of those that are known here, of all episodes or of one."""
+        self._not_compared = await not_compared(self._log, known)
+        first, end = (0, None) if episode is None else (episode.number, episode.number + 1)
+        for each in known:
+            if each.name in self._not_compared:
+                continue
+            try:
+                async for part in compared(self._log, each, first=first, end=end):
+                    self._rows += part.rows
+                    for difference in part.differences:
+                        self._differs(difference)
+            except DamageError as fault:
+                self._damaged(None, None, str(fault))
 
     async def _heads(self, connection: AsyncConnection, first: int, end: int | None) -> int:
         """How many events there should be; and tells of those that should not be."""
@@ -264,9 +288,7 @@ class _Check:
         self._rows += comparison.count
         for each in sorted(found, key=attrgetter("number", "sequence")):
             if each.number not in read or not read[each.number].hides(each):
-                self._drift += 1
-                if len(self._differences) < _TOLD_MAX:
-                    self._differences.append(each)
+                self._differs(each)
 
     # --- findings -----------------------------------------------------------------------------------------------
 
@@ -280,6 +302,11 @@ class _Check:
             self._remarks += each.remarks
             each.events = each.behind = each.remarks = 0
             each.damages.clear()
+
+    def _differs(self, difference: Difference) -> None:
+        self._drift += 1
+        if len(self._differences) < _TOLD_MAX:
+            self._differences.append(difference)
 
     def _damaged(self, number: int | None, sequence: int | None, reason: str) -> None:
         self._damage += 1

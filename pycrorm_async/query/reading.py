@@ -216,7 +216,8 @@ class Reading:
             return
         generation = await _generation(self._log)
         if generation.revision != self._all_views[0]:
-            self._all_views = generation.revision, all_views(generation, self._log.engine.dialect)
+            async with self._log.engine.connect() as connection:
+                self._all_views = generation.revision, await all_views(connection, generation)
         async with with_views(self._log.engine, self._all_views[1]) as connection:
             yield connection
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from sqlalchemy import Dialect
+from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.projections.generations import Generation
-from pycrorm_async.projections.public import public_views
-from pycrorm_async.projections.views import view_text
+from pycrorm_async.projections.generations import Generation, all_noted, projections_in, view_texts_of
 
 __all__ = ["all_views"]
 
 
-def all_views(generation: Generation, dialect: Dialect) -> dict[str, str]:
+async def all_views(connection: AsyncConnection, generation: Generation) -> dict[str, str]:
     """Name and SQL of every view there is, as it is without anything left out; a view stands on those before it."""
-    meanings = public_views(generation.layout, generation.number, simulated=True)
-    return {name: view_text(each, dialect) for name, each in meanings.items()} | generation.layout.user_views
+    projections = projections_in(await all_noted(connection))
+    return view_texts_of(generation, projections, connection.dialect, simulated=True)

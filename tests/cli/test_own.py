@@ -1,0 +1,204 @@
+"""Projections of one's own with the command: named, or offered by a package that is installed."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+
+PLAN = '''
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class WeighActionPerformable(ActionAbstract):
+    what: str
+    grams: float
+    async def perform(self):
+        if self.what == "water":
+            raise ValueError("spilled")
+
+async def plan():
+    """Weigh things."""
+    await WeighActionPerformable("milk", 1.5).perform()
+    await WeighActionPerformable("water", 2.5).perform()
+'''
+LAB = """
+from pycrorm_async.events.happenings import NodeEnded
+from pycrorm_async.projections.own import Projection
+
+class Weighed(Projection):
+    name = "weighed"
+    tables = {"weighing": {"what": "text", "grams": "real", "status": "text"}}
+
+    def fold(self, event, rows):
+        if event.dtype == "WeighAction":
+            rows.insert("weighing", event.id, **event.parameters)
+        elif isinstance(event.happening, NodeEnded):
+            rows.update("weighing", event.row(event.happening.node), status=event.happening.status)
+
+class Picky(Weighed):
+    def fold(self, event, rows):
+        super().fold(event, rows)
+        if event.parameters.get("what") == "water":
+            raise ValueError("no water")
+
+class Next(Weighed):
+    version = 2
+
+class NoTables(Weighed):
+    tables = {}
+
+class Strange:
+    pass
+"""
+WEIGHED = [("milk", 1.5, "SUCCEEDED"), ("water", 2.5, "ERROR")]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """A folder with a plan and a module of projections."""
+    (tmp_path / "weighing.py").write_text(PLAN)
+    (tmp_path / "lab.py").write_text(LAB)
+    return tmp_path
+
+
+def ask(folder: Path, question: str) -> list[Any]:
+    with sqlite3.connect(folder / "pycrorm.db") as connection:
+        found = connection.execute(question).fetchall()
+    connection.close()
+    return found
+
+
+def weighed(folder: Path) -> list[Any]:
+    return ask(folder, "SELECT what, grams, status FROM weighing ORDER BY id")
+
+
+def offered(folder: Path, **entries: str) -> None:
+    """As an installation leaves it: a folder beside the modules that says what they offer."""
+    place = folder / "site" / "lab-1.0.dist-info"
+    place.mkdir(parents=True)
+    (place / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n")
+    lines = [f"{name} = {value}" for name, value in entries.items()]
+    (place / "entry_points.txt").write_text("\n".join(["[pycrorm.projections]", *lines, ""]))
+    (folder / "lab.py").rename(folder / "site" / "lab.py")
+
+
+def with_site(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """The command where that package is installed."""
+    settings = environment()
+    settings["PYTHONPATH"] = os.pathsep.join([settings["PYTHONPATH"], str(cwd / "site")])
+    return subprocess.run(
+        [*COMMAND, *arguments], cwd=cwd, env=settings, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def test_a_named_projection_is_kept_with_the_run_rebuilt_and_verified(lab: Path) -> None:
+    assert pycrorm("run", "weighing.py", "--projection", "lab:Weighed", cwd=lab).returncode == 1  # the plan failed
+    assert weighed(lab) == WEIGHED
+    done = answer("rebuild", "weighed", "--projection", "lab:Weighed", cwd=lab)
+    assert done.keys() == {"projections"}
+    assert {**done["projections"]["weighed"], "seconds": 0} == {
+        "generation": 2, "events": 8, "episodes": 1, "seconds": 0, "parked": {}, "left": []
+    }  # fmt: skip
+    assert weighed(lab) == WEIGHED
+    assert answer("verify", "--projection", "lab:Weighed", cwd=lab)["drift"] == 0
+    ask(lab, "UPDATE pycrorm_own_weighing__2 SET grams = 3 WHERE what = 'milk'")
+    found = answer("verify", "--projection", "lab:Weighed", cwd=lab, code=1)
+    assert [(each["table"], each["column"], each["stored"]) for each in found["differences"]] == [
+        ("weighing", "grams", 3)
+    ]
+    told = pycrorm("rebuild", "--projection", "lab:Weighed", cwd=lab)
+    assert (told.returncode, told.stderr) == (0, "")
+    assert [line.split(":")[0] for line in told.stdout.splitlines()] == ["generation 2", "weighed, generation 3"]
+    assert weighed(lab) == WEIGHED
+
+
+def test_a_writer_that_knows_it_catches_up(lab: Path) -> None:
+    pycrorm("run", "weighing.py", cwd=lab)
+    done = pycrorm("writer", "--once", "--projection", "lab:Weighed", cwd=lab)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert weighed(lab) == WEIGHED
+
+
+def test_what_an_installed_package_offers_is_kept_without_a_word(lab: Path) -> None:
+    offered(lab, weighed="lab:Weighed")
+    with_site("run", "weighing.py", cwd=lab)
+    assert weighed(lab) == WEIGHED
+    told = with_site("rebuild", "--json", cwd=lab)
+    assert json.loads(told.stdout)["projections"]["weighed"]["generation"] == 2
+    assert weighed(lab) == WEIGHED
+    state = json.loads(with_site("status", "--json", cwd=lab).stdout)
+    assert state["projections"] == [{"name": "weighed", "version": 1, "behind": 0, "parked": {}, "fault": None}]
+
+
+def test_a_package_that_offers_nonsense_is_told_in_a_line_and_the_others_go_on(lab: Path) -> None:
+    offered(lab, a="lab:Strange", b="nowhere:At", c="lab:Weighed", d="lab:NoTables")
+    done = with_site("writer", "--once", "--url", f"sqlite:///{lab}/pycrorm.db", cwd=lab)
+    assert done.returncode == 0
+    said = [line.partition("the projection ")[2].strip() for line in done.stderr.splitlines()]
+    assert said == [
+        "a of an installed package is left out: lab:Strange is no projection: derive from pycrorm_async.Projection",
+        "b of an installed package is left out: ModuleNotFoundError: No module named 'nowhere'",
+        "d of an installed package is left out: the projection NoTables: it has no tables: set `tables`",
+    ]
+    assert weighed(lab) == []
+
+
+def test_one_whose_code_is_not_here_is_left_as_it_is_and_told(lab: Path) -> None:
+    pycrorm("run", "weighing.py", "--projection", "lab:Weighed", cwd=lab)
+    told = pycrorm("rebuild", cwd=lab)
+    assert told.returncode == 0
+    assert one_line_of(told) == "the code of the projection weighed is not here: it is left as it is"
+    assert weighed(lab) == WEIGHED
+    told = pycrorm("rebuild", "weighed", cwd=lab)
+    assert told.returncode == 2
+    assert "the code of the projection weighed is not here: give it with --projection module:Class" in one_line_of(told)
+    told = pycrorm("verify", cwd=lab)
+    assert told.returncode == 0
+    assert one_line_of(told) == "the projection weighed was not looked at: its code is not here"
+
+
+def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_folded(lab: Path) -> None:
+    ran = pycrorm("run", "weighing.py", "--projection", "lab:Picky", cwd=lab)
+    assert "episode 1 is parked in the projection weighed: event 5: weighed raised ValueError: no water" in ran.stderr
+    state = answer("status", cwd=lab, code=1)
+    assert state["episodes"] == []
+    assert [each["parked"] for each in state["projections"]] == [{"1": "event 5: weighed raised ValueError: no water"}]
+    told = pycrorm("status", cwd=lab)
+    assert "episode 1 is stopped in the projection weighed: event 5: weighed raised ValueError" in one_line_of(told)
+    ran = pycrorm("writer", "--once", "--projection", "lab:Next", cwd=lab)
+    assert ran.returncode == 0
+    said = "of version 1, and the one here of version 2: `pycrorm rebuild weighed` makes them anew"
+    assert said in one_line_of(ran)
+    assert pycrorm("rebuild", "weighed", "--projection", "lab:Next", cwd=lab).returncode == 0
+    assert weighed(lab) == WEIGHED
+    assert pycrorm("status", cwd=lab).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["rebuild", "--projection", "lab"], "'lab' names no projection: write module:Class"),
+        (["verify", "--projection", "nowhere:At"], "nowhere does not import: ModuleNotFoundError"),
+        (["writer", "--once", "--projection", "lab:Absent"], "lab has no 'Absent'"),
+        (["rebuild", "--projection", "lab:Strange"], "lab:Strange is no projection"),
+        (["rebuild", "--projection", "lab:NoTables"], "it has no tables"),
+        (["rebuild", "--projection", "lab:Weighed", "--projection", "lab:Picky"], "two projections are called"),
+        (["rebuild", "scales"], "there is no projection 'scales': there are tables"),
+        (["run", "weighing.py", "--writer", "daemon", "--projection", "lab:Weighed"], "knows no projections"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(lab: Path, arguments: list[str], said: str) -> None:
+    if arguments[-1] == "scales":
+        pycrorm("writer", "--once", cwd=lab)
+    done = pycrorm(*arguments, cwd=lab)
+    assert done.returncode == 2, done.stderr
+    assert said in one_line_of(done)
