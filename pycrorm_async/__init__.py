@@ -19,16 +19,18 @@ if TYPE_CHECKING:
     from pycrorm_async.config import Settings
     from pycrorm_async.errors import PycrormError
     from pycrorm_async.memory import Memory, MemoryStatus
+    from pycrorm_async.projections.own import Projection
     from pycrorm_async.projections.views import UserView
     from pycrorm_async.query.reading import Reading
 
 __version__ = "0.1.0"
 
-__all__ = ["Memory", "MemoryStatus", "PycrormError", "Reading", "Settings", "UserView", "recover"]
+__all__ = ["Memory", "MemoryStatus", "Projection", "PycrormError", "Reading", "Settings", "UserView", "recover"]
 
 _HOMES = {
     "Memory": "memory",
     "MemoryStatus": "memory",
+    "Projection": "projections.own",
     "PycrormError": "errors",
     "Reading": "query.reading",
     "Settings": "config",

@@ -12,7 +12,7 @@ import pytest
 from tests.commands import answer, pycrorm
 
 README = (Path(__file__).parent.parent.parent / "README.md").read_text()
-PLAN, QUESTIONS, TIDY, THEN = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+PLAN, QUESTIONS, TIDY, THEN, RATE = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
@@ -63,6 +63,18 @@ async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.Mo
     assert [each.whom for each in greeted] == ["Ada"]
     assert len(frame) == 0
     assert await asyncio.to_thread((tmp_path / "memory.db").exists)
+
+
+def test_the_projection_of_ones_own_counts_what_was_tried(tmp_path: Path) -> None:
+    (tmp_path / "tidy.py").write_text(TIDY)
+    (tmp_path / "rates.py").write_text(RATE)
+    done = pycrorm("run", "tidy.py", "--projection", "rates:GraspRate", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
+        tried = plain.execute("SELECT id, arm, grasp, status FROM grasp_try").fetchall()
+        question = "SELECT id, arm, grasp, status FROM pick_up_action JOIN task_tree_node USING (id)"
+        assert tried == plain.execute(question).fetchall()
+    assert [status for *_, status in tried] == ["SUCCEEDED"]
 
 
 async def test_a_moment_is_told_and_made_again_in_another_world(
