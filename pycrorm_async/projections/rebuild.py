@@ -332,6 +332,8 @@ async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
         await _sweep(log)  # where a view that was replaced cannot go yet, its tables cannot
         while tables and await _drop(log, tables[0]):
             tables = tables[1:]
+        if not tables:
+            return []
     return [each for each in tables if not await _drop(log, each)]
 
 

@@ -55,11 +55,11 @@ async def kill_again_and_again(url: str, kills: int, *, workers: int) -> None:
 
 
 async def test_killed_anywhere_people_see_the_same_and_the_next_rebuild_leaves_no_trace(database_url: str) -> None:
-    await kill_again_and_again(database_url, 8, workers=1)
+    await kill_again_and_again(database_url, 3, workers=1)
 
 
 async def test_so_it_is_when_workers_fold(tmp_path: Path) -> None:
-    await kill_again_and_again(f"sqlite:///{tmp_path}/memory.db", 2, workers=2)
+    await kill_again_and_again(f"sqlite:///{tmp_path}/memory.db", 1, workers=2)
 
 
 @pytest.mark.soak
