@@ -36,7 +36,7 @@ async def forever(memory):
 
 @pytest.fixture
 def left(tmp_path: Path) -> Path:
-    """The spool that a killed plan left, its database unreachable from the start of the spool's life."""
+    """The spool that a killed plan left; its writer may have stored some of it."""
     (tmp_path / "notes.py").write_text(PLAN)
     plan = subprocess.Popen(
         [*COMMAND, "run", "notes.py:forever"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, bufsize=0
@@ -98,7 +98,7 @@ def test_a_damaged_spool_is_mended_and_what_is_whole_is_stored(left: Path) -> No
     nodes = answer("show", "last", cwd=left.parent)["tree"]
     indices = [node["parameters"]["index"] for node in nodes if node["dtype"] == "NoteAction"]
     assert indices == list(range(len(indices)))
-    assert 140 <= len(indices) <= 150
+    assert len(indices) >= 140  # more, if the plan's own writer had stored what comes after the damage
     after = answer("spool", "inspect", left, cwd=left.parent)
     assert (after["recorders"], after["set_aside"]) == ([], [Path(mended["set_aside"]).name])
 
