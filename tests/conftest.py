@@ -25,3 +25,15 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
         return f"sqlite:///{tmp_path / 'memory.db'}"
     running: Server = request.getfixturevalue("server")
     return running.new_database()
+
+
+_LONG = ("test_verify", "test_verify_damage", "test_own", "test_cancelled", "test_rebuild_kill", "test_copy")
+"""Modules whose tests take long on a server; there they run on demand, and the others show that it answers alike."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What takes long is left to `-m soak`."""
+    for item in items:
+        if item.path.stem in _LONG and "[postgresql" in item.name:
+            item.add_marker(pytest.mark.soak)
