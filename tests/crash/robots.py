@@ -103,7 +103,7 @@ class Lab:
 
     def wait_for_log(self, words: str) -> None:
         deadline = time.monotonic() + HANGS_S
-        while words not in self.log.read_text():
+        while not self.log.exists() or words not in self.log.read_text():
             assert time.monotonic() < deadline, self.log.read_text()
             time.sleep(0.05)
 
