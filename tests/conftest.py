@@ -29,11 +29,13 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 _LONG = ("test_verify", "test_verify_damage", "test_own", "test_cancelled", "test_rebuild_kill", "test_copy")
 """Modules whose tests take long on a server; there they run on demand, and the others show that it answers alike."""
+_LONGER = ("test_bad_server", "test_bad_spool", "test_refused_killed")
+"""Modules that walk through many processes, each started anew: all of them run on demand."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes long is left to `-m soak`."""
     for item in items:
-        if item.path.stem in _LONG and "[postgresql" in item.name:
+        if item.path.stem in _LONGER or (item.path.stem in _LONG and "[postgresql" in item.name):
             item.add_marker(pytest.mark.soak)
