@@ -6,13 +6,14 @@ Nobody takes over from a daemon that may wake up again: its lock is its process'
 from __future__ import annotations
 
 import asyncio
+import json
 import random
 import signal
 import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from tests.commands import answer, one_line_of, pycrorm
+from tests.commands import one_line_of, pycrorm
 from tests.crash.robots import Lab
 from tests.databases import Server, ask
 from tests.proxy import proxy_before
@@ -41,8 +42,11 @@ def test_a_daemon_that_was_stopped_and_goes_on_has_doubled_nothing_and_nobody_to
         second = pycrorm("writer", "--url", database_url, "--spool", lab.spool, cwd=tmp_path)
         assert one_line_of(second).endswith("another `pycrorm writer` drains it already")
         assert second.returncode == 3
-        done = answer("writer", "--once", "--url", database_url, "--spool", lab.spool, cwd=tmp_path)
-        assert done["recorders"] == []  # the one that is there is held by the daemon that stands still
+        done = pycrorm("writer", "--once", "--json", "--url", database_url, "--spool", lab.spool, cwd=tmp_path)
+        if done.returncode == 3:  # it may stand still in the middle of writing, and SQLite has one lock for that
+            assert one_line_of(done).endswith("database is locked")
+        else:
+            assert json.loads(done.stdout)["recorders"] == []  # the one that is there is held by it
         let_go_on(lab)
         lab.stop_robots()
         assert lab.stop_daemon() == 0
