@@ -38,7 +38,7 @@ class NotEncodable(ValueError):
         self.reason = reason
 
 
-class UnknownShape(LookupError):
+class UnknownShape(ValueError):
     """This version knows no such event, or not in this version of it; most likely a newer one wrote it."""
 
 
@@ -60,21 +60,27 @@ class Decoder:
     def decode(self, type_name: str, payload: bytes, version: int | None = None) -> Happening:
         """The event in these bytes, which are of this version (None: the present one), in its present shape.
 
-        Raises `UnknownShape`; `msgspec.DecodeError` for bytes that are not of that shape.
+        Raises `UnknownShape`; `msgspec.DecodeError` for bytes that are not of that shape. Both are a `ValueError`.
         """
         present = self._versions.get(type_name)
         if present is None:
             raise UnknownShape(f"{type_name} is not an event this version knows")
-        if version is not None and version != present:
-            if not 1 <= version < present:
-                raise UnknownShape(f"{type_name} has version {version}, this version knows {present}")
-            payload = self._upcast(type_name, payload, version, present)
-        event: Happening = self._shapes[type_name].decode(payload)
+        if version is not None and not 1 <= version <= present:
+            raise UnknownShape(f"{type_name} has version {version}, this version knows {present}")
+        try:
+            if version is not None and version != present:
+                payload = self._upcast(type_name, payload, version, present)
+            event: Happening = self._shapes[type_name].decode(payload)
+        except (UnicodeDecodeError, RecursionError) as error:  # no UTF-8, or nested too deep
+            raise msgspec.DecodeError(str(error)) from None
         return event
 
     def declaration_of(self, payload: bytes) -> DesignatorTypeDeclared:
         """The declaration in these bytes. Raises as `decode` does."""
-        version = msgspec.json.decode(payload, type=_Versioned).version
+        try:
+            version = msgspec.json.decode(payload, type=_Versioned).version
+        except (UnicodeDecodeError, RecursionError) as error:
+            raise msgspec.DecodeError(str(error)) from None
         event = self.decode("DesignatorTypeDeclared", payload, version)
         assert isinstance(event, DesignatorTypeDeclared)
         return event

@@ -60,7 +60,7 @@ def happening_of(event: StoredEvent) -> Happening:
         return decode(event.type, event.payload, event.version)
     except UnknownShape as reason:
         raise CannotFold(str(reason)) from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except msgspec.DecodeError as error:
         raise Undecodable(f"{event.type} cannot be decoded: {error}") from None
 
 

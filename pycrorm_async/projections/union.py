@@ -38,11 +38,6 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
             accepted[name] = declared
         except Contradictory as reason:
             refused[name] = str(reason)
-        except (
-            UnknownShape,
-            msgspec.DecodeError,
-            UnicodeDecodeError,
-            RecursionError,
-        ) as error:  # a newer one, or damaged
+        except (UnknownShape, msgspec.DecodeError) as error:  # a newer version's, or damaged
             refused[name] = f"this version cannot read the declaration of its type: {error}"
     return Union(layout, accepted, refused)

@@ -143,6 +143,20 @@ async def test_a_projection_that_comes_later_begins_with_the_beginning_of_the_lo
     assert await shown(log) == [*rows_of(1), *rows_of(2)]
 
 
+@pytest.mark.parametrize(
+    "payload",
+    [b'{"version":2,"kind":"action"}', b"?", b'{"kind":"action","dtype":"XAction","table":7}', b"[" * 100_000],
+    ids=["newer", "no JSON", "another shape", "too deep"],
+)
+async def test_a_declaration_that_cannot_be_read_stops_nothing_else(log: EventLog, payload: bytes) -> None:
+    strange = declarations(PICK_UP)[0]._replace(payload=payload)
+    await log.append([*declarations(PICK_UP), strange, *tries().records])
+    projector = Projector(log, projections=[GraspRate()])
+    await projector.open()
+    await projector.fold_behind()
+    assert await ask(log, "SELECT * FROM grasp_try ORDER BY id") == rows_of(1)
+
+
 async def test_two_that_fold_at_once_show_every_event_once(log: EventLog) -> None:
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 21)))]
     await folded(log, records)
