@@ -6,11 +6,11 @@ import asyncio
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption
-from pycrorm_async.cli.output import print_json, print_table, problem, stderr
+from pycrorm_async.cli.output import print_json, print_table, problem
 from pycrorm_async.cli.waiting import note_what_waits
+from pycrorm_async.cli.watching import watched
 from pycrorm_async.copying import Copied, copy_episodes
 
 __all__ = ["copy"]
@@ -55,11 +55,5 @@ def copy(
 
 
 async def _watched(source: str, target: str, episodes: list[str]) -> Copied:
-    columns = (TextColumn("copying"), BarColumn(), MofNCompleteColumn(), TextColumn("events"), TimeRemainingColumn())
-    with Progress(*columns, console=stderr, transient=True, disable=not stderr.is_terminal) as progress:
-        task = progress.add_task("copying", total=None)
-
-        def watch(count: int, of: int) -> None:
-            progress.update(task, completed=count, total=of)
-
-        return await copy_episodes(source, target, episodes=episodes, watch=watch)
+    with watched("copying") as tell:
+        return await copy_episodes(source, target, episodes=episodes, watch=tell)

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
-from pycrorm_async.cli.output import duration, note, print_json, stderr, stdout
+from pycrorm_async.cli.output import duration, note, print_json, stdout
+from pycrorm_async.cli.watching import watched
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import installed_besides, named
@@ -78,22 +78,10 @@ async def _chosen(url: str, names: list[str], known: Mapping[str, Projection]) -
 
 
 async def _rebuild(url: str, workers: int, projection: Projection | None) -> Rebuilt:
-    bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-        console=stderr,
-        disable=not stderr.is_terminal,
-        transient=True,
-    )
-    with bar:
-        task = bar.add_task("rebuilding", total=None, rate="")
+    with watched("rebuilding") as watch:
 
         def tell(what: str, done: int, total: int) -> None:
-            speed = bar.tasks[0].speed
-            bar.update(task, description=what, completed=done, total=total, rate=f"{speed:,.0f}/s" if speed else "")
+            watch(done, total, what)
 
         if projection is not None:
             return await rebuild_projection(url, projection, tell=tell)

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stderr, stdout
+from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.watching import watched
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import installed_besides, named
 from pycrorm_async.projections.verify import Verified
@@ -52,26 +52,11 @@ def verify(
 
 
 async def _verify(url: str, episode: str | None, known: Sequence[Projection]) -> tuple[Verified, dict[int, str]]:
-    bar = Progress(
-        TextColumn("verifying"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=stderr,
-        disable=not stderr.is_terminal,
-        transient=True,
-    )
     log = await EventLog.open(DatabaseAddress.parse(url), create=False)
     try:
         only = None if episode is None else await episode_named(log, episode)
-        with bar:
-            task = bar.add_task("", total=None)
-            found = await verify_log(
-                log,
-                episode=only,
-                projections=known,
-                tell=lambda done, total: bar.update(task, completed=done, total=total),
-            )
+        with watched("verifying") as tell:
+            found = await verify_log(log, episode=only, projections=known, tell=tell)
         return found, {each.number: each.id for each in await log.episodes()}
     finally:
         await log.close()

@@ -1,0 +1,43 @@
+"""A bar on stderr for what takes long, with rate and time left; none where that is no terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from pycrorm_async.cli.output import stderr
+
+__all__ = ["watched", "Tell"]
+
+
+class Tell(Protocol):
+    """How many events are done, and of how many; and what is done with them, if that is something else now."""
+
+    def __call__(self, done: int, total: int, what: str | None = None) -> None: ...
+
+
+@contextmanager
+def watched(what: str) -> Iterator[Tell]:
+    """The bar, while the context lasts."""
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("events {task.fields[rate]}"),
+        TimeRemainingColumn(),
+        console=stderr,
+        disable=not stderr.is_terminal,
+        transient=True,
+    )
+    with bar:
+        task = bar.add_task(what, total=None, rate="")
+
+        def tell(done: int, total: int, what: str | None = None) -> None:
+            speed = bar.tasks[0].speed
+            rate = f"{speed:,.0f}/s" if speed else ""
+            bar.update(task, description=what, completed=done, total=total, rate=rate)
+
+        yield tell
