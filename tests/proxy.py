@@ -27,12 +27,14 @@ _CHUNK = 1 << 16
 class Proxy:
     """Listens on TCP; every connection to it is one to the server.
 
-    `connections` counts those made so far, `faults` the armed faults that came to pass.
+    `connections` counts those made so far, `said` how often a client spoke, `faults` the armed faults that came to
+    pass.
     """
 
     def __init__(self, server_socket: Path) -> None:
         self.port = 0
         self.connections = 0
+        self.said = 0
         self.faults = 0
         self.made: Counter[str] = Counter()
         self.chunk_bytes = _CHUNK
@@ -141,6 +143,7 @@ class Proxy:
 
     def heard(self, link: _Link, chunk: bytes) -> bytes:
         """What of the client's bytes is passed on; may end the link."""
+        self.said += 1
         if self._pattern is not None and self._pattern in chunk:
             self._pattern = None
             self.faults += 1

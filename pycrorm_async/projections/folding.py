@@ -15,7 +15,6 @@ from itertools import groupby
 from operator import attrgetter
 from typing import Protocol
 
-from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseError
@@ -161,11 +160,12 @@ class Folding:
         if growing:
             try:
                 generation = await self._goal.grow(connection, generation, types.layout)
-            except DBAPIError as error:
-                if "already exists" not in str(error.orig):
+            except dialect_of(connection).faults as error:
+                said = getattr(error, "orig", error)
+                if "already exists" not in str(said):
                     raise
                 raise DatabaseError(
-                    f"{self._log.address}: {error.orig}, and the memory needs that name: rename yours, then flush again"
+                    f"{self._log.address}: {said}, and the memory needs that name: rename yours, then flush again"
                 ) from error
         if not await self._goal.advance(connection, done.steps):
             return None

@@ -17,7 +17,7 @@ from typing import Any, Literal, TypeAlias
 import msgspec
 from sqlalchemy import Dialect, Integer, Text, column, delete, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
-from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, Index
+from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement, Index
 
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
 from pycrorm_async.projections.layout import Layout
@@ -175,19 +175,17 @@ async def make_generation(connection: AsyncConnection, number: int) -> Generatio
     """Makes the tables every memory has, in a generation of this number. Nobody sees them before `show`."""
     await dialect_of(connection).make_place(connection)
     await connection.exec_driver_sql(_CREATE)
-    for name, columns in CORE.items():
-        await make_empty(connection, name, columns, number)
+    await make_empty(connection, CORE, number)
     return Generation(number, 0, Layout(), {})
 
 
 async def grow_tables(connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
     """Makes what this layout has more than the generation; its views stay as they are."""
-    for name, columns in layout.leaves.items():
-        present = generation.layout.leaves.get(name)
-        if present is None:
-            await make_empty(connection, name, {"id": "key", **columns}, generation.number)
-        else:
-            await _add_columns(connection, name, columns, present, generation.number)
+    present = generation.layout.leaves
+    new = {name: {"id": "key", **columns} for name, columns in layout.leaves.items() if name not in present}
+    await make_empty(connection, new, generation.number)
+    for name in layout.leaves.keys() & present.keys():
+        await _add_columns(connection, name, layout.leaves[name], present[name], generation.number)
     there = kept_tables(generation.layout)
     for kept in layout.kept.values():
         if kept.table not in there:
@@ -229,12 +227,16 @@ def view_texts_of(
     return {name: view_text(meaning, dialect) for name, meaning in meanings.items()} | users | own
 
 
-async def make_empty(connection: AsyncConnection, name: str, columns: dict[str, Storage], generation: int) -> None:
-    """Makes one table of a generation, and its indexes."""
-    table = make_table(name, columns, generation)
-    await connection.execute(CreateTable(table))
-    for index in sorted(table.indexes, key=lambda each: str(each.name)):
-        await connection.execute(CreateIndex(index))
+async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[str, Storage]], generation: int) -> None:
+    """Makes these tables of a generation, by name and columns, and their indexes."""
+    statements: list[str] = []
+    for name, columns in tables.items():
+        table = make_table(name, dict(columns), generation)
+        indexes = sorted(table.indexes, key=lambda each: str(each.name))
+        made: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
+        statements += [str(each.compile(dialect=connection.dialect)) for each in made]
+    if statements:
+        await dialect_of(connection).execute_all(connection, statements)
 
 
 async def _add_columns(

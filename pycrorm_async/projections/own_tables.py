@@ -87,7 +87,7 @@ async def make_own(connection: AsyncConnection, projection: Projection, key: str
     numbers = [each.number for name, each in there.items() if name == ours or name.startswith(f"{ours}/")]
     empty = Generation(1 + max(numbers, default=0), 0, Layout(), {}, projection.version)
     made = await grow_tables(connection, empty, layout_of(projection, connection.dialect))
-    await make_empty(connection, f"{progress.TABLE}_{projection.name}", progress.COLUMNS, made.number)
+    await make_empty(connection, {f"{progress.TABLE}_{projection.name}": progress.COLUMNS}, made.number)
     await note(connection, key, made)
     return made
 

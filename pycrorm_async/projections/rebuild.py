@@ -136,7 +136,7 @@ class Rebuild:
                 if making is None:
                     numbers = [each.number for key, each in there.items() if not key.startswith(PROJECTION)]
                     making = await make_generation(connection, 1 + max(numbers, default=0))
-                    await make_empty(connection, progress.TABLE, progress.COLUMNS, making.number)
+                    await make_empty(connection, {progress.TABLE: progress.COLUMNS}, making.number)
                 shown = there.get(SHOWN)
                 layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
                 if shown is not None:

@@ -42,8 +42,7 @@ async def make_or_migrate(engine: AsyncEngine, name: str, *, birth: Birth, migra
         await dialect.alone(connection)
         found = await _look(dialect, connection, name, len(migrations))
         for statements in migrations[found.format if found else 0 :]:
-            for statement in statements:
-                await connection.exec_driver_sql(statement)
+            await dialect.execute_all(connection, statements)
         if found is None:
             await dialect.note_birth(connection, birth, len(migrations))
             return birth.log_id

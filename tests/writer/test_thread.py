@@ -251,7 +251,7 @@ async def test_damage_is_raised_at_every_flush_and_at_close_while_the_plan_goes_
 
 async def test_a_flush_that_takes_too_long_says_why_and_loses_nothing(address: DatabaseAddress) -> None:
     source = KeptSource()
-    settings = Settings(idle_ms=10**9, flush_timeout_s=0.2)
+    settings = Settings(idle_ms=10**9, flush_timeout_s=1.0)
     writer = writer_for(source, address, settings=settings, busy_timeout_s=0.01)
     await writer.start()
     holder = sqlite3.connect(address.path, isolation_level=None)

@@ -46,6 +46,12 @@ class PostgreSQL:
             raise DatabaseForeign(f"{name} has a schema {LOG_SCHEMA!r} of another program: it has no pycrorm_log")
         return Found._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
 
+    async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
+        # In one message, past SQLAlchemy: within the transaction that a statement through it has begun before.
+        driver = (await connection.get_raw_connection()).driver_connection
+        assert driver is not None
+        await driver.execute("; ".join(statements))
+
     async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
         await connection.exec_driver_sql(tables.INSERT_LOG, (birth.log_id, format_now, birth.created_wall_ns))
 
@@ -154,11 +160,8 @@ class PostgreSQL:
                 " every change: move it to another schema"
             )
         quote = connection.dialect.identifier_preparer.quote
-        for statement in tables.NEW_VIEWS_SCHEMA:
-            await connection.exec_driver_sql(statement)
-        await _execute(connection, *(f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()))
-        for statement in tables.SHOW_NEW_VIEWS_SCHEMA:
-            await connection.exec_driver_sql(statement)
+        made = [f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()]
+        await self.execute_all(connection, [*tables.NEW_VIEWS_SCHEMA, *made, *tables.SHOW_NEW_VIEWS_SCHEMA])
 
     async def sweep(self, connection: AsyncConnection) -> None:
         for schema, views in await _rows(_Gone, connection, tables.GONE_SCHEMAS):
@@ -195,7 +198,9 @@ class PostgreSQL:
         quote = connection.dialect.identifier_preparer.quote
         # Also where a connection may only read: a temporary view is nobody else's.
         await connection.exec_driver_sql("SET TRANSACTION READ WRITE")
-        await _execute(connection, *(f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()))
+        await self.execute_all(
+            connection, [f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()]
+        )
 
     async def insert_rows(
         self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
@@ -225,13 +230,6 @@ class _Gone(NamedTuple):
 
     schema: str
     views: list[str] | None
-
-
-async def _execute(connection: AsyncConnection, *statements: str) -> None:
-    """One message for all of them, instead of one each."""
-    driver = (await connection.get_raw_connection()).driver_connection
-    assert driver is not None
-    await driver.execute("; ".join(statements))
 
 
 async def _copy(

@@ -51,6 +51,10 @@ class SQLite:
             raise DatabaseForeign(f"{name} is a database of another program: it has tables but no pycrorm_log")
         return Found._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
 
+    async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
+        for statement in statements:
+            await connection.exec_driver_sql(statement)
+
     async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
         await connection.exec_driver_sql(tables.INSERT_LOG, (birth.log_id, format_now, birth.created_wall_ns))
 
