@@ -29,6 +29,8 @@ class PickUpWithContextView(Base):
         object_x, object_y, object_z: of the robot's base in the object's own frame, m.
         object_qx, object_qy, object_qz, object_qw: of the robot's base, turned into the object's own frame. They and
             `object_z` are read only when asked for by name: `select(PickUpWithContextView.object_z)`.
+        height_over_torso: how much higher than the robot's torso is lifted the object is, m: its z minus that of the
+            robot's base minus `torso_height`. What an arm reaches depends on it. Read when asked for by name.
     """
 
     __tablename__ = "PickUpWithContextView"
@@ -54,3 +56,4 @@ class PickUpWithContextView(Base):
     object_qy: Mapped[float] = mapped_column(deferred=True)
     object_qz: Mapped[float] = mapped_column(deferred=True)
     object_qw: Mapped[float] = mapped_column(deferred=True)
+    height_over_torso: Mapped[float | None] = mapped_column(deferred=True)

@@ -101,6 +101,7 @@ def _pick_up_with_context() -> Select[*tuple[Any, ...]]:
             node.c.process_metadata_id,
             node.c.id.label("node_id"),
             *_seen_from(there, robot),
+            (there.z - robot.z - node.c.torso_height).label("height_over_torso"),
         )
         .select_from(picked)
         .join(node, node.c.id == picked.c.id)

@@ -58,6 +58,7 @@ async def test_the_view_of_pick_ups_has_the_columns_of_the_thesis_and_the_pose_a
             "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
             "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
             "object_x", "object_y", "object_z", "object_qx", "object_qy", "object_qz", "object_qw",
+            "height_over_torso",
         ]  # fmt: skip
         assert [tuple(each)[:14] for each in answer] == [
             (row(2), "LEFT", "TOP", 0.3, -0.75, 0.5, 0.0, 0.0, 0.6, 0.8, "MILK", "FAILED", 1, row(2)),
@@ -109,6 +110,14 @@ async def test_the_view_says_where_the_robot_stood_as_seen_from_the_object(
     upwards = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
     np.testing.assert_allclose(ahead, of_thing.T @ [math.cos(heading), math.sin(heading), 0], atol=1e-12)
     np.testing.assert_allclose(upwards, of_thing.T @ [0, 0, 1], atol=1e-12)
+
+
+async def test_the_view_says_how_much_higher_than_the_lifted_torso_the_object_is(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    view = PickUpWithContextView
+    async with AsyncSession(log.engine) as session:
+        heights = (await session.scalars(select(view.height_over_torso).order_by(view.id))).all()
+    assert heights == [pytest.approx(0.9 - 0.3), None]
 
 
 async def test_the_mapped_view_gives_and_takes_members(log: EventLog) -> None:
