@@ -6,27 +6,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from pycrorm_async.cli.output import stderr
+__all__ = ["stderr", "watched", "Tell"]
 
-__all__ = ["watched", "Tell"]
+stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+"""One for all that is said there: a bar that stands still while something else is printed above it."""
 
 
 class Tell(Protocol):
-    """How many events are done, and of how many; and what is done with them, if that is something else now."""
+    """How much is done, and of how much; and what is done with it, if that is something else now."""
 
     def __call__(self, done: int, total: int, what: str | None = None) -> None: ...
 
 
 @contextmanager
-def watched(what: str) -> Iterator[Tell]:
+def watched(what: str, *, unit: str = "events") -> Iterator[Tell]:
     """The bar, while the context lasts."""
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("events {task.fields[rate]}"),
+        TextColumn(unit + " {task.fields[rate]}"),
         TimeRemainingColumn(),
         console=stderr,
         disable=not stderr.is_terminal,

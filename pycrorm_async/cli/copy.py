@@ -10,8 +10,8 @@ import typer
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption
 from pycrorm_async.cli.output import print_json, print_table, problem
 from pycrorm_async.cli.waiting import note_what_waits
-from pycrorm_async.cli.watching import watched
 from pycrorm_async.copying import Copied, copy_episodes
+from pycrorm_async.watching import watched
 
 __all__ = ["copy"]
 

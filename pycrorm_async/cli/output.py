@@ -12,13 +12,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pycrorm_async.watching import stderr
+
 __all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "print_facts", "duration", "moment"]
 
 _WIDTH_PIPED = 160
 """A pipe has no width; tables are then as wide as this, so that lines stay whole."""
 
 stdout = Console(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
-stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def problem(line: str) -> None:

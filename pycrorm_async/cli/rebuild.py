@@ -10,11 +10,11 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
 from pycrorm_async.cli.output import duration, note, print_json, stdout
-from pycrorm_async.cli.watching import watched
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import installed_besides, named
 from pycrorm_async.rebuilding import Rebuilt, projections_of, rebuild_memory, rebuild_projection
+from pycrorm_async.watching import watched
 
 __all__ = ["rebuild"]
 

@@ -10,7 +10,6 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, stdout
-from pycrorm_async.cli.watching import watched
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import installed_besides, named
 from pycrorm_async.projections.verify import Verified
@@ -18,6 +17,7 @@ from pycrorm_async.projections.verify import verify as verify_log
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.naming import episode_named
+from pycrorm_async.watching import watched
 
 __all__ = ["verify"]
 
