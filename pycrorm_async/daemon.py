@@ -9,7 +9,7 @@ from pathlib import Path
 from pycrorm_async.adoption import open_destination, shared_address
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DatabaseForeign, PycrormError, SpoolUnavailable
+from pycrorm_async.errors import DatabaseForeign, PycrormError, SpoolTaken
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import checked
@@ -36,14 +36,14 @@ async def serve(
 
     `projections` of one's own are kept up to date too, with those that are installed.
 
-    Raises `SpoolUnavailable` when another daemon drains this spool, `DatabaseForeign` when a SQLite file is replaced by
+    Raises `SpoolTaken` when another daemon drains this spool, `DatabaseForeign` when a SQLite file is replaced by
     another meanwhile, and as `Memory.open` does.
     """
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
     lock = place.take_writer()
     if lock is None:
-        raise SpoolUnavailable(place.path, "another `pycrorm writer` drains it already")
+        raise SpoolTaken(place.path, "another `pycrorm writer` drains it already")
     try:
         async with open_destination(
             address, place, clock=SYSTEM_CLOCK, projections=checked(projections)

@@ -20,6 +20,7 @@ __all__ = [
     "MissingExtra",
     "FilesError",
     "SpoolUnavailable",
+    "SpoolTaken",
     "SpoolFull",
     "SpoolStuck",
     "SpoolClosed",
@@ -97,6 +98,10 @@ class SpoolUnavailable(FilesError):
         super().__init__(f"spool {path}: {reason}")
         self.path = path
         self.reason = reason
+
+
+class SpoolTaken(SpoolUnavailable):
+    """Another daemon drains this spool."""
 
 
 class SpoolFull(FilesError):
