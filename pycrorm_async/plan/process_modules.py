@@ -113,16 +113,22 @@ class ChosenRobot:
         return f"<{self.name} robot>"
 
 
-def simulated_robot_within(limits: Limits) -> ChosenRobot:
+def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> ChosenRobot:
     """As `simulated_robot`, with arms that keep to these limits.
 
     Soft limits are those of the thesis' experiments. Within hard ones an arm reaches about twice as much, also
     from above with the torso down.
 
+    Args:
+        limits: of the arms' joints.
+        collisions: a hand does not go where its arm, or what it holds, would be in something (except that a gripper
+            may, where the motion allows it): `ManipulationGoalInCollision`. Ways there are not looked at.
+
     >>> with simulated_robot_within(Limits.HARD):
     ...     await MoveTCPMotion(Pose([0.9495, 0.188, 0.790675]), Arms.LEFT).perform()
     """
-    return ChosenRobot(f"simulated ({limits.name.lower()} limits)", SimulatedModules(limits), limits=limits)
+    name = f"simulated ({limits.name.lower()} limits{', no collisions' if collisions else ''})"
+    return ChosenRobot(name, SimulatedModules(limits, collisions=collisions), limits=limits)
 
 
 simulated_robot = simulated_robot_within(Limits.SOFT)

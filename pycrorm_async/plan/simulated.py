@@ -22,6 +22,7 @@ from pycrorm_async.plan.failures import (
     EnvironmentManipulationImpossible,
     IKError,
     IllPosedGoalFailure,
+    ManipulationGoalInCollision,
     TorsoGoalUnreachable,
 )
 from pycrorm_async.plan.grasping import HOLD_DISTANCE_M_MAX, between
@@ -34,6 +35,7 @@ from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import JointLimitExceeded, UnknownJoint
 from pycrorm_async.world.kinematics import Limits, Unreachable, solve
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.touching import touched_at
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.motions import (
@@ -54,17 +56,25 @@ __all__ = ["SimulatedModules"]
 
 
 class SimulatedModules:
-    """The process modules of `with simulated_robot:`, with arms that keep to these limits when they are to reach."""
+    """The process modules of `with simulated_robot:`, with arms that keep to these limits when they are to reach.
 
-    def __init__(self, limits: Limits) -> None:
+    With `collisions` an arm does not go where it, or what it holds, would reach into something else than the robot;
+    the gripper itself may, where the motion allows it.
+    """
+
+    def __init__(self, limits: Limits, *, collisions: bool = False) -> None:
         self._limits = limits
+        self._collisions = collisions
 
     async def navigate(self, motion: MoveMotion) -> None:
         robot_here().body.set_pose(motion.target)
 
     async def move_tcp(self, motion: MoveTCPMotion) -> None:
         robot = robot_here()
-        robot.body.set_joint_positions(self._reaching(robot, motion.arm, motion.target))
+        joints = self._reaching(robot, motion.arm, motion.target)
+        if self._collisions:
+            self._check_clear(robot, motion, joints)
+        robot.body.set_joint_positions(joints)
 
     async def looking(self, motion: LookingMotion) -> None:
         robot = robot_here()
@@ -135,6 +145,20 @@ class SimulatedModules:
             return solve(robot.body, arm, target, limits=self._limits)
         except Unreachable as unreachable:
             raise IKError(target, arm, tool_frame, unreachable.reason) from unreachable
+
+    def _check_clear(self, robot: RobotHere, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
+        """Raise `ManipulationGoalInCollision` if the arm would be in something with these joints."""
+        arm = robot.one_arm(motion.arm)
+        last = arm.joints[-1] if motion.allow_gripper_collision else None
+        body = robot.body
+        above = {link: body.joints_above(link) for link in body.links if body.body.solids[link]}
+        links = [link for link, found in above.items() if arm.joints[0] in found and last not in found]
+        held = [thing for thing, link in body.attachments.items() if link == arm.tool_frame]
+        met = touched_at(body, joints, links=links, carried=held)
+        if met:
+            part, thing = met[0]
+            message = f"there the {motion.arm.name} arm would be in {thing.name} with {part}"
+            raise ManipulationGoalInCollision(message, part, thing.name)
 
 
 def head_joints(robot: RobotHere, target: Pose) -> dict[str, float]:

@@ -63,6 +63,10 @@ class Body:
         """All links, the root first."""
         return tuple(self._link_numbers)
 
+    def link_number(self, link: str) -> int:
+        """Bullet's number of the link."""
+        return self._link_numbers[link]
+
     def place(self, pose: Pose) -> None:
         """Put the root link's frame there."""
         position, orientation = _composed((pose.position, pose.orientation), self._inertial[_ROOT])
