@@ -5,6 +5,7 @@ is loaded with it.
 """
 
 from pycrorm_async.orm.actions import (
+    BatchRolloutAction,
     CloseAction,
     DetectAction,
     FaceAtAction,
@@ -90,6 +91,7 @@ __all__ = [
     "GraspingAction",
     "FaceAtAction",
     "MoveAndPickUpAction",
+    "BatchRolloutAction",
     "Motion",
     "MoveMotion",
     "MoveTCPMotion",

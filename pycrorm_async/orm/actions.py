@@ -31,6 +31,7 @@ __all__ = [
     "GraspingAction",
     "FaceAtAction",
     "MoveAndPickUpAction",
+    "BatchRolloutAction",
 ]
 
 
@@ -251,3 +252,24 @@ class MoveAndPickUpAction(Action):
     standing_position: Mapped[Pose] = synonym("pose")
     object_designator_id: Mapped[int] = synonym("object_id")
     object_designator: Mapped[Object] = synonym("object")
+
+
+class BatchRolloutAction(Action):
+    """Try one action many times, each chosen by a policy (`pycrorm_async.learning.batch_rollout`).
+
+    Attributes:
+        policy: its name, made from what it says.
+        scene: where, in words.
+        seed: of the random numbers; with the index they make a rollout.
+        first: the index of the first child that ended; the next one has the next.
+        count: how many it was to be; fewer, if it was interrupted.
+    """
+
+    __tablename__ = "batch_rollout_action"
+
+    id: Mapped[int] = mapped_column(ForeignKey("action.id"), primary_key=True)
+    policy: Mapped[str]
+    scene: Mapped[str]
+    seed: Mapped[int]
+    first: Mapped[int]
+    count: Mapped[int]
