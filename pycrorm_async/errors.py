@@ -18,6 +18,9 @@ __all__ = [
     "EpisodeRefused",
     "UnknownEpisode",
     "MissingExtra",
+    "ImpossibleCondition",
+    "NotEnoughExperience",
+    "PolicyFileRefused",
     "FilesError",
     "SpoolUnavailable",
     "SpoolTaken",
@@ -34,6 +37,7 @@ __all__ = [
     "DamageError",
     "SpoolDamaged",
     "LogDamaged",
+    "PolicyDamaged",
     "InternalError",
 ]
 
@@ -82,6 +86,23 @@ class UnknownEpisode(CallerError):
 
 class MissingExtra(CallerError):
     """The call needs an optional part of the package; the message names the extra to install."""
+
+
+class ImpossibleCondition(CallerError):
+    """A policy is asked for what it gives no probability at all; the message says for what."""
+
+
+class NotEnoughExperience(CallerError):
+    """There are too few samples to learn from; the message says how many there are, and how many it takes."""
+
+
+class PolicyFileRefused(CallerError):
+    """A file cannot be read or written, holds something else than a policy, or one of another version."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"policy {path}: {reason}")
+        self.path = path
+        self.reason = reason
 
 
 # --- files ----------------------------------------------------------------------------------------------------
@@ -176,6 +197,15 @@ class LogDamaged(DamageError):
         super().__init__(f"episode {episode}, event {sequence}: {reason}")
         self.episode = episode
         self.sequence = sequence
+        self.reason = reason
+
+
+class PolicyDamaged(DamageError):
+    """A policy's file is not what was written."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"policy {path} is damaged: {reason}")
+        self.path = path
         self.reason = reason
 
 
