@@ -1,12 +1,18 @@
-"""A memory on a server at the end of a slow line is opened all the same: few messages, however many tables."""
+"""A memory on a server at the end of a line that is slow, or breaks."""
 
 from urllib.parse import urlsplit
 
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.orm import Pose
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.views import UserView
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask
-from tests.proxy import proxy_before
+from tests.proxy import Proxy, proxy_before
 
 MADE = """
     SELECT count(*) FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
@@ -14,12 +20,30 @@ MADE = """
 """
 
 
+async def opened(proxy: Proxy, url: str) -> EventLog:
+    return await EventLog.open(DatabaseAddress.parse(proxy.url(urlsplit(url).path[1:])), create=True)
+
+
 async def test_a_memory_is_made_in_far_fewer_messages_than_it_has_tables(server: Server) -> None:
     url = server.new_database()
     async with proxy_before(server) as proxy:
-        log = await EventLog.open(DatabaseAddress.parse(proxy.url(urlsplit(url).path[1:])), create=True)
+        log = await opened(proxy, url)
         await Projector(log).open()
         await log.close()
     [[made]] = ask(url, MADE)
     assert made > 200
     assert proxy.said < made / 2  # each takes as long as the line is, there and back
+
+
+async def test_a_line_that_breaks_while_replaced_views_are_cleared_away_is_told_as_such(server: Server) -> None:
+    url = server.new_database()
+    async with proxy_before(server) as proxy:
+        log = await opened(proxy, url)
+        await Projector(log).open()
+        proxy.cut_before(b"DROP SCHEMA")
+        with pytest.raises(DatabaseUnavailable):
+            await Projector(log, views=[UserView("heights", select(Pose.z))]).open()
+        assert proxy.faults == 1
+        await Projector(log, views=[UserView("heights", select(Pose.z))]).open()
+        await log.close()
+    assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname LIKE 'memory%'") == [(2,)]

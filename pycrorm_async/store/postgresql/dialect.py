@@ -171,7 +171,9 @@ class PostgreSQL:
                     if views:
                         await connection.exec_driver_sql(f"DROP VIEW {', '.join(views)}")
                     await connection.exec_driver_sql(f"DROP SCHEMA {schema}")
-            except DBAPIError:
+            except DBAPIError as error:
+                if error.connection_invalidated:
+                    raise
                 continue  # somebody reads them, or stands on them: next time
 
     async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:  # noqa: ARG002
