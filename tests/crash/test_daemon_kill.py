@@ -54,7 +54,7 @@ def test_daemons_and_plans_are_killed_a_hundred_times(database_url: str, tmp_pat
 
 @pytest.fixture
 def own_server() -> Iterator[Server]:
-    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder)) as running:
+    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
         yield running
 
 

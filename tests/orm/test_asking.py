@@ -128,10 +128,11 @@ async def every(log: EventLog, question: Any) -> list[Any]:
         return list((await session.scalars(question)).unique().all())
 
 
-@pytest.mark.parametrize("mapped", [each for each in CLASSES if each is not Base], ids=lambda each: each.__name__)
-async def test_a_fresh_memory_answers_every_class_with_nothing(log: EventLog, mapped: type[Base]) -> None:
+async def test_a_fresh_memory_answers_every_class_with_nothing(log: EventLog) -> None:
     await Projector(log).open()
-    assert await every(log, select(mapped)) == []
+    mapped = [each for each in CLASSES if each is not Base]
+    assert len(mapped) > 50
+    assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
 
 
 async def test_the_episode_says_who_did_what_and_how_it_ended(log: EventLog, script: Script) -> None:

@@ -235,7 +235,7 @@ async def test_a_connection_that_goes_silent_is_given_up_and_the_batch_goes_thro
 @pytest.fixture
 def own_server() -> Iterator[Server]:
     """A server to be killed."""
-    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder)) as running:
+    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
         yield running
 
 
