@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,17 +18,13 @@ __all__ = ["Floats", "Linear", "Marginal", "Normal", "Peak"]
 
 Floats = NDArray[np.float64]
 
-PEAK_WIDTH = 0.02
-"""A normal density has its maximum in a point; this much around it counts as its peak."""
-_ROUNDING = 1e-9
-
 
 class Peak(NamedTuple):
-    """An interval on which the density is highest, and that density."""
+    """A window, and the probability in it."""
 
     low: float
     high: float
-    density: float
+    held: float
 
 
 class Normal(msgspec.Struct, frozen=True, tag="normal"):
@@ -57,11 +53,11 @@ class Normal(msgspec.Struct, frozen=True, tag="normal"):
         scaled = (at - self.mean) / self.sigma
         return np.asarray(np.exp(-scaled * scaled / 2) / (self.sigma * math.sqrt(2 * math.pi)))
 
-    def peak(self, low: float, high: float) -> Peak:
-        """Where between the two the density is highest."""
-        top = min(max(self.mean, low), high)
-        around = max(low, top - PEAK_WIDTH / 2), min(high, top + PEAK_WIDTH / 2)
-        return Peak(*around, float(self.density(np.array([top]))[0]))
+    def peak(self, low: float, high: float, width: float) -> Peak:
+        """The window of this width, or the whole if that is narrower, that holds most of what is between the two."""
+        start = _start(self.mean - width / 2, low, high, width)
+        end = min(start + width, high)
+        return Peak(float(start), float(end), float(np.diff(self.cdf(np.array([start, end])))[0]))
 
 
 class Linear(msgspec.Struct, frozen=True, tag="linear"):
@@ -98,12 +94,17 @@ class Linear(msgspec.Struct, frozen=True, tag="linear"):
         inside = (at >= self.knots[0]) & (at <= self.knots[-1])
         return np.where(inside, slopes[np.clip(after, 0, len(slopes) - 1)], 0.0)
 
-    def peak(self, low: float, high: float) -> Peak:
-        """Where between the two the density is highest; the first of several."""
-        cut = np.clip(self.knots, low, high)
-        slopes = np.diff(self.cumulative) / np.diff(self.knots)
-        best = int(np.where(np.diff(cut) > 0, slopes, -1.0).argmax())
-        return Peak(float(cut[best]), float(cut[best + 1]), float(slopes[best]))
+    def peak(self, low: float, high: float, width: float) -> Peak:
+        """The window of this width, or the whole if that is narrower, that holds most of what is between the two.
+
+        The first of several. One of its ends is a knot, or one of the two.
+        """
+        knots = np.array(self.knots)
+        starts = _start(np.concatenate([knots, knots - width]), low, high, width)
+        ends = np.minimum(starts + width, high)
+        held = self.cdf(ends) - self.cdf(starts)
+        best = int(held.argmax())
+        return Peak(float(starts[best]), float(ends[best]), float(held[best]))
 
 
 Marginal = Normal | Linear
@@ -112,3 +113,8 @@ Marginal = Normal | Linear
 def _rises(values: Sequence[float], *, strictly: bool) -> bool:
     steps = np.diff(values)
     return bool((steps > 0).all() if strictly else (steps >= 0).all())
+
+
+def _start(wanted: Any, low: float, high: float, width: float) -> Any:
+    """Where a window begins that should begin there and must lie between the two."""
+    return np.clip(wanted, low, max(low, high - width))

@@ -158,34 +158,36 @@ class Policy:
         """How likely it is that this holds, given the evidence there is; between 0 and 1."""
         return min(1.0, float(_cells(self.leaves, self.evidence & evidence).sum()) / self._mass)
 
-    def mode(self) -> Policy:
-        """Conditioned on where it is most likely: the arms, grasps and rectangles that share the highest density.
+    def mode(self, *, width_m: float = 0.05) -> Policy:
+        """Conditioned on where it is most likely: on a square of this width, and the arms and grasps likeliest there.
 
-        Of leaves that are equal in this the first. Where the density has its maximum in a point, 1 cm on either
-        side belongs to it.
+        Of all squares, cut to the region, the one in which a leaf has most of its probability for one arm and grasp.
+        Ties in another leaf are left out. Where the density is highest in a point tells little: a tree's distributions
+        are steep wherever two samples lay close together by chance.
         """
-        peaks = list(self._peaks())
-        highest = max(density for _, _, density in peaks)
-        number = next(number for number, _, density in peaks if density == highest)
+        if not width_m > 0:
+            raise CallerError(f"a square {width_m} m wide is none")
+        peaks = list(self._peaks(width_m))
+        most = max(held for _, _, held in peaks)
+        number = next(number for number, _, held in peaks if held == most)
         arms, grasps, _ = self.leaves[number].allowed(self.evidence)
-        there = tuple(rectangle for leaf, rectangle, density in peaks if (leaf, density) == (number, highest))
         return self.condition(
             Evidence(
                 arms=frozenset(arm for arm, share in zip(ARMS, arms, strict=True) if share == arms.max()),
                 grasps=frozenset(grasp for grasp, share in zip(GRASPS, grasps, strict=True) if share == grasps.max()),
-                region=Region(there),
+                region=Region(tuple(square for leaf, square, held in peaks if (leaf, held) == (number, most))),
             )
         )
 
-    def _peaks(self) -> Iterator[tuple[int, Rectangle, float]]:
-        """Of each leaf in each rectangle: the leaf's number, where it is densest, and the density."""
+    def _peaks(self, width_m: float) -> Iterator[tuple[int, Rectangle, float]]:
+        """Of each leaf in each rectangle: the leaf's number, the square that holds most of it, and how much."""
         for number, rectangle in zip(*(each.tolist() for each in self._cells.nonzero()), strict=True):
             leaf = self.leaves[number]
             arms, grasps, height = leaf.allowed(self.evidence)
             x_min, x_max, y_min, y_max = self._limits[:, rectangle].tolist()
-            x, y = leaf.x.peak(x_min, x_max), leaf.y.peak(y_min, y_max)
-            density = leaf.weight * height * float(arms.max() * grasps.max()) * x.density * y.density
-            yield number, Rectangle(x.low, x.high, y.low, y.high), density
+            x, y = leaf.x.peak(x_min, x_max, width_m), leaf.y.peak(y_min, y_max, width_m)
+            held = leaf.weight * height * float(arms.max() * grasps.max()) * x.held * y.held
+            yield number, Rectangle(x.low, x.high, y.low, y.high), held
 
     @cached_property
     def _cells(self) -> Floats:

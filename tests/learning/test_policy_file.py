@@ -1,0 +1,181 @@
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pycrorm_async.errors import PolicyDamaged, PolicyFileRefused
+from pycrorm_async.learning.default_policy import default_policy
+from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.marginals import Linear, Normal
+from pycrorm_async.learning.policy import Leaf, Policy
+from pycrorm_async.learning.policy_file import load_policy, save_policy
+from pycrorm_async.world.enums import Arms, Grasp
+
+LEARNED = Policy(
+    (
+        Leaf(
+            1 / 3, (1.0, 0.0), (0.1, 0.2, 0.7, 0.0), Linear((-1 / 3, 0.1, 1e-17 + 2), (0.0, 1 / 3, 1.0)), Normal(0, 1)
+        ),
+        Leaf(2 / 3, (0.3, 0.7), (1.0, 0.0, 0.0, 0.0), Normal(0.1, 0.2), Normal(0, 1), Linear((0.5, 0.9), (0.0, 1.0))),
+    ),
+    Evidence(
+        arms=frozenset({Arms.LEFT}),
+        grasps=frozenset({Grasp.TOP, Grasp.FRONT}),
+        region=Region((Rectangle(-1.0, 0.1, -0.7, 1 / 7), Rectangle(0.1, 2.0, -0.7, 1 / 7))),
+        height=(0.55, 0.95),
+    ),
+    constant_height=None,
+)
+
+ELSEWHERE = """
+import sys
+for name in ("jpt", "pandas", "scipy", "sqlalchemy"):
+    sys.modules[name] = None
+from pathlib import Path
+import numpy as np
+from pycrorm_async.learning.policy_file import load_policy
+policy = load_policy(Path(sys.argv[1]))
+choices = policy.sample(np.random.default_rng(8), 500)
+print(policy.likelihood(choices).tolist())
+"""
+
+
+@pytest.mark.parametrize("policy", [default_policy(), LEARNED], ids=["default", "learned"])
+def test_a_policy_is_the_same_in_another_process_without_what_learning_needs(policy: Policy, tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(policy, path)
+    assert load_policy(path) == policy
+    here = policy.likelihood(policy.sample(np.random.default_rng(8), 500)).tolist()
+    there = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, str(path)], check=True, capture_output=True, text=True
+    ).stdout
+    assert json.loads(there) == here
+
+
+def test_a_policy_takes_the_place_of_the_one_before_and_leaves_nothing_beside(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(default_policy(), path)
+    save_policy(LEARNED, path)
+    assert load_policy(path) == LEARNED
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_is_json_with_members_by_name(tmp_path: Path) -> None:
+    save_policy(LEARNED, tmp_path / "policy.json")
+    heading, content = (json.loads(line) for line in (tmp_path / "policy.json").read_text().splitlines())
+    assert (heading["format"], heading["version"]) == ("pycrorm policy", 1)
+    assert content["arms"] == ["LEFT", "RIGHT"]
+    assert content["evidence"]["grasps"] == ["FRONT", "TOP"]
+    assert content["leaves"][1]["height"] == {"type": "linear", "knots": [0.5, 0.9], "cumulative": [0.0, 1.0]}
+
+
+def test_no_changed_byte_gives_another_policy(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(LEARNED, path)
+    whole = path.read_bytes()
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises((PolicyFileRefused, PolicyDamaged), match=f"policy {path}"):
+            load_policy(path)
+
+
+def test_no_cut_gives_another_policy(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(LEARNED, path)
+    whole = path.read_bytes()
+    for length in range(len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises((PolicyFileRefused, PolicyDamaged), match=f"policy {path}"):
+            load_policy(path)
+    path.write_bytes(whole[:-1])
+    assert load_policy(path) == LEARNED, "the last newline says nothing"
+    path.write_bytes(whole + b"more")
+    with pytest.raises(PolicyDamaged, match="checksum"):
+        load_policy(path)
+
+
+def test_another_version_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    path.write_text('{"format":"pycrorm policy","version":2,"crc32":0,"more":1}\n{"nodes":[]}\n')
+    with pytest.raises(PolicyFileRefused, match="is of format version 2, where this program reads 1"):
+        load_policy(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\n\n", b"PK\x03\x04", b"[1]\n", b'{"format":"else","version":1,"crc32":0}\n']
+)
+def test_another_file_is_no_policy(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "model.bin"
+    path.write_bytes(content)
+    with pytest.raises(PolicyFileRefused, match="holds no policy"):
+        load_policy(path)
+
+
+def test_what_cannot_be_read_or_written_is_told_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(PolicyFileRefused, match=r"nothing\.json: cannot be read: No such file"):
+        load_policy(tmp_path / "nothing.json")
+    with pytest.raises(PolicyFileRefused, match="cannot be read: Is a directory"):
+        load_policy(tmp_path)
+    with pytest.raises(PolicyFileRefused, match="cannot be written: No such file"):
+        save_policy(LEARNED, tmp_path / "no" / "policy.json")
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(PolicyFileRefused, match="cannot be written: "):
+        save_policy(LEARNED, tmp_path / "taken")
+    assert [each.name for each in tmp_path.iterdir()] == ["taken"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"arms": ["RIGHT", "LEFT"]}, "probabilities of arms"),
+        ({"leaves": []}, "weights of the leaves"),
+        ({"constant_height": "high"}, "constant_height"),
+        ({"more": 1}, "more"),
+        ({"evidence": {"arms": ["THIRD"], "grasps": None, "region": None, "height": None}}, "THIRD"),
+        ({"evidence": {"arms": [], "grasps": None, "region": None, "height": None}}, "no probability"),
+        ({"evidence": {"arms": None, "grasps": None, "region": None, "height": [2, 1]}}, "interval"),
+    ],
+)
+def test_a_file_made_by_hand_is_checked_although_its_checksum_fits(
+    change: dict[str, object], said: str, tmp_path: Path
+) -> None:
+    _refused(change, said, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"weight": 0.5}, "weights of the leaves"),
+        ({"weight": -1.0}, "weight"),
+        ({"arms": [0.5, 0.6]}, "probabilities"),
+        ({"arms": [1.0]}, "probabilities"),
+        ({"grasps": [1.5, -0.5, 0.0, 0.0]}, "probabilities"),
+        ({"x": {"type": "normal", "mean": 0.0, "sigma": 0.0}}, "sigma"),
+        ({"x": {"type": "linear", "knots": [0.0, 0.0], "cumulative": [0.0, 1.0]}}, "do not rise"),
+        ({"x": {"type": "linear", "knots": [0.0, 1.0, 2.0], "cumulative": [0.0, 1.1, 1.0]}}, "do not rise"),
+        ({"x": {"type": "linear", "knots": [0.0, 1.0], "cumulative": [0.1, 1.0]}}, "from 0 to 1"),
+        ({"x": {"type": "linear", "knots": [0.0], "cumulative": [0.0]}}, "two or more"),
+        ({"x": {"type": "linear", "knots": [0.0, None], "cumulative": [0.0, 1.0]}}, "knots"),
+        ({"x": {"type": "uniform"}}, "uniform"),
+    ],
+)
+def test_a_leaf_made_by_hand_is_checked(change: dict[str, object], said: str, tmp_path: Path) -> None:
+    save_policy(default_policy(), tmp_path / "policy.json")
+    leaf = json.loads((tmp_path / "policy.json").read_text().splitlines()[1])["leaves"][0]
+    _refused({"leaves": [leaf | change]}, said, tmp_path)
+
+
+def _refused(change: dict[str, object], said: str, tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(default_policy(), path)
+    heading, content = (json.loads(line) for line in path.read_text().splitlines())
+    line = json.dumps(content | change)
+    path.write_text(json.dumps(heading | {"crc32": zlib.crc32(line.encode())}) + "\n" + line + "\n")
+    with pytest.raises(PolicyDamaged, match=f"its checksum fits, but it holds no policy: .*{said}"):
+        load_policy(path)

@@ -1,0 +1,322 @@
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra, NotEnoughExperience
+from pycrorm_async.learning.default_policy import default_policy
+from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policy_file import save_policy
+from pycrorm_async.learning.tree import learn
+from pycrorm_async.world.enums import Arms, Grasp
+from tests.learning.rollouts import frame_of, works
+
+LEFT = Evidence(arms=frozenset({Arms.LEFT}))
+ALIKE = {"arm": ["LEFT"] * 30, "grasp": ["FRONT"] * 30, "object_x": [0.5] * 30, "object_y": [0.1] * 30}
+
+
+def successes_of(rollouts: int, seed: int) -> list[PickUpChoice]:
+    return [each for each in default_policy().sample(np.random.default_rng(seed), rollouts) if works(each)]
+
+
+@pytest.fixture(scope="module")
+def successes() -> list[PickUpChoice]:
+    """Of 2,000 pick-ups of the default policy: about 320."""
+    return successes_of(2000, 69)
+
+
+@pytest.fixture(scope="module")
+def learned(successes: list[PickUpChoice]) -> Policy:
+    return learn(frame_of(successes))
+
+
+@pytest.fixture(scope="module")
+def oracle(successes: list[PickUpChoice]) -> Iterator[Any]:
+    """The tree as pyjpt makes it when it is asked without any of our code."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from jpt.distributions import Numeric, SymbolicType
+        from jpt.trees import JPT
+        from jpt.variables import NumericVariable, SymbolicVariable
+
+        tree = JPT(
+            [
+                SymbolicVariable("arm", SymbolicType("Arm", ["LEFT", "RIGHT"])),
+                SymbolicVariable("grasp", SymbolicType("Grasp", ["FRONT", "LEFT", "RIGHT", "TOP"])),
+                NumericVariable("object_x", Numeric),
+                NumericVariable("object_y", Numeric),
+            ],
+            min_samples_leaf=25,
+        )
+        with ThreadPoolExecutor(1) as beside:
+            beside.submit(tree.learn, frame_of(successes), multicore=0).result()
+        yield tree
+
+
+def test_what_is_learned_succeeds_far_more_often_than_the_default_policy(
+    learned: Policy, successes: list[PickUpChoice]
+) -> None:
+    assert 0.14 < len(successes) / 2000 < 0.18
+    tries = learned.sample(np.random.default_rng(1), 1000)
+    assert np.mean([works(each) for each in tries]) > 0.5
+
+
+def test_its_mode_succeeds_more_often_still(learned: Policy) -> None:
+    mode = learned.mode()
+    tries = mode.sample(np.random.default_rng(1), 200)
+    assert len({each[:2] for each in tries}) == 1
+    assert np.mean([works(each) for each in tries]) > 0.9
+
+
+def test_all_it_learned_from_is_possible_and_what_never_went_well_is_not(
+    learned: Policy, successes: list[PickUpChoice]
+) -> None:
+    assert learned.coverage(successes) == 1.0
+    assert learned.probability(LEFT) == pytest.approx(np.mean([each.arm is Arms.LEFT for each in successes]))
+    assert learned.probability(Evidence(grasps=frozenset({Grasp.TOP}))) == 0.0
+    with pytest.raises(ImpossibleCondition, match="grasps TOP"):
+        learned.condition(Evidence(grasps=frozenset({Grasp.TOP})))
+
+
+def test_likelihoods_are_those_of_pyjpt(learned: Policy, oracle: Any, successes: list[PickUpChoice]) -> None:
+    choices = [*successes, *learned.sample(np.random.default_rng(2), 200)]
+    coded = frame_of(choices).assign(
+        arm=[each.arm - 1 for each in choices], grasp=[each.grasp.value for each in choices]
+    )
+    # its JPT.likelihood leaves the weights of the leaves out
+    theirs = sum(leaf.prior * leaf.likelihood(coded)[:, 0] for leaf in oracle.leaves.values())
+    alike = np.isclose(learned.likelihood(choices), theirs, rtol=1e-6)
+
+    assert alike.all()
+
+
+def test_probabilities_and_conditioned_ones_are_those_of_pyjpt(learned: Policy, oracle: Any) -> None:
+    from jpt.base.intervals import ContinuousSet
+
+    for x_min, x_max, y_min, y_max in [(-0.8, 0.0, -0.5, 0.5), (0.3, 0.7, 0.0, 1.0), (-1.0, 1.0, -0.8, -0.3)]:
+        there = Evidence(region=Region((Rectangle(x_min, x_max, y_min, y_max),)))
+        query = {"object_x": ContinuousSet(x_min, x_max), "object_y": ContinuousSet(y_min, y_max)}
+        assert learned.probability(there) == pytest.approx(oracle.infer(query), rel=1e-6)
+        conditioned = oracle.conditional_jpt(query)
+        ours = learned.condition(there)
+        for grasp in (Grasp.FRONT, Grasp.LEFT, Grasp.RIGHT):
+            expected = conditioned.infer({"arm": "LEFT", "grasp": grasp.name})
+            known = Evidence(arms=frozenset({Arms.LEFT}), grasps=frozenset({grasp}))
+            assert ours.probability(known) == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+def test_a_hundred_generators_never_fail_and_repeat_themselves(learned: Policy) -> None:
+    region = Region((Rectangle(-0.9, 0.0, -0.9, 0.9), Rectangle(0.0, 0.9, 0.2, 0.9)))
+    conditioned = learned.condition(Evidence(frozenset({Arms.RIGHT}), frozenset({Grasp.LEFT, Grasp.FRONT}), region))
+    for seed in range(100):
+        choices = learned.sample(np.random.default_rng(seed), 2000)
+        assert learned.coverage(choices) == 1.0
+        assert choices == learned.sample(np.random.default_rng(seed), 2000)
+        kept = conditioned.sample(np.random.default_rng(seed), 200)
+        assert conditioned.coverage(kept) == 1.0
+        assert {each.arm for each in kept} == {Arms.RIGHT}
+        assert {each.grasp for each in kept} <= {Grasp.LEFT, Grasp.FRONT}
+        assert all(abs(x) <= 0.9 and (x <= 0.0 or y >= 0.2) and abs(y) <= 0.9 for _, _, x, y in kept)
+
+
+def test_samples_are_spread_as_the_successes_are(learned: Policy, successes: list[PickUpChoice]) -> None:
+    drawn = learned.sample(np.random.default_rng(3), 20_000)
+    for part in (2, 3):
+        apart = [
+            np.quantile([each[part] for each in drawn], share) - np.quantile([each[part] for each in successes], share)
+            for share in np.linspace(0.05, 0.95, 10)
+        ]
+        assert max(map(abs, apart)) < 0.05
+
+
+def test_learning_again_gives_the_same_policy(learned: Policy, successes: list[PickUpChoice]) -> None:
+    assert learn(frame_of(successes)) == learned
+
+
+def test_what_was_learned_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
+    from tests.learning.test_policy_file import ELSEWHERE
+
+    save_policy(learned, tmp_path / "policy.json")
+    elsewhere = [sys.executable, "-c", ELSEWHERE, str(tmp_path / "policy.json")]
+    said = subprocess.run(elsewhere, check=True, capture_output=True, text=True).stdout
+    assert json.loads(said) == learned.likelihood(learned.sample(np.random.default_rng(8), 500)).tolist()
+
+
+FIRST_OF_ALL = """
+import random, signal, sys, threading, warnings
+import numpy, pandas
+warnings.simplefilter("error")
+def state():
+    generators = random.getstate(), repr(numpy.random.get_state(legacy=False))
+    return generators, list(warnings.filters), signal.getsignal(signal.SIGINT), threading.enumerate(), sys.excepthook
+before = state()
+from pycrorm_async.learning.tree import learn
+numbers = [number / 30 for number in range(30)]
+learn(pandas.DataFrame({"arm": ["LEFT"] * 30, "grasp": ["TOP"] * 30, "object_x": numbers, "object_y": numbers}))
+assert "jpt.trees" in sys.modules
+changed = [(then, now) for then, now in zip(before, state()) if then != now]
+assert not changed, changed
+"""
+
+
+def test_the_first_learning_of_a_process_changes_nothing_else_in_it() -> None:
+    done = subprocess.run([sys.executable, "-c", FIRST_OF_ALL], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_height_that_never_changed_is_noted_and_says_nothing_of_others(successes: list[PickUpChoice]) -> None:
+    frame = frame_of(successes).assign(height=0.9)
+    policy = learn(frame)
+    assert policy.constant_height == 0.9
+    assert all(leaf.height is None for leaf in policy.leaves)
+    assert policy.condition(Evidence(height=(1.2, 1.3))).likelihood(successes).tolist() == (
+        policy.likelihood(successes).tolist()
+    )
+
+
+def test_where_to_stand_is_learned_for_each_height() -> None:
+    chance = np.random.default_rng(4)
+    heights = chance.uniform(0.6, 1.0, 400)
+    frame = pd.DataFrame(
+        {
+            "arm": np.where(chance.random(400) < 0.5, "LEFT", "RIGHT"),
+            "grasp": "FRONT",
+            "object_x": np.where(heights < 0.8, -0.6, 0.6) + chance.normal(0, 0.05, 400),
+            "object_y": chance.normal(0, 0.1, 400),
+            "height": heights,
+        }
+    )
+    policy = learn(frame)
+    low, high = (policy.condition(Evidence(height=around)) for around in ((0.69, 0.71), (0.89, 0.91)))
+    assert all(each.relative_x < 0 for each in low.sample(np.random.default_rng(5), 500))
+    assert all(each.relative_x > 0 for each in high.sample(np.random.default_rng(5), 500))
+    assert low.coverage([PickUpChoice(Arms.LEFT, Grasp.FRONT, 0.6, 0.0)]) == 0.0
+    assert policy.probability(Evidence(height=(0.6, 0.8))) == pytest.approx((heights < 0.8).mean(), abs=0.02)
+    with pytest.raises(ImpossibleCondition, match=r"height 1\.500 to 1\.600 m"):
+        policy.condition(Evidence(height=(1.5, 1.6)))
+
+
+def test_a_few_heights_are_told_apart() -> None:
+    heights = np.repeat([0.6, 0.9], 100)
+    places = np.tile(np.linspace(-0.05, 0.05, 100), 2)
+    frame = pd.DataFrame(
+        {"arm": "LEFT", "grasp": "TOP", "object_x": np.sign(heights - 0.7) + places, "object_y": places[::-1]}
+    ).assign(height=heights)
+    policy = learn(frame)
+    assert policy.probability(Evidence(height=(0.59, 0.61))) == pytest.approx(0.5)
+    assert all(each.relative_x > 0.9 for each in policy.condition(Evidence(height=(0.89, 0.91))).sample(rng(), 100))
+
+
+def test_from_one_place_only_that_place_is_learned() -> None:
+    policy = learn(pd.DataFrame(ALIKE))
+    choices = policy.sample(rng(), 100)
+    assert {each[:2] for each in choices} == {(Arms.LEFT, Grasp.FRONT)}
+    assert all(math.dist(each[2:], (0.5, 0.1)) < 0.0015 for each in choices)
+    assert policy.coverage([PickUpChoice(Arms.LEFT, Grasp.FRONT, 0.5, 0.1)]) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_every_frame_of_repeated_and_lonely_values_is_learned_whole(seed: int) -> None:
+    chance = np.random.default_rng(seed)
+    rows = int(chance.choice([2, 5, 40, 150]))
+
+    def numbers() -> np.ndarray:
+        kinds = (
+            chance.normal(0, 1, rows),
+            chance.integers(0, 3, rows) / 2,
+            np.full(rows, 0.7),
+            chance.choice([0.6, 0.75], rows) + chance.normal(0, 1e-9, rows),
+            np.where(chance.random(rows) < 0.5, 0.25, chance.random(rows)),
+        )
+        return kinds[chance.integers(len(kinds))]
+
+    frame = pd.DataFrame(
+        {
+            "arm": chance.choice(["LEFT", "RIGHT"][: chance.integers(1, 3)], rows),
+            "grasp": chance.choice([each.name for each in Grasp][: chance.integers(1, 5)], rows),
+            "object_x": numbers(),
+            "object_y": numbers(),
+            "height": numbers(),
+        }
+    )
+    policy = learn(frame, min_samples_leaf=int(chance.integers(2, min(rows, 30) + 1)))
+    seen = [
+        PickUpChoice(Arms[arm], Grasp[grasp], x, y)
+        for arm, grasp, x, y in zip(*(frame[name].tolist() for name in frame.columns[:4]), strict=True)
+    ]
+    assert policy.coverage(seen) == 1.0
+    assert policy.coverage(policy.sample(rng(), 500)) == 1.0
+    assert policy.probability(LEFT) == pytest.approx((frame.arm == "LEFT").mean())
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"arm": ["BOTH"] * 30}, "column arm holds 'BOTH', which is none of LEFT, RIGHT"),
+        ({"grasp": [Grasp.TOP] * 30}, "column grasp holds 3, which is none of FRONT, LEFT, RIGHT, TOP"),
+        ({"grasp": ["TOP"] * 29 + [None]}, "column grasp holds nan"),
+        ({"object_x": [0.1] * 28 + [math.nan, math.inf]}, "object_x has no finite number in 2 of 30 rows"),
+        ({"object_y": ["near"] * 30}, "column object_y holds something else than numbers"),
+        ({"height": [None] * 30}, "height has no finite number in 30 of 30 rows"),
+    ],
+)
+def test_what_cannot_be_learned_from_is_named(change: dict[str, Any], said: str) -> None:
+    with pytest.raises(CallerError) as raised:
+        learn(pd.DataFrame(ALIKE | change))
+    assert said in str(raised.value)
+
+
+def test_a_column_that_is_missing_is_named() -> None:
+    frame = pd.DataFrame(ALIKE).rename(columns={"object_x": "relative_x"})
+    with pytest.raises(CallerError, match="the frame has no column object_x: select arm, grasp, object_x, object_y"):
+        learn(frame)
+
+
+def test_too_few_successes_are_no_experience() -> None:
+    for rows in (0, 1, 24):
+        with pytest.raises(NotEnoughExperience, match=f"^{rows} successes are too few to learn from: a leaf takes 25"):
+            learn(pd.DataFrame(ALIKE)[:rows])
+    with pytest.raises(CallerError, match="two samples or more"):
+        learn(pd.DataFrame(ALIKE), min_samples_leaf=1)
+
+
+def test_without_pyjpt_the_extra_to_install_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "jpt.trees", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'pycrorm-async\[learning\]'"):
+        learn(pd.DataFrame(ALIKE))
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", [69, 70])
+def test_ten_thousand_tries_teach_enough_and_do_not_only_teach_to_repeat(seed: int) -> None:
+    policy = learn(frame_of(successes_of(10_000, seed)))
+    tries = policy.sample(np.random.default_rng(1), 10_000)
+    assert np.mean([works(each) for each in tries]) >= 0.78
+    assert policy.coverage(successes_of(10_000, seed + 1000)) >= 0.85
+
+
+@pytest.mark.soak
+def test_the_mode_for_every_arm_and_grasp_succeeds_nearly_always() -> None:
+    policy = learn(frame_of(successes_of(10_000, 69)))
+    for arm in (Arms.LEFT, Arms.RIGHT):
+        for grasp in (Grasp.FRONT, Grasp.LEFT, Grasp.RIGHT):
+            known = Evidence(arms=frozenset({arm}), grasps=frozenset({grasp}))
+            tries = policy.condition(known).mode().sample(np.random.default_rng(1), 100)
+            assert {each[:2] for each in tries} == {(arm, grasp)}
+            assert np.mean([works(each) for each in tries]) >= 0.95, known
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(9)
