@@ -22,7 +22,7 @@ from typing import Any
 import typer
 from rich.logging import RichHandler
 
-from pycrorm_async.cli import copy, demo, episodes, events, rebuild, run, show, spool, status, verify, writer
+from pycrorm_async.cli import copy, demo, episodes, events, learn, rebuild, run, show, spool, status, verify, writer
 from pycrorm_async.cli.output import problem, stderr
 from pycrorm_async.errors import (
     CallerError,
@@ -91,6 +91,7 @@ _VERBS: dict[str, Callable[..., int | None]] = {
     "status": status.status,
     "rebuild": rebuild.rebuild,
     "verify": verify.verify,
+    "learn": learn.learn,
 }
 for _name, _verb in _VERBS.items():
     app.command(_name)(_told_in_a_line(_verb))

@@ -1,1 +1,37 @@
-"""Policies over pick-ups: the default one, those learned from what a memory holds, and how they are tried out."""
+"""Getting better from what is remembered (thesis 5.2): policies over pick-ups, learned from those that went well.
+
+>>> policy = learn(await memory.dataframe(query_for_database()))
+>>> await Retry(MoveAndPickUp(milk, policy=policy), max_tries=20).perform()
+"""
+
+from pycrorm_async.learning.default_policy import default_policy
+from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.figure import draw_policies
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp, query_for_database
+from pycrorm_async.learning.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policy_file import load_policy, name_of, save_policy
+from pycrorm_async.learning.remembered import rollouts_question
+from pycrorm_async.learning.rollouts import Tally, batch_rollout
+from pycrorm_async.learning.scene import Scene, Stage
+from pycrorm_async.learning.tree import learn
+
+__all__ = [
+    "MoveAndPickUp",
+    "query_for_database",
+    "default_policy",
+    "learn",
+    "Policy",
+    "PickUpChoice",
+    "Evidence",
+    "Region",
+    "Rectangle",
+    "save_policy",
+    "load_policy",
+    "name_of",
+    "draw_policies",
+    "Scene",
+    "Stage",
+    "batch_rollout",
+    "Tally",
+    "rollouts_question",
+]

@@ -10,6 +10,7 @@ file from elsewhere can do no more than be refused; reading and using one needs 
 
 from __future__ import annotations
 
+import hashlib
 import math
 import os
 import zlib
@@ -22,7 +23,7 @@ from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
 from pycrorm_async.learning.policy import ARMS, GRASPS, Leaf, Policy
 from pycrorm_async.world.enums import Arms, Grasp
 
-__all__ = ["load_policy", "save_policy"]
+__all__ = ["load_policy", "name_of", "save_policy"]
 
 FORMAT = "pycrorm policy"
 VERSION = 1
@@ -56,15 +57,7 @@ def save_policy(policy: Policy, path: Path) -> None:
 
     Raises `PolicyFileRefused` where it cannot be written.
     """
-    content = msgspec.json.encode(
-        _Policy(
-            [each.name for each in ARMS],
-            [each.name for each in GRASPS],
-            policy.leaves,
-            _written(policy.evidence),
-            policy.constant_height,
-        )
-    )
+    content = _content(policy)
     heading = msgspec.json.encode(_Heading(FORMAT, VERSION, zlib.crc32(content)))
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -73,6 +66,23 @@ def save_policy(policy: Policy, path: Path) -> None:
     except OSError as error:
         beside.unlink(missing_ok=True)
         raise PolicyFileRefused(path, f"cannot be written: {error.strerror or error}") from None
+
+
+def name_of(policy: Policy) -> str:
+    """Twelve hexadecimal digits that tell policies apart: equal ones have the same, in every process."""
+    return hashlib.blake2b(_content(policy), digest_size=6).hexdigest()
+
+
+def _content(policy: Policy) -> bytes:
+    return msgspec.json.encode(
+        _Policy(
+            [each.name for each in ARMS],
+            [each.name for each in GRASPS],
+            policy.leaves,
+            _written(policy.evidence),
+            policy.constant_height,
+        )
+    )
 
 
 def load_policy(path: Path) -> Policy:
