@@ -17,7 +17,7 @@ from pycrorm_async.plan.failures import PlanFailure
 __all__ = ["InKitchen", "pick_up_in_kitchen", "KITCHEN"]
 
 KITCHEN = Scene(kitchen=True, collisions=True, torso_height=0.3)
-"""The milk of the thesis on the worktop, and the torso up: an arm that must not be in the worktop comes from above it."""
+"""The milk of the thesis on the worktop, and the torso up: the arm has to stay out of the worktop."""
 
 
 @dataclass(frozen=True)
