@@ -378,7 +378,7 @@ class Memory:
         """
         return self._now.reading.session(simulated=simulated)
 
-    async def dataframe(self, statement: Select[Any], *, simulated: bool = False) -> DataFrame:
+    async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> DataFrame:
         """The answer as a pandas DataFrame (extra `learning`); with `simulated`, thoughts too."""
         return await self._now.reading.dataframe(statement, simulated=simulated)
 

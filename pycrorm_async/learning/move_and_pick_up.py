@@ -15,7 +15,7 @@ from pycrorm_async.learning.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policy_file import name_of
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.actions import MoveAndPickUpPerformable
-from pycrorm_async.plan.composing import Composable
+from pycrorm_async.plan.descriptions import ActionDescription
 from pycrorm_async.plan.failures import ObjectUnreachable
 from pycrorm_async.plan.here import robot_here
 from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike, designator_of, in_world
@@ -30,7 +30,7 @@ HEIGHT_TOLERANCE_M = 0.05
 _UPRIGHT_MIN = 0.1
 
 
-class MoveAndPickUp(Composable):
+class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     """Alternatives for moving somewhere and picking an object up, as often as its policy has them.
 
     Iterating draws samples that fit the scene, and gives the likeliest first:
@@ -57,6 +57,7 @@ class MoveAndPickUp(Composable):
         samples: int = 20,
         rng: np.random.Generator | None = None,
     ) -> None:
+        super().__init__(MoveAndPickUpPerformable)
         self.target = target.resolve() if isinstance(target, ObjectDesignatorDescription) else designator_of(target)
         wanted = Evidence(
             arms=frozenset(arms) if arms is not None else None,
@@ -96,10 +97,6 @@ class MoveAndPickUp(Composable):
             raise ObjectUnreachable(message, self.target.name) from impossible
 
     # --- alternatives -----------------------------------------------------------------------------------------
-
-    def resolve(self) -> MoveAndPickUpPerformable:
-        """The likeliest of the samples that fit the scene. Raises `ObjectUnreachable` if none can."""
-        return next(iter(self))
 
     def __iter__(self) -> Iterator[MoveAndPickUpPerformable]:
         """Samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none can."""
