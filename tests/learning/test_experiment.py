@@ -1,0 +1,213 @@
+"""The whole experiment with real worker processes: counted and remembered alike, killed, interrupted and resumed."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+from pycrorm_async import Reading
+from pycrorm_async.errors import CallerError, NotEnoughExperience
+from pycrorm_async.learning import Scene, default_policy, name_of, remembered
+from pycrorm_async.learning.experiment import Experiment, Learned, known, run
+from pycrorm_async.learning.kitchen import pick_up_in_kitchen
+from pycrorm_async.learning.rollouts import Tally
+from pycrorm_async.learning.study import study
+from pycrorm_async.learning.workers import Job, Place, WorkerLost, Workers
+from pycrorm_async.orm import MoveAndPickUpAction
+from tests.databases import ask
+
+SMALL = Experiment(rollouts=700, evaluate=200, held_out=200, workers=2)
+
+
+@pytest.fixture
+def place(database_url: str, tmp_path: Path) -> Place:
+    return Place(database_url, tmp_path / "spool")
+
+
+def workers_running() -> list[psutil.Process]:
+    return [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
+
+
+def after(rollouts: int, act: Callable[[], None]) -> Callable[[str, int, int, Tally], None]:
+    """A watch that acts once, when so many rollouts are done."""
+    acted = False
+
+    def watch(_name: str, done: int, _total: int, _tally: Tally) -> None:
+        nonlocal acted
+        if done >= rollouts and not acted:
+            acted = True
+            act()
+
+    return watch
+
+
+async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_often(place: Place) -> None:
+    told: dict[str, tuple[int, int]] = {}
+    learned = await run(SMALL, place, lambda name, done, total, _: told.update({name: (done, total)}))
+    assert [(each.name, each.tally.rollouts) for each in learned.phases] == [
+        ("default policy", 700), ("learned policy", 200), ("default policy, held out", 200),
+    ]  # fmt: skip
+    assert [each.seed for each in learned.phases] == [69, 70, 69 + 1_000_003]
+    assert 0.11 < learned.default.tally.success_rate < 0.21
+    assert learned.evaluation.tally.success_rate > 0.4
+    assert learned.coverage > 0.6
+    assert len(learned.successes) == learned.default.tally.successes
+    assert learned.default.grasps["TOP"].successes == 0
+    assert sum(learned.default.stages.values()) == 700 - learned.default.tally.successes
+    assert sum((learned.default.arms | {}).values(), Tally()) == learned.default.tally
+    assert told["learned policy"][1] == 200
+    assert not workers_running()
+    everything = sum(each.tally.rollouts for each in learned.phases)
+    assert ask(place.url, f"SELECT count(*) FROM {MoveAndPickUpAction.__tablename__}") == [(everything,)]
+
+    await fails_without_resume(place)
+    again = await run(replace(SMALL, resume=True), place)
+    assert again.policy == learned.policy
+    assert [each.done_now for each in again.phases] == [0, 0, 0]
+    assert [each.tally for each in again.phases] == [each.tally for each in learned.phases]
+
+    studied = await study(replace(SMALL, resume=True), learned, place, rollouts=100, watch=lambda *_: None)
+    assert [each.rollouts for each in studied.curve] == [500]
+    assert {each.rollouts for each in studied.costs} == {400, 200}
+    turned = [each for each in studied.elsewhere if each.scene.yaw]
+    assert turned
+    for each in turned:  # in the object's own frame nothing is other than it was
+        assert each.learned == studied.elsewhere[0].learned
+    assert ask(place.url, f"SELECT count(*) FROM {MoveAndPickUpAction.__tablename__}") == [(everything,)]
+
+    picked = await pick_up_in_kitchen(learned.policy, place, seed=69)
+    assert picked.done is not None, picked.failure
+    async with Reading.open(place.url) as reading:
+        tree = await reading.tree((await reading.episode(picked.episode)).number)
+    assert [each.dtype for each in tree].count("MoveAndPickUpAction") == picked.tries
+
+
+async def fails_without_resume(place: Place) -> None:
+    with pytest.raises(CallerError, match=r"700 rollouts .* remembered already .* --resume"):
+        await run(SMALL, place)
+
+
+async def finished(experiment: Experiment, place: Place) -> Learned:
+    """What is left of it, held against an experiment that nothing happened to."""
+    learned = await run(replace(experiment, resume=True), place)
+    for phase in learned.phases:
+        async with Reading.open(place.url) as reading:
+            frame = await known(reading, experiment.scene, phase.policy, phase.seed)
+        done = [each for each in sorted(frame["index"]) if each < phase.tally.rollouts]
+        assert done == list(range(phase.tally.rollouts))
+    async with Workers(1, None) as workers:
+        job = Job(experiment.scene, default_policy(), experiment.seed, remembered=False)
+        undisturbed = await workers.roll_out(job, [(0, experiment.rollouts)])
+    assert learned.default.tally == undisturbed
+    return learned
+
+
+def kill_one() -> None:
+    workers_running()[0].kill()
+
+
+async def test_a_worker_that_is_killed_is_told_and_resumed_nothing_is_lost_or_counted_twice(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    with pytest.raises(WorkerLost, match="a worker was killed by SIGKILL; what it had done is remembered"):
+        await run(SMALL, place, after(300, kill_one))
+    assert not workers_running()
+    async with Reading.open(place.url) as reading:
+        before = await known(reading, Scene(), name_of(default_policy()), 69)
+    learned = await finished(SMALL, place)
+    assert 0 < learned.default.done_now < 700
+    assert len(before) > 0
+
+
+async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it_can_be_resumed(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    task: asyncio.Task[Learned]
+
+    def interrupt() -> None:
+        task.cancel()
+
+    task = asyncio.create_task(run(SMALL, place, after(300, interrupt)))
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert not workers_running()
+    assert ask(place.url, "SELECT status FROM process_metadata WHERE status <> 'SUCCEEDED'") == []
+    await finished(replace(SMALL, evaluate=50, held_out=50), place)
+
+
+async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is_lost(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    command = ["-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]
+    process = await asyncio.create_subprocess_exec("python", *command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE)
+    for _ in range(600):
+        await asyncio.sleep(0.1)
+        if (tmp_path / "memory.db").exists() and ask(url, "SELECT count(*) > 3000 FROM event") == [(1,)]:
+            break
+    spawned = psutil.Process(process.pid).children()
+    os.kill(process.pid, signal.SIGKILL)
+    await process.wait()
+    _, alive = await asyncio.to_thread(psutil.wait_procs, spawned, 30)
+    assert not alive
+    await finished(replace(SMALL, workers=1, evaluate=50, held_out=50), Place(url))
+
+
+async def test_too_few_successes_are_told_and_all_rollouts_kept(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    with pytest.raises(NotEnoughExperience, match="too few to learn from"):
+        await run(replace(SMALL, rollouts=40, workers=1), place)
+    async with Reading.open(place.url) as reading:
+        frame = await known(reading, Scene(), name_of(default_policy()), 69)
+    assert len(frame) == 40
+
+
+async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    learned = await run(replace(SMALL, rounds=2, workers=1, evaluate=200, held_out=100, rollouts=600), place)
+    assert [each.name for each in learned.phases][:3] == ["default policy", "learned policy, round 2", "learned policy"]
+    assert len(learned.successes) == learned.phases[0].tally.successes + learned.phases[1].tally.successes
+    assert learned.evaluation.tally.success_rate > 0.5
+
+
+async def test_each_rollout_may_be_an_episode(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    async with Workers(2, place) as workers:
+        job = Job(Scene(), default_policy(), 5, episode_each=True)
+        tally = await workers.roll_out(job, [(0, 15), (15, 15)])
+        assert ask(place.url, "SELECT count(*) FROM process_metadata") == [(30,)]
+    async with Reading.open(place.url) as reading:
+        frame = await known(reading, Scene(), name_of(default_policy()), 5)
+    assert remembered.tally_of(frame) == tally
+
+
+async def test_what_is_not_to_be_remembered_leaves_no_trace_beside_what_is(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    async with Workers(1, place) as workers:
+        job = Job(Scene(), default_policy(), 5)
+        forgotten = await workers.roll_out(replace(job, remembered=False), [(0, 30)])
+        assert ask(place.url, "SELECT count(*) FROM event") == [(0,)]
+        assert await workers.roll_out(job, [(0, 30)]) == forgotten
+        await workers.roll_out(replace(job, remembered=False), [(0, 30)])
+    async with Reading.open(place.url) as reading:
+        assert len(await known(reading, Scene(), name_of(default_policy()), 5)) == 30
+
+
+async def test_what_a_worker_raises_is_told_in_one_line(tmp_path: Path) -> None:
+    job = Job(Scene(position=(float("nan"), 0.0, 0.0)), default_policy(), 1)
+    async with Workers(1, Place(f"sqlite:///{tmp_path}/memory.db")) as workers:
+        with pytest.raises(WorkerLost, match="a worker failed: PoseRefused") as told:
+            await workers.roll_out(job, [(0, 5)])
+    assert "\n" not in str(told.value)
+
+
+def test_what_cannot_be_an_experiment_is_refused() -> None:
+    with pytest.raises(CallerError, match="at least one of held-out"):
+        Experiment(held_out=0)
+    with pytest.raises(CallerError, match="a seed is"):
+        Experiment(seed=-1)
+    with pytest.raises(CallerError, match="at least one worker"):
+        Workers(0, None)
