@@ -17,6 +17,7 @@ from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
 from pycrorm_async.queue.spool import RecorderFolder, Spool
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, Moved
 from pycrorm_async.writer.ports import Found, Held, LetGo
 
@@ -40,6 +41,8 @@ async def serve(
     another meanwhile, and as `Memory.open` does.
     """
     address = shared_address(url)
+    # The database first: where it is refused, no spool is made beside it.
+    await (await EventLog.open(address, create=True)).close()
     place = Spool(spool or address.default_spool)
     lock = place.take_writer()
     if lock is None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import math
+import os
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +15,7 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_facts, print_json, print_table
-from pycrorm_async.errors import MissingExtra
+from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
 from pycrorm_async.learning.default_policy import default_policy
 from pycrorm_async.learning.experiment import Experiment, Learned, Phase
@@ -30,6 +31,8 @@ from pycrorm_async.watching import watched
 from pycrorm_async.world.robot import Limits
 
 __all__ = ["learn"]
+
+_PICTURES = (".png", ".svg", ".pdf")
 
 
 def learn(
@@ -77,7 +80,9 @@ def learn(
 
     The thesis tried 50,000 times: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra [learning].
     """
+    # Now, and not after an hour of rollouts.
     _check_extra()
+    _check_files(policy, figure)
     experiment = Experiment(
         rollouts=rollouts,
         rounds=rounds,
@@ -113,12 +118,19 @@ def learn(
 
 
 def _check_extra() -> None:
-    """Now, and not after an hour of rollouts."""
-    try:
-        for name in ("jpt", "matplotlib", "pandas"):
-            importlib.import_module(name)
-    except ImportError as missing:
-        raise MissingExtra(f"{missing.name} is not installed: pip install 'pycrorm-async[learning]'") from None
+    for module, package in (("jpt", "pyjpt"), ("matplotlib", "matplotlib"), ("pandas", "pandas")):
+        try:
+            importlib.import_module(module)
+        except ImportError:
+            raise MissingExtra(f"{package} is not installed: pip install 'pycrorm-async[learning]'") from None
+
+
+def _check_files(policy: Path, figure: Path) -> None:
+    if figure.suffix not in _PICTURES:
+        raise CallerError(f"--figure {figure} must end in one of {', '.join(_PICTURES)}")
+    for option, path in (("--policy", policy), ("--figure", figure)):
+        if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise CallerError(f"{option} {path} cannot be written: choose another place")
 
 
 async def _learned(

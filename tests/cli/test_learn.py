@@ -1,0 +1,115 @@
+"""`pycrorm learn` as a user meets it: what it prints and leaves behind, resumed, interrupted, and told off."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async.learning import load_policy, name_of
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.databases import ask
+
+SMALL = ("learn", "--rollouts", "400", "--evaluate", "150", "--held-out", "150")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("learn")
+
+
+@pytest.fixture(scope="module")
+def document(folder: Path) -> Any:
+    """Of a small experiment, done in the folder."""
+    return answer(*SMALL, cwd=folder)
+
+
+def test_it_tells_what_was_done_what_it_came_to_and_where_the_policy_is(document: Any, folder: Path) -> None:
+    default, learned, held_out = document["phases"]
+    assert (default["rollouts"], learned["rollouts"], held_out["rollouts"]) == (400, 150, 150)
+    assert 0.08 < default["success_rate"] < 0.25 < learned["success_rate"]
+    assert default["interval"][0] < default["success_rate"] < default["interval"][1]
+    failed = 400 - default["successes"]
+    assert default["failures"] == {"IKError": failed}
+    assert sum(default["stages"].values()) == failed
+    assert document["successes"] == default["successes"]
+    assert 0 < document["coverage"] <= 1
+    saved = load_policy(folder / document["policy"]["file"])
+    assert (name_of(saved), len(saved.leaves)) == (document["policy"]["name"], document["policy"]["leaves"])
+    assert learned["policy"] == document["policy"]["name"] != default["policy"]
+    assert (folder / document["figure"]).read_bytes().startswith(b"\x89PNG")
+    assert document["kitchen"]["tries"] > 0
+    tried = "SELECT count(*) FROM task_tree_node node JOIN batch_rollout_action batch ON batch.id = node.parent_id"
+    assert ask(folder / "pycrorm.db", tried) == [(700,)]
+
+
+def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> None:
+    line = one_line_of(pycrorm(*SMALL, cwd=folder))
+    assert "400 rollouts of this experiment are remembered already" in line
+    assert "--resume" in line
+    assert pycrorm(*SMALL, cwd=folder).returncode == 2
+    done = pycrorm(*SMALL, "--resume", "--figure", "two.svg", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("remembered") > 3
+    assert f"{document['phases'][1]['success_rate']:.1%}" in done.stdout
+    assert "picked up" in done.stdout
+    assert "two.svg" in done.stderr
+    assert (folder / "two.svg").read_text().startswith("<?xml")
+
+
+def test_a_study_asks_what_else_the_policy_is_worth(document: Any, folder: Path) -> None:
+    studied = answer(*SMALL, "--resume", "--study", "20", cwd=folder)["study"]
+    assert len(studied["elsewhere"]) > 8
+    assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {20}
+    assert document["study"] is None
+    printed = pycrorm(*SMALL, "--resume", "--study", "20", cwd=folder)
+    assert "The same policies elsewhere" in printed.stdout
+
+
+def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path) -> None:
+    longer = ("--rollouts", "2500")
+    command = [*COMMAND, *SMALL, *longer, "--workers", "2"]
+    process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        time.sleep(0.1)
+        if (tmp_path / "pycrorm.db").exists() and ask(tmp_path / "pycrorm.db", "SELECT count(*) FROM event") > [(500,)]:
+            break
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 130, said
+    assert said.strip() == "pycrorm: interrupted; what was recorded up to here is kept"
+    document = answer(*SMALL, *longer, "--resume", cwd=tmp_path)
+    assert [each["rollouts"] for each in document["phases"]] == [2_500, 150, 150]
+    assert 0 < document["phases"][0]["done_now"] < 2_500
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("--url", "mysql://there/memory"), 2, "mysql"),
+        (("--url", "postgresql://nobody@127.0.0.1:9/memory"), 3, "cannot be reached"),
+        (("--url", "sqlite:////nowhere/memory.db"), 3, "/nowhere"),
+        (("--figure", "policies.doc"), 2, "--figure policies.doc must end in one of .png, .svg, .pdf"),
+        (("--policy", "/nowhere/policy.json"), 2, "--policy /nowhere/policy.json cannot be written"),
+        (("--figure", "folder.png"), 2, "--figure folder.png cannot be written"),
+        (("--rollouts", "30"), 2, "successes are too few to learn from"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...], code: int, words: str) -> None:
+    (tmp_path / "folder.png").mkdir()
+    done = pycrorm(*SMALL, *arguments, cwd=tmp_path)
+    assert words in one_line_of(done)
+    assert done.returncode == code
+
+
+def test_without_the_extra_it_says_what_to_install(tmp_path: Path) -> None:
+    (tmp_path / "jpt.py").write_text("raise ImportError")  # found before the real one
+    done = pycrorm(*SMALL, cwd=tmp_path)
+    assert one_line_of(done).endswith("pyjpt is not installed: pip install 'pycrorm-async[learning]'")
+    assert done.returncode == 2
+    assert not (tmp_path / "pycrorm.db").exists()
