@@ -158,6 +158,7 @@ FIRST_OF_ALL = """
 import random, signal, sys, threading, warnings
 import numpy, pandas
 warnings.simplefilter("error")
+signal.signal(signal.SIGINT, signal.default_int_handler)
 def state():
     generators = random.getstate(), repr(numpy.random.get_state(legacy=False))
     return generators, list(warnings.filters), signal.getsignal(signal.SIGINT), threading.enumerate(), sys.excepthook
