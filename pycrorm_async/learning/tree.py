@@ -41,13 +41,14 @@ _ROUNDING = 1e-9
 
 
 def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
-    """The policy that does again what went well, and what lies between.
+    """The policy that does again what went well, and what lies between; some 0.5 s for 8,000 rows, in which it waits.
 
     Args:
         successes: a row for each pick-up that went well: `arm` and `grasp` as names, `object_x` and `object_y`, where
             the robot's base stood in the object's own frame, m, as in `PickUpWithContextView`; and, if wanted,
             `height`, the object's height minus the torso's, m. Other columns are passed over. If all heights are
-            the same, it is not learned, but kept as the policy's `constant_height`.
+            the same, it is not learned, but kept as the policy's `constant_height`. A policy that knows heights is
+            asked with evidence on the one at hand, give or take 1 to 5 cm; without, it mixes what works at any.
         min_samples_leaf: so many rows, two or more, are in every leaf. With fewer the policy repeats more exactly
             what it saw: more of what it does succeeds, and less of what would is done (see `Policy.coverage`).
 

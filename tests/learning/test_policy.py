@@ -30,6 +30,7 @@ EAST = Leaf(
     Linear((0.6, 1.0), (0.0, 1.0)),
 )
 TWO = Policy((WEST, EAST))
+NEAR = Evidence(region=Region((Rectangle(0.21, 1 / 3, -1 / 7, 1 / 7),)))
 
 
 def test_probabilities_are_sums_of_products() -> None:
@@ -137,6 +138,18 @@ def test_the_same_generator_gives_the_same_samples_however_they_are_asked_for() 
     assert TWO.sample(np.random.default_rng(6), 0) == []
 
 
+@pytest.mark.parametrize("drawn", [0.0, 1 - 2**-53], ids=["least", "most"])
+def test_the_least_and_the_most_likely_draws_are_possible_too(drawn: float) -> None:
+    class Fixed:
+        def random(self, shape: tuple[int, int]) -> np.ndarray:
+            return np.full(shape, drawn)
+
+    region = Region((Rectangle(-0.9, -0.3 + 1e-12, 0.1, 1 / 3), Rectangle(-0.3 + 1e-12, 0.7, -1.9, -0.1)))
+    for policy in (TWO.condition(Evidence(region=region)), default_policy(), default_policy().condition(NEAR)):
+        (choice,) = policy.sample(Fixed())  # type: ignore[arg-type]
+        assert policy.coverage([choice]) == 1.0
+
+
 def test_sampling_leaves_the_global_generator_alone() -> None:
     before = np.random.get_state(legacy=False)["state"]
     TWO.sample(np.random.default_rng(6), 50)
@@ -157,9 +170,11 @@ def test_the_mode_is_the_square_that_holds_most() -> None:
     assert west.evidence.region.rectangles[0] == pytest.approx((-0.85, -0.75, 0.42, 0.5))
 
 
-def test_a_window_wider_than_all_there_is_holds_all_of_it() -> None:
+def test_a_window_holds_as_much_as_one_of_its_width_can() -> None:
     linear = WEST.x
     assert linear.peak(-5.0, 5.0, 4.0).held == pytest.approx(1.0)
+    assert linear.peak(-5.0, 5.0, 0.3) == pytest.approx((-1.0, -0.7, 0.8 + 0.2 / 3))
+    assert Linear((0.0, 1.0, 1.1), (0.0, 0.1, 1.0)).peak(-5.0, 5.0, 0.3) == pytest.approx((0.8, 1.1, 0.92))
     assert linear.peak(-0.9, -0.7, 4.0) == pytest.approx((-0.9, -0.7, 0.4 + 0.2 / 3))
     assert Normal(0.3, 1.0).peak(-1.0, 1.0, 0.2)[:2] == pytest.approx((0.2, 0.4))
     assert Normal(3.0, 1.0).peak(-1.0, 1.0, 0.2)[:2] == pytest.approx((0.8, 1.0))

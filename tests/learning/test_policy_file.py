@@ -35,7 +35,7 @@ LEARNED = Policy(
 
 ELSEWHERE = """
 import sys
-for name in ("jpt", "pandas", "scipy", "sqlalchemy"):
+for name in ("jpt", "pandas", "scipy", "matplotlib"):
     sys.modules[name] = None
 from pathlib import Path
 import numpy as np

@@ -158,11 +158,13 @@ FIRST_OF_ALL = """
 import random, signal, sys, threading, warnings
 import numpy, pandas
 warnings.simplefilter("error")
+signal.signal(signal.SIGINT, signal.default_int_handler)
 def state():
     generators = random.getstate(), repr(numpy.random.get_state(legacy=False))
     return generators, list(warnings.filters), signal.getsignal(signal.SIGINT), threading.enumerate(), sys.excepthook
-before = state()
 from pycrorm_async.learning.tree import learn
+assert "jpt" not in sys.modules
+before = state()
 numbers = [number / 30 for number in range(30)]
 learn(pandas.DataFrame({"arm": ["LEFT"] * 30, "grasp": ["TOP"] * 30, "object_x": numbers, "object_y": numbers}))
 assert "jpt.trees" in sys.modules
