@@ -32,7 +32,12 @@ from pycrorm_async.plan import (
     simulated_robot,
     simulated_robot_within,
 )
-from pycrorm_async.plan.failures import CapabilityAbsenceFailure, GripperGoalNotReached, ReachabilityFailure
+from pycrorm_async.plan.failures import (
+    CapabilityAbsenceFailure,
+    GripperGoalNotReached,
+    ManipulationGoalInCollision,
+    ReachabilityFailure,
+)
 from pycrorm_async.world import Arms, BulletWorld, GripperState, Limits, Object, ObjectType, Pose, WorldMode
 from pycrorm_async.world.errors import NoWorld
 from tests.plan.conftest import Scene
@@ -162,3 +167,21 @@ async def test_a_choice_belongs_to_its_context() -> None:
     assert (a.asked, b.asked) == (["navigate"], ["navigate"])
     with pytest.raises(NoRobotChosen):
         await MoveMotion(THERE).perform()
+
+
+async def test_a_hand_that_minds_collisions_fails_where_its_arm_would_be_in_something_and_stays_where_it_was(
+    scene: Scene,
+) -> None:
+    goal = Pose([1.25, 0.4, 0.86])  # over the worktop by less than half a forearm
+    await NavigateActionPerformable(Pose([0.62, 0.2, 0])).perform()
+    before = scene.robot.joint_positions()
+    with simulated_robot_within(Limits.SOFT, collisions=True) as robot:
+        assert repr(robot) == "<simulated (soft limits, no collisions) robot>"
+        with pytest.raises(ManipulationGoalInCollision, match="LEFT arm would be in kitchen") as failed:
+            await MoveTCPMotion(goal, Arms.LEFT).perform()
+    part, thing = failed.value.data
+    assert thing == "kitchen"
+    assert part in scene.robot.links
+    assert scene.robot.joint_positions() == before
+    await MoveTCPMotion(goal, Arms.LEFT).perform()  # the others do not look
+    assert scene.robot.joint_positions() != before

@@ -1,30 +1,49 @@
-"""PyCRAM's test of moving and picking up (July 2024), by name, as far as it is about the action and not the policy."""
+"""PyCRAM's tests of moving and picking up (July 2024), by name, and what they assert."""
 
 from __future__ import annotations
 
-import random
+from itertools import combinations
 
-from pycrorm_async.plan import MoveAndPickUpPerformable, PlanFailure
-from pycrorm_async.world import Arms, Grasp, Pose
+import numpy as np
+import pytest
+
+from pycrorm_async.learning import Evidence, MoveAndPickUp, PickUpChoice, Rectangle, Region, default_policy
+from pycrorm_async.plan import PlanFailure, Retry
 from tests.plan.conftest import Scene
 
 
-async def test_move_and_pick_up(scene: Scene) -> None:
-    """Of 20 places around the milk, drawn as the default policy draws them, one at least will do."""
-    rng = random.Random(69)
-    held = []
-    for _ in range(20):
-        while True:
-            x, y = rng.gauss(0, 0.5**0.5), rng.gauss(0, 0.5**0.5)
-            if max(abs(x), abs(y)) < 2 and max(abs(x), abs(y)) > 0.2:
-                break
-        arm, grasp = rng.choice([Arms.LEFT, Arms.RIGHT]), rng.choice(list(Grasp))
+def test_create_model() -> None:
+    """Nothing is where the object stands; four variables."""
+    centre = Region((Rectangle(-0.2, 0.2, -0.2, 0.2),))
+    assert default_policy().probability(Evidence(region=centre)) == 0
+    assert PickUpChoice._fields == ("arm", "grasp", "relative_x", "relative_y")
+
+
+def test_grounding(scene: Scene) -> None:
+    """What is free and sees the object is in disjoint pieces, and a policy for it there is."""
+    grounded = MoveAndPickUp(scene.milk).grounded()
+    region = grounded.evidence.region
+    assert region is not None
+    assert region.rectangles
+    for one, other in combinations(region.rectangles, 2):
+        apart_x = one.x_max <= other.x_min or other.x_max <= one.x_min
+        assert apart_x or one.y_max <= other.y_min or other.y_max <= one.y_min
+    assert grounded.sample(np.random.default_rng(69), 5)
+
+
+@pytest.mark.parametrize("seed", [69, 420])
+async def test_move_and_pick_up(scene: Scene, seed: int) -> None:
+    """Of twenty samples that fit the scene one at least will do."""
+    rng = np.random.default_rng(seed)
+    tries = iter(MoveAndPickUp(scene.milk, samples=20, rng=rng))
+    for each in tries:
         try:
-            await MoveAndPickUpPerformable(Pose([1.3 + x, 1 + y, 0]), scene.milk, arm, grasp).perform()
+            await each.perform()
         except PlanFailure:
-            assert scene.milk.attached_to in (None, scene.robot)
+            scene.world.reset()
         else:
-            held.append(scene.milk.attached_to)
-        scene.world.reset()
-    assert 1 <= len(held) < 20
-    assert set(held) == {scene.robot}
+            break
+    assert scene.milk.attached_to is scene.robot
+    scene.world.reset()
+    await Retry(MoveAndPickUp(scene.milk, rng=np.random.default_rng(seed)), max_tries=20).perform()
+    assert scene.milk.attached_to is scene.robot
