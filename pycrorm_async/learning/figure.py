@@ -18,7 +18,7 @@ _CELLS = 120
 
 
 def draw_policies(
-    policies: Mapping[str, Policy], path: Path, *, successes: Sequence[PickUpChoice] = (), seed: int = 0
+    policies: Mapping[str, Policy], path: Path | str, *, successes: Sequence[PickUpChoice] = (), seed: int = 0
 ) -> None:
     """Draws the policies side by side, each by its title, into a file whose ending says its format (.png, .svg, .pdf).
 

@@ -52,12 +52,12 @@ class _Policy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     constant_height: float | None
 
 
-def save_policy(policy: Policy, path: Path) -> None:
+def save_policy(policy: Policy, path: Path | str) -> None:
     """Write the policy, in place of what the file held before; a reader finds the one or the other, whole.
 
     Raises `PolicyFileRefused` where it cannot be written.
     """
-    content = _content(policy)
+    path, content = Path(path), _content(policy)
     heading = msgspec.json.encode(_Heading(FORMAT, VERSION, zlib.crc32(content)))
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -85,13 +85,14 @@ def _content(policy: Policy) -> bytes:
     )
 
 
-def load_policy(path: Path) -> Policy:
+def load_policy(path: Path | str) -> Policy:
     """The policy that was saved there.
 
     Raises:
         PolicyFileRefused: there is no such file, or it holds something else, or a policy of another version.
         PolicyDamaged: it is not what was written.
     """
+    path = Path(path)
     try:
         first, _, rest = path.read_bytes().partition(b"\n")
     except OSError as error:

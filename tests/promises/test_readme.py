@@ -6,13 +6,15 @@ import re
 import sqlite3
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from pycrorm_async.learning import load_policy
 from tests.commands import answer, pycrorm
 
 README = (Path(__file__).parent.parent.parent / "README.md").read_text()
-PLAN, QUESTIONS, TIDY, THEN, RATE = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+PLAN, QUESTIONS, TIDY, THEN, RATE, BETTER = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
@@ -106,6 +108,22 @@ with BulletWorld() as world:
     assert pose.position == pytest.approx(there)
 
 
+async def test_a_policy_is_learned_from_what_is_remembered_and_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(BETTER, names)
+    tally, policy = await names["get_better"]()
+    assert tally.rollouts == 1000
+    assert len(policy.leaves) > 3
+    saved = await asyncio.to_thread(load_policy, tmp_path / "policy.json")
+    assert saved == policy
+    with contextlib.closing(sqlite3.connect(tmp_path / "tries.db")) as plain:
+        statuses = [status for (status,) in plain.execute("SELECT status FROM task_tree_node WHERE dtype = 'Retry'")]
+    assert statuses == ["SUCCEEDED"]
+
+
 def test_every_verb_the_readme_names_exists(tmp_path: Path) -> None:
     verbs = set(re.findall(r"^pycrorm (\w+)", README, re.MULTILINE))
     assert verbs == {
@@ -115,6 +133,7 @@ def test_every_verb_the_readme_names_exists(tmp_path: Path) -> None:
         "show",
         "events",
         "copy",
+        "learn",
         "writer",
         "status",
         "spool",
