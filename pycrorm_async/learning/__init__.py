@@ -1,13 +1,13 @@
 """Getting better from what is remembered (thesis 5.2): policies over pick-ups, learned from those that went well.
 
->>> policy = learn(await memory.dataframe(query_for_database()))
+>>> policy = learn(await memory.dataframe(MoveAndPickUp.query_for_database()))
 >>> await Retry(MoveAndPickUp(milk, policy=policy), max_tries=20).perform()
 """
 
 from pycrorm_async.learning.default_policy import default_policy
 from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
 from pycrorm_async.learning.figure import draw_policies
-from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp, query_for_database
+from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policy_file import load_policy, name_of, save_policy
 from pycrorm_async.learning.remembered import rollouts_question
@@ -17,7 +17,6 @@ from pycrorm_async.learning.tree import learn
 
 __all__ = [
     "MoveAndPickUp",
-    "query_for_database",
     "default_policy",
     "learn",
     "Policy",

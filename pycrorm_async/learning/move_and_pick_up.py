@@ -23,7 +23,7 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose, rotated
 
-__all__ = ["MoveAndPickUp", "query_for_database", "HEIGHT_TOLERANCE_M"]
+__all__ = ["MoveAndPickUp", "HEIGHT_TOLERANCE_M"]
 
 HEIGHT_TOLERANCE_M = 0.05
 """Experience with an object that was so much higher or lower, measured from the torso, is experience with this one."""
@@ -70,6 +70,23 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     def __repr__(self) -> str:
         return f"MoveAndPickUp({self.target.name!r}, policy={name_of(self.policy)})"
+
+    @staticmethod
+    def query_for_database() -> Select[Arms, Grasp, float, float, float | None]:
+        """What a policy is learned from: how objects were picked up when it went well, in all episodes.
+
+        A frame of it has the columns that `learn` takes: arm, grasp, object_x, object_y (where the robot stood, m, in
+        the object's own frame) and height (of the object over the lifted torso, m). Add a `where` for a part of the
+        episodes.
+        """
+        view = PickUpWithContextView
+        return select(
+            view.arm,
+            view.grasp,
+            view.object_x,
+            view.object_y,
+            view.height_over_torso.label("height"),
+        ).where(view.status == TaskStatus.SUCCEEDED)
 
     # --- what is known here -----------------------------------------------------------------------------------
 
@@ -132,19 +149,3 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
 def _around(height: float) -> tuple[float, float]:
     return height - HEIGHT_TOLERANCE_M, height + HEIGHT_TOLERANCE_M
-
-
-def query_for_database() -> Select[Arms, Grasp, float, float, float | None]:
-    """What a policy is learned from: how objects were picked up when it went well, in all episodes.
-
-    A frame of it has the columns that `learn` takes: arm, grasp, object_x, object_y (where the robot stood, m in the
-    object's own frame) and height (of the object over the lifted torso, m). Add a `where` for a part of the episodes.
-    """
-    view = PickUpWithContextView
-    return select(
-        view.arm,
-        view.grasp,
-        view.object_x,
-        view.object_y,
-        view.height_over_torso.label("height"),
-    ).where(view.status == TaskStatus.SUCCEEDED)

@@ -26,7 +26,7 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
     """All that were brought to an end, in the order of their index: what was interrupted never counts.
 
     A frame of it has the columns policy, index, status, failure, arm, grasp, object_x, object_y, height (as
-    in `query_for_database`) and goals: how many goals the hand was given.
+    in `MoveAndPickUp.query_for_database`) and goals: how many goals the hand was given.
     """
     batch, node, view = BatchRolloutAction, TaskTreeNode, PickUpWithContextView
     tried, picked, moved = aliased(TaskTreeNode), aliased(TaskTreeNode), aliased(TaskTreeNode)

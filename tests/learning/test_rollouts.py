@@ -22,7 +22,6 @@ from pycrorm_async.learning import (
     default_policy,
     learn,
     name_of,
-    query_for_database,
     remembered,
     rollouts_question,
 )
@@ -122,9 +121,8 @@ async def test_what_is_remembered_is_what_was_counted_with_the_stage_each_failed
         assert stages == await by_node_arithmetic(memory, frame)
         assert sum(stages.values()) == sum(frame.status == "FAILED")
         async with memory.session() as session:
-            assert len((await session.execute(query_for_database())).all()) == sum(
-                frame.status == "SUCCEEDED"
-            ) + await won(memory, 1)
+            asked = (await session.execute(MoveAndPickUp.query_for_database())).all()
+        assert len(asked) == sum(frame.status == "SUCCEEDED") + await won(memory, 1)
 
 
 def again(first: int, count: int) -> Tally:
@@ -224,7 +222,7 @@ async def test_a_policy_is_learned_from_the_memory_and_does_better(tmp_path: Pat
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         default = await rolled_out(1_500)
         await memory.flush()
-        frame = await memory.dataframe(query_for_database())
+        frame = await memory.dataframe(MoveAndPickUp.query_for_database())
         assert len(frame) == default.successes
         policy = learn(frame)
         assert policy.constant_height == pytest.approx(0.9)
