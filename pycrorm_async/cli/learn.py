@@ -8,6 +8,7 @@ import math
 import os
 import shlex
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +21,7 @@ from pycrorm_async.learning import experiment as experiments
 from pycrorm_async.learning.default_policy import default_policy
 from pycrorm_async.learning.experiment import Experiment, Learned, Phase
 from pycrorm_async.learning.figure import draw_policies
-from pycrorm_async.learning.kitchen import InKitchen, pick_up_in_kitchen
+from pycrorm_async.learning.kitchen import KITCHEN, InKitchen, pick_up_in_kitchen
 from pycrorm_async.learning.policy_file import name_of, save_policy
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.scene import Scene
@@ -140,7 +141,8 @@ async def _learned(
     studied = None
     if study_rollouts:
         studied = await study(experiment, learned, place, rollouts=study_rollouts, watch=watch)
-    return learned, await pick_up_in_kitchen(learned.policy, place, seed=experiment.seed), studied
+    kitchen = replace(KITCHEN, limits=experiment.scene.limits)
+    return learned, await pick_up_in_kitchen(learned.policy, place, seed=experiment.seed, scene=kitchen), studied
 
 
 # --- telling it -----------------------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ AT_ONCE = 500
 """A worker is given so many rollouts at once: they are one episode."""
 _TELL_S = 0.2
 _LOOK_S = 0.02
+_SETTINGS = Settings(flush_timeout_s=120)
 _log = logging.getLogger(__name__)
 
 
@@ -261,7 +262,7 @@ async def _working(pipe: Connection, place: Place | None) -> None:
     async with AsyncExitStack() as stack:
         memory = None
         if place is not None:
-            opened = Memory.open(place.url, spool=place.spool, writer="daemon", settings=Settings(flush_timeout_s=600))
+            opened = Memory.open(place.url, spool=place.spool, writer="daemon", settings=_SETTINGS)
             memory = await stack.enter_async_context(opened)
         job: Job | None = None
         with suppress(EOFError):
