@@ -9,8 +9,8 @@ plans, each in a task and a world of its own: one without a memory; three whose 
 PostgreSQL that is up, that answers 20 ms late each time it is spoken to, and that went away; three for the daemon. They
 take turns in random order, and a turn is over when its writer has nothing left to do. A percentile is the median over
 the turns of that of a turn, and what a perform costs more is compared within a round, so a busy moment of the machine
-counts little; the largest is of all turns. Prints one JSON line, in µs; half of what a perform costs more is one hook.
-The table is on stderr.
+counts little. Of performs in which the kernel gave the processor to somebody else only their number is told, and the
+longest of all. Prints one JSON line, in µs; half of what a perform costs more is one hook. The table is on stderr.
 """
 
 from __future__ import annotations
@@ -21,12 +21,13 @@ import json
 import logging
 import platform
 import random
+import resource
 import statistics
 import sys
 import tempfile
 import time
 from collections.abc import AsyncIterator
-from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -71,12 +72,19 @@ class Kind(NamedTuple):
         return self.state == "down"
 
 
+class Turn(NamedTuple):
+    """What each perform took, ns: those that nobody interrupted, and the others."""
+
+    whole: list[int]
+    interrupted: list[int]
+
+
 class Plan:
     """Performs when it is its turn, with a memory or none, in a task and a world of its own."""
 
     def __init__(self, kind: Kind | None) -> None:
         self.name = "none" if kind is None else f"{kind.writer}, {kind.state}"
-        self.turns: list[list[int]] = []
+        self.turns: list[Turn] = []
         self._kind = kind
         self._asked: asyncio.Queue[int] = asyncio.Queue()
 
@@ -104,21 +112,27 @@ class Plan:
 async def _remembering(kind: Kind) -> AsyncIterator[Memory]:
     settings = Settings(flush_timeout_s=1.0 if kind.is_down else 300.0)
     memory = Memory.open(kind.url, spool=kind.spool, writer=kind.writer, settings=settings)
-    with suppress(FlushTimeout):
+    with suppress(FlushTimeout) if kind.is_down else nullcontext():
         async with memory, memory.episode(description="bench"):
             yield memory
 
 
-async def _turn(action: NothingActionPerformable, performs: int) -> list[int]:
-    """What each took, ns."""
-    took: list[int] = []
+async def _turn(action: NothingActionPerformable, performs: int) -> Turn:
+    turn = Turn([], [])
     start = time.perf_counter_ns()
     for number in range(performs):
         _compute(until_ns=start + number * 1_000_000_000 // _PERFORMS_PER_S)
+        before = _interruptions()
         began = time.perf_counter_ns()
         await action.perform()
-        took.append(time.perf_counter_ns() - began)
-    return took
+        took = time.perf_counter_ns() - began
+        (turn.whole if _interruptions() == before else turn.interrupted).append(took)
+    return turn
+
+
+def _interruptions() -> int:
+    """How often the kernel took the processor from this thread. Waiting, as for the interpreter, is none."""
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
 
 
 def _compute(until_ns: int) -> None:
@@ -211,7 +225,11 @@ def _figures(plan: Plan, without: Plan) -> dict[str, object]:
     """µs."""
     spreads, plain = [_spread(turn) for turn in plan.turns], [_spread(turn) for turn in without.turns]
     typical = {name: statistics.median(each[name] for each in spreads) for name in _PERCENTILES}
-    figures: dict[str, object] = {"perform_us": _rounded(typical | {"max": max(map(max, plan.turns)) / 1e3})}
+    longest = max(max(turn.whole + turn.interrupted) for turn in plan.turns) / 1e3
+    figures: dict[str, object] = {
+        "perform_us": _rounded(typical | {"max": longest}),
+        "interrupted": sum(len(turn.interrupted) for turn in plan.turns),
+    }
     if plan is not without:
         more = {
             name: statistics.median(with_it[name] - none[name] for with_it, none in zip(spreads, plain, strict=True))
@@ -221,8 +239,8 @@ def _figures(plan: Plan, without: Plan) -> dict[str, object]:
     return figures
 
 
-def _spread(turn: list[int]) -> dict[str, float]:
-    ordered = sorted(turn)
+def _spread(turn: Turn) -> dict[str, float]:
+    ordered = sorted(turn.whole)
     return {name: ordered[round(share * (len(ordered) - 1))] / 1e3 for name, share in _PERCENTILES.items()}
 
 
@@ -231,14 +249,15 @@ def _rounded(figures: dict[str, float]) -> dict[str, float]:
 
 
 def _table(result: dict[str, object]) -> Table:
-    columns = ("memory", *_PERCENTILES, "max", *(f"more, {name}" for name in _PERCENTILES), "one hook")
+    more = [f"more, {name}" for name in _PERCENTILES]
+    columns = ("memory", *_PERCENTILES, "max", "interrupted", *more, "one hook")
     table = Table(title="A whole perform, µs, by writer and state of the database", title_justify="left")
     for name in columns:
         table.add_column(name, justify="left" if name == "memory" else "right")
     for name, found in result.items():
         if isinstance(found, dict):
-            figures = [*found["perform_us"].values(), *found.get("more_us", {}).values(), found.get("hook_us")]
-            table.add_row(name, *(f"{each:,}" for each in figures if each is not None))
+            figures = [*found["perform_us"].values(), found["interrupted"], *found.get("more_us", {}).values()]
+            table.add_row(name, *(f"{each:,}" for each in figures), str(found.get("hook_us", "")))
     return table
 
 
@@ -250,7 +269,7 @@ def main() -> None:
     with ExitStack() as stack:
         result = asyncio.run(measured(stack, turns=2 if quick else 20, performs=100 if quick else 1_000))
     print(json.dumps(result))
-    Console(stderr=True, width=None if sys.stderr.isatty() else 120).print(_table(result))
+    Console(stderr=True, width=None if sys.stderr.isatty() else 140).print(_table(result))
 
 
 if __name__ == "__main__":
