@@ -61,7 +61,7 @@ async def measured(url: str, seconds: float) -> dict[str, object]:
         "events_per_s": round(2 * actions / took),
         "events": 2 * actions,
         "backlog": backlog,
-        "backlog_max": largest,
+        "backlog_max": max(largest, left),
         "backlog_at_the_end": left,
         "stored_and_folded_after_s": round(flushed, 2),
     }

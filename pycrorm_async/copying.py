@@ -100,7 +100,10 @@ async def _made(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tup
     log = await EventLog.open(address, create=True)
     try:
         if log.log_id == source.log_id:
-            raise CallerError(f"{source.address} and {address} are the same memory: there is nothing to copy")
+            raise CallerError(
+                f"{source.address} and {address} are the same memory, or the files of one are a copy of the other's:"
+                " copy into a new one"
+            )
         projector = Projector(log)
         await answer_of(projector.open, backoff=BRIEF)  # another copy may be making the tables
         yield log, LogAndTables(log, projector)

@@ -61,12 +61,7 @@ class HandedOver:
             if self._is_tended:
                 self._tended_s = now_s
             if now_s - self._tended_s > _UNTENDED_S or now_s - began_s > self._settings.flush_timeout_s:
-                _log.warning(
-                    "%d events are safe in %s and not in the database yet (%s)",
-                    position - self._said.stored,
-                    self._queue.folder.parent,
-                    self._hindrance(before),
-                )
+                _log.warning("%s (%s)", self._left(position), self._hindrance(before))
                 break
             await asyncio.sleep(_LOOK_S)
         self._raise_stopped()
@@ -86,6 +81,12 @@ class HandedOver:
         reason = self._said.note.given_up
         if reason is not None and not self._queue.is_drained:
             raise DatabaseError(f"{reason}; everything recorded is safe in the spool")
+
+    def _left(self, position: int) -> str:
+        said = self._said
+        if said.stored >= position:
+            return f"all events are stored, and the last {position - said.folded} do not show in the tables yet"
+        return f"{position - said.stored} events are safe in {self._queue.folder.parent} and not in the database yet"
 
     def _hindrance(self, before: int) -> str:
         said = self._said

@@ -10,6 +10,7 @@ import asyncio
 import math
 import random
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 from pycrorm_async.config import Settings
@@ -98,8 +99,20 @@ class Daemon:
     async def _look_round(self) -> list[Held]:
         now_s = self._now_s()
         resting = {name for name, (_, until_s) in self._rests.items() if until_s > now_s}
+        but = self._serving.keys() | resting
+        found = Found([], {})
+
+        def look() -> None:
+            nonlocal found
+            found = self._look(but)
+
         try:
-            found: Found = await to_the_end(asyncio.to_thread(self._look, self._serving.keys() | resting))
+            await to_the_end(asyncio.to_thread(look))
+        except asyncio.CancelledError:
+            for held in found.held:  # the next daemon, which may be in this process, is to find them free
+                with suppress(PycrormError):
+                    held.let_go()
+            raise
         except SpoolForeign:
             raise
         except FilesError as error:

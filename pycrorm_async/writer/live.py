@@ -6,6 +6,7 @@ Appending goes on beside the plan; folding costs interpreter time, so it waits u
 from __future__ import annotations
 
 import asyncio
+import logging
 import random
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
 from typing import NamedTuple, TypeVar
@@ -19,6 +20,7 @@ from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["LiveWriter", "WriterState"]
 
+_log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
 
 
@@ -60,6 +62,7 @@ class LiveWriter:
         self._drain = Drain(source, destination, settings=settings, on_append=self._news.set)
         self._adopted: list[Drain] = []
         self._adoption_errors: list[str] = []
+        self._not_adopted: list[str] = []
         self._folding = asyncio.Lock()
         self._fold_error: str | None = None
         self._failure: Exception | None = None
@@ -176,11 +179,24 @@ class LiveWriter:
         finally:
             if isinstance(sources, Generator):
                 sources.close()  # so that it lets go of the folder it is at
+            self._tell_not_adopted()
 
     async def _drain_adopted(self, source: Source) -> None:
-        drain = Drain(source, self._destination, settings=self._settings, on_append=self._news.set)
+        drain = Drain(
+            source,
+            self._destination,
+            settings=self._settings,
+            on_append=self._news.set,
+            say=self._not_adopted.append,
+        )
         self._adopted.append(drain)
         try:
             await drain.run()
         except Exception as error:  # noqa: BLE001 - shown in the state; the next folder may be in order
             self._adoption_errors.append(f"{source.name}: {error}")
+
+    def _tell_not_adopted(self) -> None:
+        """In one line: what was refused once is offered, and refused, at every start."""
+        if self._not_adopted:
+            more = len(self._not_adopted) - 1
+            _log.error("%s%s", self._not_adopted[0], f" (and {more} more: see `pycrorm status`)" if more else "")

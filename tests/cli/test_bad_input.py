@@ -222,6 +222,20 @@ def test_a_file_that_is_no_database_is_left_alone(folder: Path) -> None:
     assert (folder / "plans.py").read_text() == PLANS
 
 
+def test_a_database_beside_which_nothing_can_be_written_is_told_with_its_path(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    (folder / "pycrorm.db-wal").mkdir()  # SQLite cannot make its file there: as on a disk that is read-only
+    for arguments in (["run", "plans.py"], ["episodes"]):
+        done = pycrorm(*arguments, "--url", f"sqlite:///{folder}/pycrorm.db", cwd=folder)
+        assert one_line_of(done) == (
+            f"pycrorm: sqlite:///{folder}/pycrorm.db cannot be opened: the file must be readable and its folder"
+            " writable, for SQLite makes files beside it, also to read it"
+        )
+        assert done.returncode == 3
+    (folder / "pycrorm.db-wal").rmdir()
+    assert len(answer("episodes", cwd=folder)) == 1
+
+
 def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
     with sqlite3.connect(folder / "pycrorm.db") as connection:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import random
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -381,6 +382,14 @@ async def test_a_memory_is_not_copied_into_itself(new_url: New, tmp_path: Path) 
     with pytest.raises(CallerError, match="are the same memory"):
         await copy_episodes(url, url)
     assert logs_of(url) == before
+
+
+async def test_a_copy_of_the_files_of_a_memory_is_told_apart_from_a_new_one(new_file: New) -> None:
+    source, target = new_file(), new_file()
+    await notes(source, "a")
+    shutil.copy(path_of(source), path_of(target))
+    with pytest.raises(CallerError, match=r"or the files of one are a copy of the other's: copy into a new one"):
+        await copy_episodes(source, target)
 
 
 async def test_what_cannot_be_copied_makes_no_target(new_file: New) -> None:

@@ -5,6 +5,7 @@ import logging
 import re
 import shutil
 import sqlite3
+import threading
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
@@ -14,7 +15,7 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, UserView, recover
-from pycrorm_async.daemon import serve
+from pycrorm_async.daemon import _take, serve
 from pycrorm_async.errors import (
     CallerError,
     DatabaseForeign,
@@ -26,6 +27,9 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
+from pycrorm_async.queue.living import LiveQueue
+from pycrorm_async.queue.spool import RecorderFolder
+from pycrorm_async.writer.ports import Held
 from tests.databases import ask, ask_to_change
 from tests.memory.notes import NoteActionPerformable, texts
 
@@ -132,6 +136,22 @@ async def test_without_a_daemon_flush_says_so_and_closing_leaves_the_events_to_w
     assert (report.lost, report.failed) == ((), {})
     async with Reading.open(database_url) as reading:
         assert await texts(reading) == ["a"]
+
+
+async def test_closing_says_so_when_all_is_stored_and_the_tables_are_behind(
+    database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.synced()
+        [folder] = Spool(spool).recorders()
+        drainer = LiveQueue.take(folder.path)
+        assert drainer is not None
+        batch = await drainer.get_batch(events_max=100, bytes_max=2**20, age_s_max=0.0)
+        await drainer.acknowledge(batch[-1].position)
+    drainer.release()
+    [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+    assert line.startswith("all events are stored, and the last 7 do not show in the tables yet (")
 
 
 async def test_one_round_stores_what_a_living_process_has_synced_and_its_flush_returns(
@@ -286,6 +306,32 @@ async def test_a_second_daemon_on_the_same_spool_is_refused_in_one_line(
         assert "\n" not in str(refused.value)
     async with daemon() as started:
         await started.says("draining")
+
+
+async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folders_to_the_next(
+    database_url: str, spool: Path, daemon: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looking, cancelled = threading.Event(), threading.Event()
+
+    def take(folder: RecorderFolder) -> Held | None:
+        looking.set()
+        assert cancelled.wait(60)
+        return _take(folder)
+
+    async with memory_at(database_url, spool) as memory:
+        await NoteActionPerformable("a").perform()
+        with monkeypatch.context() as patch:
+            patch.setattr("pycrorm_async.daemon._take", take)
+            first = Daemon(database_url, spool)
+            assert await asyncio.to_thread(looking.wait, 60)
+            first.task.cancel()
+            cancelled.set()
+            with pytest.raises(asyncio.CancelledError):
+                await first.task
+        assert not memory.status.drained
+        async with daemon():
+            await memory.flush()
+            assert await texts(memory) == ["a"]
 
 
 async def test_a_spool_of_another_database_is_refused_and_nothing_of_it_is_moved(

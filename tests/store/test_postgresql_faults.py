@@ -15,6 +15,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from sqlalchemy import text
 
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable
@@ -227,6 +228,19 @@ async def test_a_connection_that_goes_silent_is_given_up_and_the_batch_goes_thro
 
     drain, source = await drained(through(proxy, direct), records, silent)
     proved(direct, records, drain, source)
+
+
+async def test_the_server_asks_after_a_machine_that_says_nothing_any_more_in_the_middle_of_a_statement(
+    direct: str,
+) -> None:
+    asked = "SELECT name, reset_val::int FROM pg_settings WHERE source = 'client' AND name LIKE 'tcp%' ORDER BY name"
+    log = await EventLog.open(DatabaseAddress.parse(direct), create=True)
+    async with log.engine.connect() as connection:
+        answer = {row.name: row.reset_val for row in await connection.execute(text(asked))}
+    await log.close()
+    idle, interval, count = (answer[f"tcp_keepalives_{each}"] for each in ("idle", "interval", "count"))
+    assert 5 <= idle + interval * count <= 30  # seconds until a silent machine is given up, and its locks
+    assert answer["tcp_user_timeout"] <= 30_000
 
 
 # --- the server itself ------------------------------------------------------------------------------------------

@@ -480,6 +480,28 @@ async def test_a_damaged_folder_of_somebody_else_is_shown_and_not_raised(address
     assert after.kept == []
 
 
+async def test_what_is_refused_of_many_dead_recorders_is_told_in_one_line(
+    address: DatabaseAddress, caplog: pytest.LogCaptureFixture
+) -> None:
+    dead = [
+        KeptSource([*run_of(episode(n), 1, 3), record(episode(n), 5, position=4)], closed=True, name=f"dead {n}")
+        for n in (2, 3, 4)
+    ]
+    source = KeptSource(run_of(episode(1), 1, 3))
+    writer = writer_for(source, address, adopt=dead)
+    await writer.start()
+    await until(lambda: bool(caplog.records))
+    source.close()
+    with pytest.raises(EpisodeParked):
+        await writer.close()
+    [line] = [each.getMessage() for each in caplog.records if each.levelname == "ERROR"]
+    assert line == (
+        f"recorder dead 2: episode {name(2)} was refused: event 4 did not arrive before event 5;"
+        " its events are kept in the spool (and 2 more: see `pycrorm status`)"
+    )
+    assert [len(each.aside or []) for each in dead] == [4, 4, 4]
+
+
 async def test_closing_does_not_wait_for_somebody_elses_records(address: DatabaseAddress) -> None:
     let_go: list[str] = []
 

@@ -17,6 +17,14 @@ VIEWS_SCHEMA = "memory"
 ANSWER_S_MAX = 60.0
 """A statement that takes longer counts as a server that is away."""
 
+_VANISHED = {
+    "tcp_keepalives_idle": "10",
+    "tcp_keepalives_interval": "5",
+    "tcp_keepalives_count": "3",
+    "tcp_user_timeout": "25000",
+}
+"""A machine that vanishes in the middle of a statement says no goodbye. The server asks after it, and lets go of its
+locks half a minute later; as it comes, it waits two hours, and nobody can go on with what was being appended."""
 
 WHERE = ("host", "port")
 """The parameters of a URL that say where the server is, and so may be shown."""
@@ -56,6 +64,7 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
         "synchronous_commit": "on",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
         "lock_timeout": f"{int(busy_timeout_s * 1000)}",
         "idle_in_transaction_session_timeout": "60000",
+        **_VANISHED,
         "default_transaction_read_only": "on" if read_only else "off",
         "timezone": "UTC",
     }

@@ -25,7 +25,6 @@ _AWAY = {
     sqlite3.SQLITE_INTERRUPT,
     sqlite3.SQLITE_IOERR,
     sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_CANTOPEN,
     sqlite3.SQLITE_PROTOCOL,
     sqlite3.SQLITE_SCHEMA,
     sqlite3.SQLITE_AUTH,
@@ -45,6 +44,11 @@ def ours(error: DBAPIError, database: str) -> PycrormError:
         return DatabaseForeign(f"{database} is not a database: SQLite cannot read it")
     if primary == sqlite3.SQLITE_CORRUPT:
         return DamageError(f"{database} is damaged: {fault}")
+    if primary == sqlite3.SQLITE_CANTOPEN:
+        return DatabaseUnavailable(
+            f"{database} cannot be opened: the file must be readable and its folder writable,"
+            " for SQLite makes files beside it, also to read it"
+        )
     if primary in _AWAY:
         return DatabaseUnavailable(f"{database}: {fault}")
     return InternalError(f"{database}: {fault}")

@@ -1,0 +1,46 @@
+"""Every script in `bench/` runs with --quick and prints one JSON line; what the figures are is not a test's to say."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - {"busy", "faults", "hook"})
+"""Those that have no test of their own."""
+
+
+def measured(script: str, *options: str) -> dict[str, Any]:
+    """The one line that the script prints."""
+    command = [sys.executable, "-m", f"bench.{script}", "--quick", *options]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    [line] = done.stdout.splitlines()
+    result = json.loads(line)
+    assert result["bench"] == script
+    return dict(result)
+
+
+def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> None:
+    result = measured("hook")
+    states = [f"{writer}, {state}" for writer in ("thread", "daemon") for state in ("up", "slow", "down")]
+    assert [name for name in result if isinstance(result[name], dict)] == ["none", *states]
+    for name in ("none", *states):
+        spread = result[name]["perform_us"]
+        assert 0 < spread["median"] <= spread["p99"] <= spread["p99.9"] <= spread["max"]
+
+
+@pytest.mark.parametrize("options", [(), ("--postgresql",)])
+def test_the_backlog_beside_a_busy_plan_is_measured(options: tuple[str, ...]) -> None:
+    result = measured("busy", *options)
+    assert result["events"] > 0
+    assert max(result["backlog_at_the_end"], *result["backlog"]) <= result["backlog_max"] <= result["events"] + 10
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("script", OTHERS)
+def test_every_other_script_measures_something(script: str) -> None:
+    assert len(measured(script)) >= 2
