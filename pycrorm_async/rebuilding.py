@@ -88,9 +88,8 @@ async def projections_of(url: str) -> list[str]:
     """The names of the projections that have tables in a memory, whether their code is here or not."""
     log = await EventLog.open(shared_address(url), create=False)
     try:
-        with log.translated():
-            async with log.engine.connect() as connection:
-                return [*projections_in(await all_noted(connection))]
+        async with log.reading() as connection:
+            return [*projections_in(await all_noted(connection))]
     finally:
         await log.close()
 

@@ -149,22 +149,21 @@ class Rebuild:
     @classmethod
     async def join(cls, log: EventLog, share: Share) -> Self:
         """The rebuild of our tables that another process has begun, to fold a share of it."""
-        with log.translated():
-            async with log.engine.connect() as connection:
-                making = await noted(connection, MAKING)
+        async with log.reading() as connection:
+            making = await noted(connection, MAKING)
         if making is None:
             raise InternalError("nothing is being rebuilt")
         return cls(log, making, share=share)
 
     async def left(self) -> int:
         """How many events of the log are not in the new tables yet."""
-        async with self._log.engine.connect() as connection:
+        async with self._log.reading() as connection:
             whole = (await connection.execute(_EVENTS)).scalar_one()
             return int(whole) - await progress.total(connection, self._place)
 
     async def parked(self) -> dict[int, str]:
         """By episode number, why not all of it could be folded."""
-        async with self._log.engine.connect() as connection:
+        async with self._log.reading() as connection:
             return await progress.parked(connection, self._place)
 
     async def fold_some(self) -> int | None:
@@ -188,7 +187,7 @@ class Rebuild:
 
     async def _fill_kept(self) -> None:
         """Makes the rows of the views that are kept, from the new tables."""
-        async with self._log.engine.connect() as connection:
+        async with self._log.reading() as connection:
             making = await self._making.generation(connection, "share")
         if not making.layout.kept:
             return
@@ -283,7 +282,7 @@ async def clear(log: EventLog) -> list[str]:
     """Drops what is not shown any more, little by little; gives the names of the tables that had to be left."""
     left: list[str] = []
     with log.translated():
-        async with log.engine.connect() as connection:
+        async with log.reading() as connection:
             there = await _known(log, connection)
         await _sweep(log)
         for key, generation in there.items():
@@ -339,7 +338,7 @@ async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
 
 async def _drop(log: EventLog, table: str) -> bool:
     dialect = dialect_of(log.engine)
-    async with log.engine.connect() as connection:
+    async with log.reading() as connection:
         if not await dialect.has_table(connection, table):
             return True
     full = True
