@@ -130,6 +130,9 @@ class Rebuild:
             async with log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
                 there = await _known(log, connection)
+                shown = there.get(SHOWN)
+                # Asked at the end too; but who must move something is told before hours of work.
+                await dialect_of(connection).only_views(connection, shown.views if shown else ())
                 if projection is not None:
                     return cls(log, await _begin_own(connection, there, projection), projection=projection)
                 making = await _going_on(connection, there, SHOWN, lambda each: each.version == PROJECTION_VERSION)
@@ -137,7 +140,6 @@ class Rebuild:
                     numbers = [each.number for key, each in there.items() if not key.startswith(PROJECTION)]
                     making = await make_generation(connection, 1 + max(numbers, default=0))
                     await make_empty(connection, {progress.TABLE: progress.COLUMNS}, making.number)
-                shown = there.get(SHOWN)
                 layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
                 if shown is not None:
                     layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
