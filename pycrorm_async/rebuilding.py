@@ -17,7 +17,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.projections.generations import all_noted, projections_in
 from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, clear
+from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, clear, recorded
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -112,13 +112,14 @@ async def _rebuilt(
             parked = await rebuild.parked()
             tell("clearing up", 1, 1)
             left = await clear(log)
-        episodes = await log.episodes()
+        episodes, events = await recorded(log)
+        ids = {each.number: each.id for each in await log.episodes()} if parked else {}
         return Rebuilt(
             generation=rebuild.number,
-            events=sum(each.head for each in episodes),
-            episodes=len(episodes),
+            events=events,
+            episodes=episodes,
             seconds=seconds,
-            parked={each.id: parked[each.number] for each in episodes if each.number in parked},
+            parked={ids[number]: reason for number, reason in parked.items()},
             left=left,
         )
     finally:
@@ -130,7 +131,7 @@ async def _opened(address: DatabaseAddress) -> EventLog:
 
 
 async def _fold(log: EventLog, rebuild: Rebuild, workers: int, tell: Tell) -> None:
-    total = sum(each.head for each in await log.episodes())
+    _, total = await recorded(log)
     if workers > 1:
         await _share_out(log.address, rebuild, workers, lambda left: tell("rebuilding", max(total - left, 0), total))
     # All of it, or what came meanwhile and what a worker that failed has left: then it fails here too, and says why.

@@ -57,7 +57,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import Span
 
-__all__ = ["Rebuild", "Share", "claimed", "clear"]
+__all__ = ["Rebuild", "Share", "claimed", "clear", "recorded"]
 
 _MAKING, _GONE = "/making", "/gone/"
 _BATCH_EVENTS = 4_000
@@ -71,7 +71,14 @@ _LATE_EVENTS_MAX = 2_000
 _SHOW_ATTEMPTS = 50
 _DROP_PAUSES_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 """Before each attempt: a question that was asked before the new tables were shown is answered by then."""
-_EVENTS = text("SELECT coalesce(sum(head), 0) FROM episode")
+_RECORDED = text("SELECT count(*), coalesce(sum(head), 0) FROM episode")
+
+
+async def recorded(log: EventLog) -> tuple[int, int]:
+    """How many episodes and how many events there are in the log."""
+    async with log.reading() as connection:
+        episodes, events = (await connection.execute(_RECORDED)).one()
+        return int(episodes), int(events)
 
 
 @asynccontextmanager
@@ -160,8 +167,9 @@ class Rebuild:
     async def left(self) -> int:
         """How many events of the log are not in the new tables yet."""
         async with self._log.reading() as connection:
-            whole = (await connection.execute(_EVENTS)).scalar_one()
-            return int(whole) - await progress.total(connection, self._place)
+            done = await progress.total(connection, self._place)
+        _, events = await recorded(self._log)
+        return events - done
 
     async def parked(self) -> dict[int, str]:
         """By episode number, why not all of it could be folded."""
