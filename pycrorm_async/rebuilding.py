@@ -62,7 +62,9 @@ async def rebuild_memory(
 
     Args:
         url: of a memory that is there; what is recorded meanwhile will be in the tables too.
-        workers: processes that fold at once, each its share of the episodes. On SQLite one at a time writes.
+        workers: processes that fold at once, each its share of the episodes. On SQLite one at a time writes, while
+            another folds. More than one needs a core for each, and a second to begin: fewer than a million events are
+            faster without.
         views: questions with a name to keep beside the tables, with those that were registered before.
         tell: what is done now, how many events are done, and of how many.
         clock: what the time is taken from.
