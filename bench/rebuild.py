@@ -1,15 +1,18 @@
-"""How fast tables are made anew from the log, whether the cost of an event grows, and who feels it meanwhile.
+"""How fast tables are made anew from the log, whether an event costs more in a large log, and who feels it meanwhile.
 
-    python -m bench.rebuild                100,000 and 1,000,000 events, one and two workers, SQLite
-    python -m bench.rebuild --postgresql   the same on a server of its own
-    python -m bench.rebuild --large        10,000,000 too
-    python -m bench.rebuild --quick        2,000 and 10,000
+    python -m bench.rebuild                        100,000 and 1,000,000 events, SQLite
+    python -m bench.rebuild --postgresql           the same on a server of its own
+    python -m bench.rebuild --events 100000 10000000
+    python -m bench.rebuild --in FOLDER            keeps the logs there, and goes on with those it finds (SQLite)
+    python -m bench.rebuild --workers 1 2          by one process and by two
+    python -m bench.rebuild --quick                2,000 and 10,000
 
-Every rebuild is a process of its own. Prints one JSON line: events a second, µs an event, by the clock and of the
-processors (on PostgreSQL without the server's; with what a process needs to begin and to clear up), and MB of the
-largest process, by size and workers; how much more an event costs, and how much more memory is taken, in the largest
-log than in the smallest; and the longest waits, in s, of a process that records and flushes and of one that asks, with
-nothing else going on and while the largest log is rebuilt.
+Every rebuild is a process of its own, and each size is rebuilt twice, of which the cheaper one counts. Then the largest
+log is rebuilt beside two processes that record and two that ask all the time, each of which ends with an error if it
+ever sees less than before. Prints a table for people on stderr, and one JSON line: by size events a second, µs an event
+by the clock and by the processor (on PostgreSQL without the server's), and MB of the largest process; how much more an
+event costs in the largest log than in the smallest, and how many MB more are taken; and how often the others did what
+they do and how long they waited at most, calm and beside the rebuild.
 """
 
 from __future__ import annotations
@@ -25,13 +28,16 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+from rich.console import Console
+from rich.table import Table
+
+from bench.rebuild_beside import Company
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.rebuilding import rebuild_memory
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.crash.forked import Forked
-from tests.crash.remaking import read_until_told, record_until_told
 from tests.databases import server_in
 from tests.projections.remade import TYPES, picking
 
@@ -40,100 +46,121 @@ _NODES = 124
 _APPEND_EPISODES = 40
 _CALM_S = 5.0
 
+Figures = dict[str, float]
 
-async def fill(url: str, events: int) -> int:
-    """Appends whole episodes, the first of them folded; the number of events."""
+
+async def fill(url: str, events: int) -> None:
+    """Appends whole episodes until the log holds so many events; what shows in the tables are those of the first."""
+    one = picking(1, nodes=_NODES).records
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    records: list[Record] = list(TYPES)
-    count = number = 0
+    there = await log.episodes()
+    count, number = sum(each.head for each in there), len(there)
     while count < events:
-        number += 1
-        records += picking(number, nodes=_NODES).records
-        count += 5 + 2 * _NODES
-        if number % _APPEND_EPISODES == 1 or count >= events:
-            await log.append(records)
-            records.clear()
+        records: list[Record] = list(TYPES) if number == 0 else []
+        for _ in range(_APPEND_EPISODES if number else 1):
+            if count >= events:
+                break
+            number += 1
+            episode = EpisodeId(bytes([*bytes(6), 0x70, 0, 0x80, 0, 0, 0, *number.to_bytes(4, "big")]))
+            records += [each._replace(episode=episode) for each in one]
+            count += len(one)
+        assert await log.append(records) == {}
         if number == 1:
             projector = Projector(log)
             await projector.open()
             await projector.fold_behind()
     await log.close()
-    return count
 
 
-def rebuilt(url: str, workers: int) -> dict[str, float]:
+def rebuilt(url: str, workers: int) -> Figures:
     """What a process of its own says of its rebuild."""
     command = [sys.executable, "-m", "bench.rebuild", "--of", url, "--workers", str(workers)]
-    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    return dict(json.loads(said))
+    said: Figures = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
+    return said
 
 
 def rebuild_and_say(url: str, workers: int) -> None:
+    began = _cpu_s()
     done = asyncio.run(rebuild_memory(url, workers=workers))
+    mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024
+    print(json.dumps({"events": done.events, "seconds": done.seconds, "cpu_s": _cpu_s() - began, "mb": mb}))
+
+
+def _cpu_s() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    said = {
-        "events": done.events,
-        "seconds": done.seconds,
-        "cpu_s": sum(each.ru_utime + each.ru_stime for each in used),
-        "mb": max(each.ru_maxrss for each in used) / 1024,
-    }
-    print(json.dumps(said))
+    return sum(each.ru_utime + each.ru_stime for each in used)
 
 
-def waits(url: str, spool: Path, *, rebuilding: bool) -> dict[str, float]:
-    """The longest waits of one that records and of one that reads."""
-    recorder, reader = Forked(record_until_told, url, spool), Forked(read_until_told, url)
-    for each in (recorder, reader):
-        each.wait_for_its_first_words()
-    if rebuilding:
-        rebuilt(url, 1)
-    else:
-        time.sleep(_CALM_S)
-    for each in (recorder, reader):
-        each.tell_to_stop()
-        assert each.wait() == 0, each.said[-3:]
+def figures(found: Figures) -> Figures:
     return {
-        "flush_s": round(float(recorder.said[-1].split()[-1]), 3),
-        "question_s": round(float(reader.said[-1].split()[-1]), 3),
+        "events": found["events"],
+        "events_per_s": round(found["events"] / found["seconds"]),
+        "us_per_event": round(found["seconds"] / found["events"] * 1e6, 2),
+        "cpu_us_per_event": round(found["cpu_s"] / found["events"] * 1e6, 2),
+        "mb": round(found["mb"], 1),
     }
+
+
+def growth(smallest: Figures, largest: Figures) -> Figures:
+    """How much more the largest takes, by event; and in MB."""
+    costs = {name: round(largest[name] / smallest[name], 2) for name in ("us_per_event", "cpu_us_per_event")}
+    return costs | {"mb": round(largest["mb"] - smallest["mb"], 1)}
+
+
+def beside_others(url: str, spool: Path, *, calm_s: float) -> dict[str, object]:
+    """What those found who went on while it was rebuilt, and how fast that was."""
+    with ExitStack() as stack:
+        company = Company(stack, url, spool, recorders=2, readers=2)
+        time.sleep(calm_s)
+        company.rebuilding()
+        found = rebuilt(url, 1)
+        said = company.end()
+    return {"rebuild": figures(found), **said}
+
+
+def table(database: str, by_workers: dict[str, list[Figures]]) -> Table:
+    shown = Table(title=f"rebuild, {database}")
+    for name in ("events", "workers", "events/s", "µs/event", "CPU µs/event", "MB"):
+        shown.add_column(name, justify="right")
+    for workers, by_size in by_workers.items():
+        for each in by_size:
+            shown.add_row(f"{each['events']:,}", workers, *(f"{each[name]:,}" for name in list(each)[1:]))
+    return shown
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    for name in ("--quick", "--large", "--postgresql"):
-        parser.add_argument(name, action="store_true")
+    parser.add_argument("--postgresql", action="store_true", help="on a server of its own")
+    parser.add_argument("--quick", action="store_true", help="2,000 and 10,000 events")
+    parser.add_argument("--events", type=int, nargs="+", metavar="N", help="sizes of the logs")
+    parser.add_argument("--workers", type=int, nargs="+", default=[1], metavar="N", help="how many fold at once")
+    parser.add_argument("--in", dest="folder", type=Path, metavar="FOLDER", help="where logs of SQLite are kept")
+    parser.add_argument("--no-company", action="store_true", help="without others beside it")
     parser.add_argument("--of", help=argparse.SUPPRESS)
-    parser.add_argument("--workers", type=int, default=1, help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.of:
-        rebuild_and_say(asked.of, asked.workers)
+        rebuild_and_say(asked.of, *asked.workers)
         return
-    sizes = [2_000, 10_000] if asked.quick else [100_000, 1_000_000, *([10_000_000] if asked.large else [])]
-    answer: dict[str, object] = {"bench": "rebuild", "database": "postgresql" if asked.postgresql else "sqlite"}
-    by_workers: dict[int, list[dict[str, float]]] = {1: [], 2: []}
+    sizes = sorted(asked.events or ([2_000, 10_000] if asked.quick else [100_000, 1_000_000]))
+    database = "postgresql" if asked.postgresql else "sqlite"
+    answer: dict[str, object] = {"bench": "rebuild", "database": database}
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
+        folder = asked.folder or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
+        folder.mkdir(parents=True, exist_ok=True)
         server = stack.enter_context(server_in(folder / "pg")) if asked.postgresql else None
-        for size in sizes:
-            url = server.new_database() if server else f"sqlite:///{folder}/{size}.db"
+        urls = [server.new_database() if server else f"sqlite:///{folder}/{each}.db" for each in sizes]
+        by_workers: dict[str, list[Figures]] = {str(workers): [] for workers in asked.workers}
+        for size, url in zip(sizes, urls, strict=True):
             asyncio.run(fill(url, size))
             for workers, found in by_workers.items():
-                found.append(rebuilt(url, workers))
-                last = found[-1]
-                answer[f"{size}_events_{workers}_workers"] = {
-                    "events_per_s": round(last["events"] / last["seconds"]),
-                    "us_per_event": round(last["seconds"] / last["events"] * 1e6, 2),
-                    "cpu_us_per_event": round(last["cpu_s"] / last["events"] * 1e6, 2),
-                    "mb": round(last["mb"], 1),
-                }
-        for workers, found in by_workers.items():
-            costs = [each["seconds"] / each["events"] for each in found]
-            answer[f"growth_{workers}_workers"] = {
-                "cost": round(costs[-1] / costs[0], 2),
-                "mb": round(found[-1]["mb"] - found[0]["mb"], 1),
-            }
-        answer["waits_calm"] = waits(url, folder / "spool", rebuilding=False)
-        answer["waits_rebuilding"] = waits(url, folder / "spool", rebuilding=True)
+                both = [figures(rebuilt(url, int(workers))) for _ in range(1 if asked.quick else 2)]
+                found.append(min(both, key=lambda each: each["cpu_us_per_event"]))
+        answer["by_workers"] = by_workers
+        answer["growth"] = {workers: growth(found[0], found[-1]) for workers, found in by_workers.items()}
+        if not asked.no_company:
+            spool = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="s")))
+            answer["beside_others"] = beside_others(urls[-1], spool, calm_s=0.5 if asked.quick else _CALM_S)
+    Console(stderr=True).print(table(database, by_workers))
     print(json.dumps(answer))
 
 

@@ -17,7 +17,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.projections.generations import all_noted, projections_in
 from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, clear
+from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, clear, recorded
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -62,7 +62,9 @@ async def rebuild_memory(
 
     Args:
         url: of a memory that is there; what is recorded meanwhile will be in the tables too.
-        workers: processes that fold at once, each its share of the episodes. On SQLite one at a time writes.
+        workers: processes that fold at once, each its share of the episodes. On SQLite one at a time writes, while
+            another folds. More than one needs a core for each, and a second to begin: fewer than a million events are
+            faster without.
         views: questions with a name to keep beside the tables, with those that were registered before.
         tell: what is done now, how many events are done, and of how many.
         clock: what the time is taken from.
@@ -88,9 +90,8 @@ async def projections_of(url: str) -> list[str]:
     """The names of the projections that have tables in a memory, whether their code is here or not."""
     log = await EventLog.open(shared_address(url), create=False)
     try:
-        with log.translated():
-            async with log.engine.connect() as connection:
-                return [*projections_in(await all_noted(connection))]
+        async with log.reading() as connection:
+            return [*projections_in(await all_noted(connection))]
     finally:
         await log.close()
 
@@ -113,13 +114,14 @@ async def _rebuilt(
             parked = await rebuild.parked()
             tell("clearing up", 1, 1)
             left = await clear(log)
-        episodes = await log.episodes()
+        episodes, events = await recorded(log)
+        ids = {each.number: each.id for each in await log.episodes()} if parked else {}
         return Rebuilt(
             generation=rebuild.number,
-            events=sum(each.head for each in episodes),
-            episodes=len(episodes),
+            events=events,
+            episodes=episodes,
             seconds=seconds,
-            parked={each.id: parked[each.number] for each in episodes if each.number in parked},
+            parked={ids[number]: reason for number, reason in parked.items()},
             left=left,
         )
     finally:
@@ -131,7 +133,7 @@ async def _opened(address: DatabaseAddress) -> EventLog:
 
 
 async def _fold(log: EventLog, rebuild: Rebuild, workers: int, tell: Tell) -> None:
-    total = sum(each.head for each in await log.episodes())
+    _, total = await recorded(log)
     if workers > 1:
         await _share_out(log.address, rebuild, workers, lambda left: tell("rebuilding", max(total - left, 0), total))
     # All of it, or what came meanwhile and what a worker that failed has left: then it fails here too, and says why.

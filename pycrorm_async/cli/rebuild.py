@@ -27,7 +27,14 @@ def rebuild(
     ] = None,
     url: UrlOption = DEFAULT_URL,
     workers: Annotated[
-        int, typer.Option("--workers", min=1, max=64, help="Processes that fold the tables at once.")
+        int,
+        typer.Option(
+            "--workers",
+            min=1,
+            max=64,
+            help="Processes that fold the tables at once; more than one pays from a million events on, with a free"
+            " core for each.",
+        ),
     ] = 1,
     projection: ProjectionOption = None,
     as_json: JsonOption = False,

@@ -100,7 +100,7 @@ class CatchUp:
     async def fold_some(self) -> int | None:
         """Folds a batch; the number of events, None when none is left of this share. Raises `LogDamaged`."""
         while True:
-            async with self._log.engine.connect() as connection:
+            async with self._log.reading() as connection:
                 await self._goal.generation(connection, "share")  # it is not dropped meanwhile
                 behind = await progress.behind(
                     connection,

@@ -221,15 +221,14 @@ async def states(log: EventLog, known: Sequence[Projection]) -> list[ProjectionS
     """Of every projection in this memory. `known` are those whose code is here."""
     here = {each.name: each for each in known}
     found: list[ProjectionState] = []
-    with log.translated():
-        async with log.engine.connect() as connection:
-            for name, each in projections_in(await all_noted(connection)).items():
-                place = progress.place_of(each.number, name)
-                fault = None
-                if name in here:
-                    fault = fault_in_version(here[name], each, layout_of(here[name], connection.dialect))
-                left, parked = await progress.left(connection, place), await progress.parked(connection, place)
-                found.append(ProjectionState(name, each.version, left, parked, fault))
+    async with log.reading() as connection:
+        for name, each in projections_in(await all_noted(connection)).items():
+            place = progress.place_of(each.number, name)
+            fault = None
+            if name in here:
+                fault = fault_in_version(here[name], each, layout_of(here[name], connection.dialect))
+            left, parked = await progress.left(connection, place), await progress.parked(connection, place)
+            found.append(ProjectionState(name, each.version, left, parked, fault))
     return found
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import TableClause, bindparam, column, or_, select, table, text, update
+from sqlalchemy import TableClause, column, or_, select, table, text, update
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.projections.tables import Storage, physical_name
@@ -153,17 +153,16 @@ async def carry_over(connection: AsyncConnection, place: str) -> None:
     episode = table("episode", column("number"), column("folded"), column("parked"))
     progress = _table(place)
     different = or_(episode.c.folded != progress.c.folded, episode.c.parked.is_distinct_from(progress.c.parked))
-    found = await connection.execute(
+    taken = (
         select(episode.c.number, progress.c.folded, progress.c.parked)
         .join_from(episode, progress, progress.c.id == episode.c.number)
         .where(different)
         .order_by(episode.c.number)  # as everybody takes them, so that nobody waits in a circle
         .with_for_update(of=episode)
+        .cte("taken")
     )
-    changes = [{"key": number, "now": folded, "why": parked} for number, folded, parked in found]
-    if changes:
-        change = update(episode).where(episode.c.number == bindparam("key"))
-        await connection.execute(change.values(folded=bindparam("now"), parked=bindparam("why")), changes)
+    change = update(episode).where(episode.c.number == taken.c.number)
+    await connection.execute(change.values(folded=taken.c.folded, parked=taken.c.parked))
 
 
 def _table(place: str) -> TableClause:

@@ -57,7 +57,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import Span
 
-__all__ = ["Rebuild", "Share", "claimed", "clear"]
+__all__ = ["Rebuild", "Share", "claimed", "clear", "recorded"]
 
 _MAKING, _GONE = "/making", "/gone/"
 _BATCH_EVENTS = 4_000
@@ -71,7 +71,14 @@ _LATE_EVENTS_MAX = 2_000
 _SHOW_ATTEMPTS = 50
 _DROP_PAUSES_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
 """Before each attempt: a question that was asked before the new tables were shown is answered by then."""
-_EVENTS = text("SELECT coalesce(sum(head), 0) FROM episode")
+_RECORDED = text("SELECT count(*), coalesce(sum(head), 0) FROM episode")
+
+
+async def recorded(log: EventLog) -> tuple[int, int]:
+    """How many episodes and how many events there are in the log."""
+    async with log.reading() as connection:
+        episodes, events = (await connection.execute(_RECORDED)).one()
+        return int(episodes), int(events)
 
 
 @asynccontextmanager
@@ -130,6 +137,9 @@ class Rebuild:
             async with log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
                 there = await _known(log, connection)
+                shown = there.get(SHOWN)
+                # Asked at the end too; but who must move something is told before hours of work.
+                await dialect_of(connection).only_views(connection, shown.views if shown else ())
                 if projection is not None:
                     return cls(log, await _begin_own(connection, there, projection), projection=projection)
                 making = await _going_on(connection, there, SHOWN, lambda each: each.version == PROJECTION_VERSION)
@@ -137,7 +147,6 @@ class Rebuild:
                     numbers = [each.number for key, each in there.items() if not key.startswith(PROJECTION)]
                     making = await make_generation(connection, 1 + max(numbers, default=0))
                     await make_empty(connection, {progress.TABLE: progress.COLUMNS}, making.number)
-                shown = there.get(SHOWN)
                 layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
                 if shown is not None:
                     layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
@@ -149,22 +158,22 @@ class Rebuild:
     @classmethod
     async def join(cls, log: EventLog, share: Share) -> Self:
         """The rebuild of our tables that another process has begun, to fold a share of it."""
-        with log.translated():
-            async with log.engine.connect() as connection:
-                making = await noted(connection, MAKING)
+        async with log.reading() as connection:
+            making = await noted(connection, MAKING)
         if making is None:
             raise InternalError("nothing is being rebuilt")
         return cls(log, making, share=share)
 
     async def left(self) -> int:
         """How many events of the log are not in the new tables yet."""
-        async with self._log.engine.connect() as connection:
-            whole = (await connection.execute(_EVENTS)).scalar_one()
-            return int(whole) - await progress.total(connection, self._place)
+        async with self._log.reading() as connection:
+            done = await progress.total(connection, self._place)
+        _, events = await recorded(self._log)
+        return events - done
 
     async def parked(self) -> dict[int, str]:
         """By episode number, why not all of it could be folded."""
-        async with self._log.engine.connect() as connection:
+        async with self._log.reading() as connection:
             return await progress.parked(connection, self._place)
 
     async def fold_some(self) -> int | None:
@@ -188,7 +197,7 @@ class Rebuild:
 
     async def _fill_kept(self) -> None:
         """Makes the rows of the views that are kept, from the new tables."""
-        async with self._log.engine.connect() as connection:
+        async with self._log.reading() as connection:
             making = await self._making.generation(connection, "share")
         if not making.layout.kept:
             return
@@ -283,7 +292,7 @@ async def clear(log: EventLog) -> list[str]:
     """Drops what is not shown any more, little by little; gives the names of the tables that had to be left."""
     left: list[str] = []
     with log.translated():
-        async with log.engine.connect() as connection:
+        async with log.reading() as connection:
             there = await _known(log, connection)
         await _sweep(log)
         for key, generation in there.items():
@@ -339,7 +348,7 @@ async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
 
 async def _drop(log: EventLog, table: str) -> bool:
     dialect = dialect_of(log.engine)
-    async with log.engine.connect() as connection:
+    async with log.reading() as connection:
         if not await dialect.has_table(connection, table):
             return True
     full = True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
@@ -143,6 +143,10 @@ class Dialect(Protocol):
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
         """Gives up soon where a reader is in the way, so that nobody waits behind the two for long."""
+        ...
+
+    async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
+        """Raises `DatabaseError` if beside these views stands what `replace_views` would not leave as it is."""
         ...
 
     async def replace_views(

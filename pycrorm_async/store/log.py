@@ -115,12 +115,12 @@ class EventLog:
 
     async def episodes(self) -> list[EpisodeRow]:
         """Every episode, by number."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             return await self._dialect.episodes(connection)
 
     async def episode(self, episode: EpisodeId) -> EpisodeRow | None:
         """How far an episode is here; None if nothing of it is stored."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             return await self._dialect.episode(connection, episode_text(episode))
 
     async def episode_number(self, episode: EpisodeId) -> int | None:
@@ -130,7 +130,7 @@ class EventLog:
 
     async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[StoredEvent]:
         """The events of an episode that follow sequence `after`, at most `limit`."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             return await self._dialect.events(connection, number, after=after, limit=limit)
 
     async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[list[StoredEvent]]:
@@ -147,7 +147,7 @@ class EventLog:
 
     async def spans(self, spans: Sequence[Span]) -> list[StoredEvent]:
         """The events of each span, in the order of the spans."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             return await self._dialect.spans(connection, spans)
 
     async def unfolded(self, limit: int = 10_000, *, after: int = 0) -> list[Span]:
@@ -155,7 +155,7 @@ class EventLog:
 
         Begins with the episodes that follow number `after`, and with the first one when there are none.
         """
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             behind = await self._dialect.behind(connection, after=after, limit=limit)
             if not behind and after:
                 behind = await self._dialect.behind(connection, after=0, limit=limit)
@@ -163,28 +163,29 @@ class EventLog:
 
     async def behind(self) -> list[EpisodeRow]:
         """The episodes of which the tables do not show all; without the parked ones."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             return await self._dialect.behind(connection, after=0, limit=EPISODE_NUMBER_MAX)
 
     async def stopped(self) -> list[EpisodeRow]:
         """The episodes that the log refused something of, or that are parked; the rows say why."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             return await self._dialect.stopped(connection)
 
     async def declarations(self) -> list[bytes]:
         """The payloads of all DesignatorTypeDeclared, in the order of their first arrival."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             return await self._dialect.declarations(connection)
 
     @asynccontextmanager
     async def snapshot(self) -> AsyncIterator[AsyncConnection]:
         """A connection whose transaction sees everything as it is at one moment."""
-        async with self._reading() as connection:
+        async with self.reading() as connection:
             await self._dialect.hold_still(connection)
             yield connection
 
     @asynccontextmanager
-    async def _reading(self) -> AsyncIterator[AsyncConnection]:
+    async def reading(self) -> AsyncIterator[AsyncConnection]:
+        """A connection for reading, which waits for nobody who writes and for which nobody waits."""
         with self.translated():
             async with self._reads.connect() as connection:
                 yield connection

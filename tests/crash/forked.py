@@ -45,6 +45,10 @@ class Forked:
         self.process.kill()
         self.wait()
 
+    def tell(self) -> None:
+        """Writes a byte to its input."""
+        os.write(self._input.fileno(), b"!")
+
     def tell_to_stop(self) -> None:
         """Closes its input."""
         self._input.close()

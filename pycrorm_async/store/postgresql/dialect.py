@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from typing import Any, NamedTuple
 
@@ -145,6 +145,15 @@ class PostgreSQL:
         await connection.exec_driver_sql(f"ALTER TABLE {quote(table)} ADD COLUMN {definition}")
         await connection.exec_driver_sql(tables.WAIT_AS_EVER)
 
+    async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
+        found = await connection.exec_driver_sql(tables.IN_VIEWS_SCHEMA, (list(known),))
+        strangers = list(found.scalars())
+        if strangers:
+            raise DatabaseError(
+                f"{VIEWS_SCHEMA}.{strangers[0]} is not of the memory, and the schema {VIEWS_SCHEMA} is made anew with"
+                " every change: move it to another schema"
+            )
+
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
@@ -152,13 +161,7 @@ class PostgreSQL:
         to wait for every reader in a transaction, with every new reader waiting behind."""
         if before == after:
             return
-        found = await connection.exec_driver_sql(tables.IN_VIEWS_SCHEMA, (list(before),))
-        strangers = list(found.scalars())
-        if strangers:
-            raise DatabaseError(
-                f"{VIEWS_SCHEMA}.{strangers[0]} is not of the memory, and the schema {VIEWS_SCHEMA} is made anew with"
-                " every change: move it to another schema"
-            )
+        await self.only_views(connection, before)
         quote = connection.dialect.identifier_preparer.quote
         made = [f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()]
         await self.execute_all(connection, [*tables.NEW_VIEWS_SCHEMA, *made, *tables.SHOW_NEW_VIEWS_SCHEMA])

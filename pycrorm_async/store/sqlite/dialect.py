@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from itertools import accumulate, chain
 from pathlib import Path
@@ -139,6 +139,9 @@ class SQLite:
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
         quote = connection.dialect.identifier_preparer.quote
         await connection.exec_driver_sql(f"ALTER TABLE {quote(table)} ADD COLUMN {definition}")
+
+    async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
+        """What is somebody else's is in nobody's way."""
 
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]

@@ -1,0 +1,65 @@
+"""Two memories in one, and its tables made anew from its log: what both held, under keys of no database."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from itertools import pairwise
+
+from pycrorm_async.copying import copy_episodes
+from pycrorm_async.rebuilding import rebuild_memory
+from tests.copying.memories import assert_merged, everything, lost, random_plans
+from tests.databases import ask, ask_to_change
+from tests.projections.remade import traces
+from tests.tables import declarations_of, differences, tables_of
+from tests.test_tables import episode as hand_written
+from tests.test_tables import fill
+
+New = Callable[[], str]
+
+
+async def merged(new_file: New, new_url: New, fill_other: Callable[[str], Awaitable[None]]) -> tuple[str, str, str]:
+    """Two sources that share episodes, under numbers of their own, and both of them in a third."""
+    one, recorded, other, target = new_file(), new_file(), new_url(), new_url()
+    await random_plans(one, range(20, 26))
+    await fill(one, [hand_written(1), lost(2)])
+    await fill_other(recorded)
+    await copy_episodes(recorded, other)
+    await copy_episodes(one, other, episodes=["2", "4"])
+    for source in (other, one):  # not in the order of their numbers
+        await copy_episodes(source, target)
+    numbers = [dict(ask(each, "SELECT id, number FROM episode")) for each in (one, target)]
+    assert all(numbers[0][each] != numbers[1][each] for each in numbers[0])
+    statuses = {row["status"] for row in tables_of(target)["task_tree_node"].values()}
+    assert statuses >= {"SUCCEEDED", "FAILED", "LOST"}, "the random plans fail in no way, so this proves little"
+    return one, other, target
+
+
+async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_hold(
+    new_url: New, new_file: New
+) -> None:
+    one, other, target = await merged(new_file, new_url, everything)
+    assert_merged(target, one, other)
+    at = "memory_tables." if target.startswith("postgresql:") else ""
+    for change in ("DELETE FROM {}pose__1", "UPDATE {}task_tree_node__1 SET status = 'RUNNING'"):
+        ask_to_change(target, change.format(at))  # what is compared below is none of what was merged
+    done = await rebuild_memory(target)
+    assert (done.generation, done.parked, done.left) == (2, {}, [])
+    assert_merged(target, one, other)
+    assert traces(target) == []
+
+
+async def test_it_makes_no_difference_which_of_them_was_rebuilt_before(new_url: New, new_file: New) -> None:
+    one, other, target = await merged(new_file, new_url, lambda url: random_plans(url, range(6)))
+    before = tables_of(target)
+    for each in (one, other):
+        assert (await rebuild_memory(each)).generation == 2
+    again, at_last = new_url(), new_file()
+    for source in (one, other):
+        await copy_episodes(source, again)
+    await rebuild_memory(again)
+    await copy_episodes(again, at_last)
+    await rebuild_memory(at_last)
+    for here, there in pairwise([target, again, at_last]):
+        assert declarations_of(here) == declarations_of(there)
+        assert differences(tables_of(here), tables_of(there)) == []
+    assert differences(before, tables_of(at_last)) == []
