@@ -131,13 +131,16 @@ def cut_connections(server: Server) -> Callable[[int, random.Random, Path, Step]
 
 
 def start_again(server: Server) -> None:
-    """Until it answers: on a busy machine that may be after the patience of the command that starts it."""
+    """Until it answers: on a busy machine that may be after the patience of the command that starts it.
+
+    That gives up after ten seconds, and asserts that a server which is there is ready.
+    """
     deadline = time.monotonic() + 300
     while True:
         try:
             server.start()
             ask(server.url(), "SELECT 1")
-        except (OSError, subprocess.SubprocessError, asyncpg.PostgresError):
+        except (AssertionError, OSError, subprocess.SubprocessError, asyncpg.PostgresError):
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.2)
