@@ -39,10 +39,10 @@ class ComputingActionPerformable(ActionAbstract):
             number = number * 3 % 1_000_003
 
 
-async def measured(url: str, seconds: float) -> dict[str, object]:
+async def measured(url: str, spool: Path, seconds: float) -> dict[str, object]:
     backlog: list[int] = []
     largest = actions = 0
-    async with Memory.open(url) as memory:
+    async with Memory.open(url, spool=spool) as memory:
         async with memory.episode(description="bench"):
             began = time.perf_counter()
             while (now := time.perf_counter() - began) < seconds:
@@ -79,7 +79,7 @@ def main() -> None:
         if arguments.postgresql:
             url = stack.enter_context(server_in(folder / "pg")).new_database()
         result = {"bench": "busy", "database": url.partition(":")[0], "asked_events_per_s": _EVENTS_PER_S}
-        print(json.dumps(result | asyncio.run(measured(url, seconds))))
+        print(json.dumps(result | asyncio.run(measured(url, folder / "spool", seconds))))
 
 
 if __name__ == "__main__":
