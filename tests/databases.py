@@ -84,6 +84,7 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
         yield running
     finally:
         running.stop()
+        server._postmaster_info = None  # where nobody reaps it, it would be stopped once more, in vain and aloud
         server.cleanup()
         lock.unlink(missing_ok=True)
 
