@@ -112,17 +112,15 @@ def _ask_until_told(url: str) -> None:
 
 
 async def _ask(url: str, told: _Told) -> None:
-    """Counts episodes, nodes, actions and pick-ups, and reads the newest pick-ups with what they stand on."""
-    asked, seen = _Waits(), (0,) * len(_COUNTED)
-    newest = select(PickUpWithContextView).order_by(PickUpWithContextView.id.desc()).limit(10)
+    """Counts episodes, nodes, actions and pick-ups, and reads those of one episode with what was around them."""
+    asked, seen = _Waits(), (0,) * (len(_COUNTED) + 1)
+    first = select(PickUpWithContextView).where(PickUpWithContextView.process_metadata_id == 1)
     async with Reading.open(url) as reading:
         while not told.over:
             phase, began_s = told.phase, time.perf_counter()
             async with reading.session() as session:
-                now = tuple(
-                    [(await session.scalars(select(func.count()).select_from(each))).one() for each in _COUNTED]
-                )
-                assert len((await session.execute(newest)).all()) == 10
+                counts = [(await session.scalars(select(func.count()).select_from(each))).one() for each in _COUNTED]
+                now = (*counts, len((await session.scalars(first)).all()))
             assert all(before <= after for before, after in zip(seen, now, strict=True)), f"{now} after {seen}"
             asked.add(phase, began_s)
             if not any(seen):
