@@ -35,7 +35,7 @@ from rich.table import Table
 from bench.baseline.storing import Statements, engine_of, store
 from bench.baseline.tables import BaselineBase
 from bench.material.rollouts import Tree, tree
-from bench.material.spooled import DECLARED, spool_tree
+from bench.material.spooled import spool_tree
 from bench.reporting.figures import MISSING, console, peak_mb, spread
 from pycrorm_async.daemon import serve
 from tests.databases import Server, ask, server_in
@@ -133,7 +133,7 @@ def side(*arguments: object) -> dict[str, Any]:
 def compared(made: Tree, folder: Path, *, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
     """One size."""
     spooled = folder / "spooled"
-    events = spool_tree(made, spooled) - len(DECLARED)
+    events = spool_tree(made, spooled)
     new = partial(_new_url, folder, server)
     theirs, ours = [], []
     nodes = made.nodes

@@ -12,10 +12,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-__all__ = ["Place", "Robot", "Thing", "Node", "Tree", "tree", "tree_of", "THESIS_NODES", "MILK"]
+__all__ = ["Place", "Robot", "Thing", "Node", "Tree", "tree", "tree_of", "THESIS_NODES", "SHARES", "MILK"]
 
 THESIS_NODES: Final = 488_043
 _THESIS_ROLLOUTS, _SUCCEEDED, _STUCK_LATER = 50_000, 7_886, 3_249
+SHARES: Final = (_SUCCEEDED, _STUCK_LATER, _THESIS_ROLLOUTS - _SUCCEEDED - _STUCK_LATER)
+"""Of rollouts with 5, 3 and 1 motions in their pick-up."""
 _STEP_NS = 5_000_000
 _BEGAN_NS = 1_700_000_000_000_000_000
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.material.rollouts import MILK, Node, Place, Robot, Thing, Tree
+from bench.material.rollouts import MILK, SHARES, Node, Place, Robot, Thing, Tree, tree_of
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings
@@ -38,7 +39,7 @@ from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
 from pycrorm_async.queue import RecorderQueue
 
-__all__ = ["spool_tree", "Recording", "DECLARED"]
+__all__ = ["spool_tree", "spool_rollouts", "Recording", "DECLARED"]
 
 _CLASSES: tuple[type[Designator], ...] = (
     NavigateActionPerformable,
@@ -54,14 +55,30 @@ DECLARED: dict[str, DeclaredType] = {each.dtype: declared_type(each) for each in
 
 
 def spool_tree(made: Tree, spool: Path) -> int:
-    """Writes the tree into a new recorder's folder, as one closed episode, and leaves it; the number of events."""
+    """Writes the tree into a new recorder's folder, as one closed episode, and leaves it; the number of its events."""
     recording = Recording(spool)
     recording.declare()
     recording.begin(made.began_ns)
     for rollout in made.rollouts:
         recording.put_tree(rollout, recording.root)
     recording.end()
-    return recording.leave()
+    return recording.leave() - len(DECLARED)
+
+
+def spool_rollouts(count: int, spool: Path, *, seed: int, an_episode: int = 100) -> int:
+    """So many rollouts in episodes of a hundred, by one recorder that is gone then; the number of its events.
+
+    Each turns out as one of the thesis by chance. Needs memory for one episode only.
+    """
+    recording, chance = Recording(spool), random.Random(seed)
+    recording.declare()
+    for first in range(0, count, an_episode):
+        made = tree_of(chance.choices((5, 3, 1), SHARES, k=min(an_episode, count - first)), seed + first)
+        recording.begin(made.began_ns)
+        for rollout in made.rollouts:
+            recording.put_tree(rollout, recording.root)
+        recording.end()
+    return recording.leave() - len(DECLARED)
 
 
 class Recording:
