@@ -1,0 +1,166 @@
+"""The same task tree as our hooks would have recorded it: events in a spool, by the real queue."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bench.material.rollouts import MILK, SHARES, Node, Place, Robot, Thing, Tree, tree_of
+from pycrorm_async import __version__
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.config import Settings
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.happenings import (
+    DesignatorTypeDeclared,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    Happening,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.hooks.declaration import DeclaredType, declared_type
+from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.plan.actions import (
+    FaceAtPerformable,
+    LookAtActionPerformable,
+    NavigateActionPerformable,
+    PickUpActionPerformable,
+)
+from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
+from pycrorm_async.queue import RecorderQueue
+
+__all__ = ["spool_tree", "spool_rollouts", "Recording", "DECLARED"]
+
+_CLASSES: tuple[type[Designator], ...] = (
+    NavigateActionPerformable,
+    FaceAtPerformable,
+    LookAtActionPerformable,
+    PickUpActionPerformable,
+    MoveMotion,
+    LookingMotion,
+    MoveTCPMotion,
+    MoveGripperMotion,
+)
+DECLARED: dict[str, DeclaredType] = {each.dtype: declared_type(each) for each in _CLASSES}
+
+
+def spool_tree(made: Tree, spool: Path) -> int:
+    """Writes the tree into a new recorder's folder, as one closed episode, and leaves it; the number of its events."""
+    recording = Recording(spool)
+    recording.declare()
+    recording.begin(made.began_ns)
+    for rollout in made.rollouts:
+        recording.put_tree(rollout, recording.root)
+    recording.end()
+    return recording.leave() - len(DECLARED)
+
+
+def spool_rollouts(count: int, spool: Path, *, seed: int, an_episode: int = 100) -> int:
+    """So many rollouts in episodes of a hundred, by one recorder that is gone then; the number of its events.
+
+    Each turns out as one of the thesis by chance. Needs memory for one episode only.
+    """
+    recording, chance = Recording(spool), random.Random(seed)
+    recording.declare()
+    for first in range(0, count, an_episode):
+        made = tree_of(chance.choices((5, 3, 1), SHARES, k=min(an_episode, count - first)), seed + first)
+        recording.begin(made.began_ns)
+        for rollout in made.rollouts:
+            recording.put_tree(rollout, recording.root)
+        recording.end()
+    return recording.leave() - len(DECLARED)
+
+
+class Recording:
+    """One recorder that writes one episode after the other; what it puts happens when the values say it did."""
+
+    def __init__(self, spool: Path, *, settings: Settings | None = None, live: bool = False) -> None:
+        self._now_ns = 1
+        clock = SYSTEM_CLOCK if live else Clock(lambda: self._now_ns, lambda: self._now_ns)
+        settings = settings or Settings(spool_bytes_max=64 * 2**30)
+        name = episode_id(SYSTEM_CLOCK.wall_ns(), b"benchspool")
+        self.queue = RecorderQueue.create(spool, settings=settings, clock=clock, recorder=name, offered=True)
+        self._emitter = Emitter(self.queue, settings)
+        self._episodes = 0
+        self._episode = EpisodeId(b"")
+        self._milk = ObjectReference(0, 0)
+        self.root = 0
+
+    def declare(self) -> None:
+        """Once, before the first episode."""
+        for each in DECLARED.values():
+            heading = Heading(None, DesignatorTypeDeclared.__name__, DesignatorTypeDeclared.version)
+            self._emitter.put_payload(heading, each.payload)
+
+    def begin(self, began_ns: int) -> None:
+        """A new episode, with its root and the milk."""
+        self._now_ns = began_ns
+        self._episodes += 1
+        self._episode = episode_id(SYSTEM_CLOCK.wall_ns(), self._episodes.to_bytes(10, "big"))
+        self._put(EpisodeStarted("rollouts", "bench", "here", __version__, "3"))
+        self.root = self._put(NodeStarted("root"))
+        milk = self._put(ObjectAdded(MILK.name, MILK.type, _pose(MILK.place)))
+        self._milk = ObjectReference(milk, milk)
+
+    def end(self) -> None:
+        self._put(NodeEnded(self.root, "SUCCEEDED"))
+        self._put(EpisodeEnded("SUCCEEDED"))
+
+    def put_tree(self, node: Node, parent: int, *, after: Callable[[], None] | None = None) -> None:
+        """This node and all below it; `after` is called when a node has ended."""
+        declared = DECLARED[node.dtype]
+        self._now_ns = node.start_ns
+        sequence = self._put(
+            NodeStarted(
+                declared.declaration.kind,
+                parent,
+                declared.fingerprint,
+                {name: self._written(value) for name, value in node.values.items()},
+                _robot(node.robot),
+            )
+        )
+        for child in node.children:
+            self.put_tree(child, sequence, after=after)
+        self._now_ns = node.end_ns
+        failure = FailureValue(node.failure, "") if node.failure else None
+        self._put(NodeEnded(sequence, "FAILED" if failure else "SUCCEEDED", failure))
+        if after is not None:
+            after()
+
+    def leave(self) -> int:
+        """All of it is synced, and the folder is that of a recorder that is gone; how many records it holds."""
+        asyncio.run(self.queue.synced_to(self.queue.written))
+        count = self.queue.written
+        self.queue.close()
+        self.queue.release()
+        return count
+
+    def _put(self, event: Happening) -> int:
+        return self._emitter.put(self._episode, event)
+
+    def _written(self, value: object) -> Any:
+        match value:
+            case Place():
+                return _pose(value)
+            case Thing():
+                return self._milk
+            case _:
+                return value
+
+
+def _pose(place: Place) -> PoseValue:
+    return PoseValue(place.position, place.orientation, "map", place.time_ns)
+
+
+def _robot(robot: Robot | None) -> RobotValue | None:
+    return RobotValue(_pose(robot.place), "ROBOT", robot.torso_m) if robot is not None else None

@@ -1,0 +1,44 @@
+"""What every script does with what it measured: a spread, the peak of a process, where people read."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+
+__all__ = ["MISSING", "console", "peak_mb", "percentiles", "spread"]
+
+MISSING: Final = "missing: pip install '.[bench]'"
+"""In the place of a figure, where a library to compare with is not installed."""
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, least and most, to four digits."""
+    return {"median": _short(statistics.median(values)), "least": _short(min(values)), "most": _short(max(values))}
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float]:
+    """Median, p99, p99.9 and the largest, to four digits."""
+    ordered = sorted(values)
+    at = {"median": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
+    return {name: _short(ordered[round(share * (len(ordered) - 1))]) for name, share in at.items()}
+
+
+def _short(value: float) -> float:
+    rounded = float(f"{value:.4g}")
+    return int(rounded) if rounded.is_integer() else rounded
+
+
+def peak_mb() -> float:
+    """The most memory this process held so far, of its own image: not of the one it was started from."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+
+
+def console() -> Console:
+    """For progress and tables: what is printed elsewhere is for programs."""
+    return Console(stderr=True, width=None if sys.stderr.isatty() else 140)

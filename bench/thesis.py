@@ -1,0 +1,234 @@
+"""From task trees to every row in every table: as the system of the thesis did it, and as ours does.
+
+    python -m bench.thesis                    about 1,000, 10,000 and 50,000 nodes, SQLite; --postgresql on a server
+    python -m bench.thesis --nodes 488043 --repeat 1
+    python -m bench.thesis --quick            300 nodes, on both databases
+
+The trees are the same values on both sides. The baseline (`bench/baseline`) has the whole tree in memory, adds an
+object for each row to a session and commits once; ours has it as events in the spool of a recorder that is gone, and a
+daemon appends and folds them. The clock runs from there until every row is in every table, without starting Python and
+without making the baseline's tables; ours makes its own in that time. The sides take turns, each in a process of its
+own. Prints one JSON line: by size nodes a second, how many times faster ours is (median, least and most over the
+turns) and how much less of the processor it takes (on PostgreSQL without the server's), rows and insert statements a
+node, and MB of each process. The table is on stderr.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from bench.baseline.storing import Statements, engine_of, store
+from bench.baseline.tables import BaselineBase
+from bench.material.rollouts import Tree, tree
+from bench.material.spooled import spool_tree
+from bench.reporting.figures import MISSING, console, peak_mb, spread
+from pycrorm_async.daemon import serve
+from tests.databases import Server, ask, server_in
+
+_LOOK_S = 0.02
+_COMPARED = ("baseline_nodes_per_s", "ours_nodes_per_s", "times_faster", "times_less_cpu")
+
+
+# --- one side, in a process of its own ------------------------------------------------------------------------------
+
+
+def stored_by_baseline(url: str, nodes: int, seed: int) -> dict[str, Any]:
+    """What it takes the baseline, with the whole tree in memory."""
+    made = tree(nodes, seed)
+    engine = engine_of(url)
+    statements = Statements(engine)
+    before_mb = peak_mb()
+    began, began_cpu = time.perf_counter(), time.process_time()
+    store(made, engine)
+    seconds, cpu_s = time.perf_counter() - began, time.process_time() - began_cpu
+    rows = sum(ask(url, f"SELECT count(*) FROM {_quoted(each, url)}")[0][0] for each in BaselineBase.metadata.tables)
+    return {
+        "seconds": seconds,
+        "cpu_s": cpu_s,
+        "mb": peak_mb(),
+        "tree_mb": before_mb,
+        "rows": rows,
+        "statements": statements.sent,
+    }
+
+
+def _quoted(table: str, url: str) -> str:
+    return f'public."{table}"' if url.startswith("postgresql:") else f'"{table}"'
+
+
+async def stored_by_us(url: str, spool: Path, events: int) -> dict[str, Any]:
+    """What it takes the daemon, with all events in the spool."""
+    leave = asyncio.Event()
+    began, began_cpu = time.perf_counter(), time.process_time()
+    serving = asyncio.create_task(serve(url, spool=spool, leave=leave, say=lambda _: None), name="daemon")
+    appended_s = folded_s = 0.0
+    while not folded_s:
+        await asyncio.wait([serving], timeout=_LOOK_S)
+        if serving.done():
+            serving.result()
+            raise RuntimeError("the daemon left")
+        appended, folded = await asyncio.to_thread(_progress, url)
+        now_s = time.perf_counter() - began
+        if not appended_s and appended == events:
+            appended_s = now_s
+        if folded == events:
+            folded_s = now_s
+    cpu_s = time.process_time() - began_cpu
+    leave.set()
+    await serving
+    return {"seconds": folded_s, "cpu_s": cpu_s, "appended_s": appended_s, "mb": peak_mb(), "rows": rows_shown(url)}
+
+
+def _progress(url: str) -> tuple[int, int]:
+    """Events in the log, and in the tables; none while there is no log."""
+    try:
+        [(head, folded)] = ask(url, "SELECT coalesce(sum(head), 0), coalesce(sum(folded), 0) FROM episode")
+    except Exception as error:
+        if "no such table" in str(error) or "does not exist" in str(error):
+            return 0, 0
+        if "locked" in str(error):
+            return 0, 0
+        raise
+    return int(head), int(folded)
+
+
+def rows_shown(url: str) -> int:
+    """Rows in all our tables but the log and the bookkeeping."""
+    if url.startswith("postgresql:"):
+        named = "SELECT 'memory_tables.\"' || tablename || '\"' FROM pg_tables WHERE schemaname = 'memory_tables'"
+        named += " AND tablename NOT LIKE 'pycrorm_%'"
+    else:
+        named = (
+            "SELECT '\"' || name || '\"' FROM sqlite_master WHERE type = 'table' AND name LIKE '%\\_\\_%' ESCAPE '\\'"
+        )
+        named += " AND name NOT LIKE 'pycrorm_%'"
+    return sum(int(ask(url, f"SELECT count(*) FROM {name}")[0][0]) for (name,) in ask(url, named))
+
+
+# --- the two, in turns ----------------------------------------------------------------------------------------------
+
+
+def side(*arguments: object) -> dict[str, Any]:
+    """What one side's process says."""
+    command = [sys.executable, "-m", "bench.thesis", *map(str, arguments)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return dict(json.loads(done.stdout))
+
+
+def compared(made: Tree, folder: Path, *, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
+    """One size."""
+    spooled = folder / "spooled"
+    events = spool_tree(made, spooled)
+    new = partial(_new_url, folder, server)
+    theirs, ours = [], []
+    nodes = made.nodes
+    for turn in range(repeat):
+        theirs.append(side("--side", "baseline", "--url", new(f"baseline{turn}"), "--nodes", nodes, "--seed", seed))
+        spool = folder / f"spool{turn}"
+        shutil.copytree(spooled, spool)
+        os.sync()
+        ours.append(side("--side", "ours", "--url", new(f"ours{turn}"), "--spool", spool, "--events", events))
+        shutil.rmtree(spool)
+    shutil.rmtree(spooled)
+    faster = [one["seconds"] / other["seconds"] for one, other in zip(theirs, ours, strict=True)]
+    return {
+        "nodes": nodes,
+        "events": events,
+        "baseline_nodes_per_s": spread([nodes / each["seconds"] for each in theirs]),
+        "ours_nodes_per_s": spread([nodes / each["seconds"] for each in ours]),
+        "times_faster": spread(faster),
+        "times_less_cpu": spread([one["cpu_s"] / other["cpu_s"] for one, other in zip(theirs, ours, strict=True)]),
+        "baseline_rows_per_node": round(theirs[0]["rows"] / nodes, 2),
+        "baseline_statements_per_node": round(theirs[0]["statements"] / nodes, 2),
+        "ours_rows_per_node": round(ours[0]["rows"] / nodes, 2),
+        "baseline_mb": round(max(each["mb"] for each in theirs)),
+        "baseline_tree_mb": round(max(each["tree_mb"] for each in theirs)),
+        "ours_mb": round(max(each["mb"] for each in ours)),
+        "ours_appended_share": spread([each["appended_s"] / each["seconds"] for each in ours]),
+    }
+
+
+def _new_url(folder: Path, server: Server | None, name: str) -> str:
+    return server.new_database() if server else f"sqlite:///{folder}/{name}.db"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="300 nodes, on both databases")
+    parser.add_argument("--postgresql", action="store_true", help="on a server of its own")
+    parser.add_argument("--nodes", type=int, nargs="+", default=[1_000, 10_000, 50_000])
+    parser.add_argument("--repeat", type=int, default=3, help="how often each side has its turn")
+    parser.add_argument("--seed", type=int, default=69)
+    for hidden in ("--side", "--url"):
+        parser.add_argument(hidden, help=argparse.SUPPRESS)
+    parser.add_argument("--spool", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--events", type=int, help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.side == "baseline":
+        print(json.dumps(stored_by_baseline(asked.url, asked.nodes[0], asked.seed)))
+        return
+    if asked.side == "ours":
+        print(json.dumps(asyncio.run(stored_by_us(asked.url, asked.spool, asked.events))))
+        return
+    sizes, repeat = ([300], 1) if asked.quick else (asked.nodes, asked.repeat)
+    databases = ["sqlite", "postgresql"] if asked.quick else ["postgresql" if asked.postgresql else "sqlite"]
+    answer: dict[str, Any] = {"bench": "thesis", "seed": asked.seed, "repeat": repeat}
+    with ExitStack() as stack:
+        place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
+        for database in databases:
+            if database == "postgresql" and find_spec("psycopg") is None:
+                answer[database] = MISSING
+                continue
+            server = stack.enter_context(server_in(place / "pg")) if database == "postgresql" else None
+            answer[database] = [_one_size(size, place, asked.seed, repeat, server) for size in sizes]
+    print(json.dumps(answer))
+    console().print(_table(answer))
+
+
+def _one_size(size: int, place: Path, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
+    console().print(f"{size:,} nodes …")
+    with tempfile.TemporaryDirectory(dir=place) as folder:
+        return compared(tree(size, seed), Path(folder), seed=seed, repeat=repeat, server=server)
+
+
+def _table(answer: dict[str, Any]) -> Table:
+    table = Table(title="From trees to every row in every table", title_justify="left")
+    for name in (
+        "database",
+        "nodes",
+        "thesis, nodes/s",
+        "ours, nodes/s",
+        "times faster",
+        "times less CPU",
+        "MB",
+        "MB, ours",
+    ):
+        table.add_column(name, justify="left" if name == "database" else "right")
+    for database in ("sqlite", "postgresql"):
+        if answer.get(database) == MISSING:
+            table.add_row(database, MISSING)
+            continue
+        for each in answer.get(database, ()):
+            rates = [each[name]["median"] for name in _COMPARED]
+            figures = [each["nodes"], *rates, each["baseline_mb"], each["ours_mb"]]
+            table.add_row(database, *(f"{figure:,}" for figure in figures))
+    return table
+
+
+if __name__ == "__main__":
+    main()
