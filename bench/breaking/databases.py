@@ -198,10 +198,11 @@ def locked_files(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
             settings=Settings(batch_events_max=_BATCH),
             backoff=_QUICKLY,
         )
-        other = sqlite3.connect(folder / "memory.db", isolation_level=None, timeout=30)
+        other = sqlite3.connect(folder / "memory.db", isolation_level=None, timeout=300, check_same_thread=False)
         running = None
         for _ in range(rounds):
-            other.execute("BEGIN EXCLUSIVE")
+            # In a thread: who holds the lock meanwhile needs this loop to let go of it.
+            await asyncio.to_thread(other.execute, "BEGIN EXCLUSIVE")
             running = running or asyncio.create_task(drain.run())
             retries = drain.state.retries
             while drain.state.retries == retries and not running.done():  # noqa: ASYNC110
