@@ -7,8 +7,8 @@
 same nodes in the folders of 1 to 32 recorders that one daemon drains. *Daemons*: 1 to 4 of them, each with a spool of
 its own and the same number of nodes, into one PostgreSQL. *Episodes*: how fast a hundred episodes of a hundred nodes
 come on top when a hundred, a thousand … are there already. *Recording*: how large the recording process is after so
-many nodes. Prints one JSON line: nodes a second for each, and the knee, the largest of each kind that still has nine tenths
-of the best rate. Every point is measured `--turns` times, in turns, and its median told with least and most.
+many nodes. Prints one JSON line: nodes a second for each, and the knee, the largest of each kind that still has nine
+tenths of the best rate. Every point is measured `--turns` times, in turns; of these it tells median, least and most.
 """
 
 from __future__ import annotations
