@@ -36,11 +36,11 @@ from bench.baseline.storing import Statements, engine_of, store
 from bench.baseline.tables import BaselineBase
 from bench.material.rollouts import Tree, tree
 from bench.material.spooled import spool_tree
+from bench.material.watched import until_folded
 from bench.reporting.figures import MISSING, console, peak_mb, spread
 from pycrorm_async.daemon import serve
 from tests.databases import Server, ask, server_in
 
-_LOOK_S = 0.02
 _COMPARED = ("baseline_nodes_per_s", "ours_nodes_per_s", "times_faster", "times_less_cpu")
 
 
@@ -74,37 +74,15 @@ def _quoted(table: str, url: str) -> str:
 async def stored_by_us(url: str, spool: Path, events: int) -> dict[str, Any]:
     """What it takes the daemon, with all events in the spool."""
     leave = asyncio.Event()
-    began, began_cpu = time.perf_counter(), time.process_time()
+    began_cpu = time.process_time()
     serving = asyncio.create_task(serve(url, spool=spool, leave=leave, say=lambda _: None), name="daemon")
-    appended_s = folded_s = 0.0
-    while not folded_s:
-        await asyncio.wait([serving], timeout=_LOOK_S)
-        if serving.done():
-            serving.result()
-            raise RuntimeError("the daemon left")
-        appended, folded = await asyncio.to_thread(_progress, url)
-        now_s = time.perf_counter() - began
-        if not appended_s and appended == events:
-            appended_s = now_s
-        if folded == events:
-            folded_s = now_s
+    watching = asyncio.create_task(asyncio.to_thread(until_folded, url, events), name="watch")
+    await asyncio.wait([serving, watching], return_when=asyncio.FIRST_COMPLETED)
+    appended_s, folded_s = await watching
     cpu_s = time.process_time() - began_cpu
     leave.set()
     await serving
     return {"seconds": folded_s, "cpu_s": cpu_s, "appended_s": appended_s, "mb": peak_mb(), "rows": rows_shown(url)}
-
-
-def _progress(url: str) -> tuple[int, int]:
-    """Events in the log, and in the tables; none while there is no log."""
-    try:
-        [(head, folded)] = ask(url, "SELECT coalesce(sum(head), 0), coalesce(sum(folded), 0) FROM episode")
-    except Exception as error:
-        if "no such table" in str(error) or "does not exist" in str(error):
-            return 0, 0
-        if "locked" in str(error):
-            return 0, 0
-        raise
-    return int(head), int(folded)
 
 
 def rows_shown(url: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -88,10 +89,9 @@ class Recording:
         self._now_ns = 1
         clock = SYSTEM_CLOCK if live else Clock(lambda: self._now_ns, lambda: self._now_ns)
         settings = settings or Settings(spool_bytes_max=64 * 2**30)
-        name = episode_id(SYSTEM_CLOCK.wall_ns(), b"benchspool")
+        name = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
         self.queue = RecorderQueue.create(spool, settings=settings, clock=clock, recorder=name, offered=True)
         self._emitter = Emitter(self.queue, settings)
-        self._episodes = 0
         self._episode = EpisodeId(b"")
         self._milk = ObjectReference(0, 0)
         self.root = 0
@@ -105,8 +105,7 @@ class Recording:
     def begin(self, began_ns: int) -> None:
         """A new episode, with its root and the milk."""
         self._now_ns = began_ns
-        self._episodes += 1
-        self._episode = episode_id(SYSTEM_CLOCK.wall_ns(), self._episodes.to_bytes(10, "big"))
+        self._episode = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
         self._put(EpisodeStarted("rollouts", "bench", "here", __version__, "3"))
         self.root = self._put(NodeStarted("root"))
         milk = self._put(ObjectAdded(MILK.name, MILK.type, _pose(MILK.place)))

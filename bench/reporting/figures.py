@@ -10,7 +10,7 @@ from typing import Final
 
 from rich.console import Console
 
-__all__ = ["MISSING", "console", "peak_mb", "percentiles", "spread"]
+__all__ = ["MISSING", "console", "held_mb", "peak_mb", "percentiles", "spread"]
 
 MISSING: Final = "missing: pip install '.[bench]'"
 """In the place of a figure, where a library to compare with is not installed."""
@@ -35,8 +35,13 @@ def _short(value: float) -> float:
 
 def peak_mb() -> float:
     """The most memory this process held so far, of its own image: not of the one it was started from."""
+    return held_mb("VmHWM")
+
+
+def held_mb(what: str) -> float:
+    """A figure of this process' memory, by the name that `proc(5)` gives it."""
     lines = Path("/proc/self/status").read_text().splitlines()
-    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmHWM"))
+    return next(round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith(f"{what}:"))
 
 
 def console() -> Console:

@@ -1,0 +1,142 @@
+"""The budgets of the design, and what was measured for each: pure, from the lines the scripts printed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+__all__ = ["BUDGETS", "Budget", "Verdict", "judged"]
+
+Lines = Mapping[str, Mapping[str, Any]]
+"""What each run printed, by its name."""
+
+
+class Verdict(NamedTuple):
+    """What was measured, in words, and whether the budget is held; None where it was not measured."""
+
+    measured: str
+    held: bool | None
+
+
+class Budget(NamedTuple):
+    """What is promised, how much of it, and how to read it off; `read` raises `LookupError` where it was not run."""
+
+    what: str
+    budget: str
+    read: Callable[[Lines], Verdict]
+
+
+def judged(budget: Budget, lines: Lines) -> Verdict:
+    """The verdict on one budget. What a quick run printed shows that it runs, and no more."""
+    measured = {name: line for name, line in lines.items() if "--quick" not in line["command"]}
+    try:
+        return budget.read(measured)
+    except (LookupError, TypeError, ValueError):  # not run, or printed by an older script
+        return Verdict("not measured", None)
+
+
+def _hook(lines: Lines) -> Verdict:
+    found = {name: each for name, each in lines["hook"].items() if isinstance(each, dict) and "hook_us" in each}
+    median = max(each["hook_us"] for each in found.values())
+    p99 = max(each["more_us"]["p99"] / 2 for each in found.values())
+    worst = max(found, key=lambda name: found[name]["hook_us"])
+    return Verdict(f"median {median:g} µs, p99 {p99:g} µs (the worst of each; {worst})", median <= 5 and p99 <= 50)
+
+
+def _plan(lines: Lines) -> Verdict:
+    shares = {how: lines["plan"][f"with_{how}"]["slower_by_median"] for how in ("thread", "daemon")}
+    text = ", ".join(f"{how} {share:+.1%}" for how, share in shares.items())
+    return Verdict(text, all(share <= 0.05 for share in shares.values()))
+
+
+def _log_against_raw(lines: Lines) -> Verdict:
+    shares = {
+        database: min(
+            found["ours_is"]["median"]
+            for name, found in lines["others"][database].items()
+            if name in ("executemany", "json_each", "COPY")
+        )
+        for database in ("sqlite", "postgresql")
+    }
+    text = ", ".join(f"{database} {share:.2f} times" for database, share in shares.items())
+    return Verdict(text, all(share >= 0.5 for share in shares.values()))
+
+
+def _log_against_eventsource(lines: Lines) -> Verdict:
+    times = lines["others"]["postgresql"]["eventsource-py"]["ours_is"]["median"]
+    return Verdict(f"{times:.1f} times", times >= 10)
+
+
+def _thesis(database: str, wanted: float) -> Callable[[Lines], Verdict]:
+    def read(lines: Lines) -> Verdict:
+        sizes = [
+            each
+            for name, line in lines.items()
+            if name.startswith("thesis") and isinstance(line.get(database), list)
+            for each in line[database]
+        ]
+        largest = max(sizes, key=lambda each: each["nodes"])
+        times = largest["times_faster"]["median"]
+        return Verdict(f"{times:.1f} times at {largest['nodes']:,} nodes", times >= wanted)
+
+    return read
+
+
+def _rebuild_rate(lines: Lines) -> Verdict:
+    rates = {database: _rebuilt(lines, database)[-1]["events_per_s"] for database in ("sqlite", "postgresql")}
+    text = ", ".join(f"{database} {rate:,} events/s" for database, rate in rates.items())
+    return Verdict(text, all(rate >= 100_000 for rate in rates.values()))
+
+
+def _rebuild_growth(lines: Lines) -> Verdict:
+    found = {
+        database: lines[name]["growth"]["1"] for database, name in (("sqlite", "rebuild"), ("postgresql", _REBUILD))
+    }
+    text = ", ".join(
+        f"{database} {each['us_per_event']:.2f} times, {each['mb']:+g} MB" for database, each in found.items()
+    )
+    events = [each["events"] for each in _rebuilt(lines, "sqlite")]
+    held = all(each["us_per_event"] <= 1.1 and each["mb"] <= _FLAT_MB for each in found.values())
+    return Verdict(f"{text} ({events[0]:,} to {events[-1]:,} events)", held)
+
+
+_REBUILD = "rebuild postgresql"
+_FLAT_MB = 16
+
+
+def _rebuilt(lines: Lines, database: str) -> list[dict[str, Any]]:
+    return list(lines["rebuild" if database == "sqlite" else _REBUILD]["by_workers"]["1"])
+
+
+def _recording(lines: Lines) -> Verdict:
+    found = {database: lines["growth"][database]["recording"]["bytes_a_node"] for database in ("sqlite", "postgresql")}
+    text = ", ".join(f"{database} {each:g} bytes a node" for database, each in found.items())
+    return Verdict(text, all(each < _FLAT_BYTES for each in found.values()))
+
+
+_FLAT_BYTES = 100
+
+
+def _learning(lines: Lines) -> Verdict:
+    took = {
+        database: lines["questions"][database]["50000"]["learning, frame"]["ms"]["median"]
+        for database in ("sqlite", "postgresql")
+    }
+    text = ", ".join(f"{database} {each:.0f} ms" for database, each in took.items())
+    return Verdict(text, all(each <= 100 for each in took.values()))
+
+
+BUDGETS = (
+    Budget("one hook, mean of start and end", "median ≤ 5 µs, p99 ≤ 50 µs", _hook),
+    Budget("the fastest headless rollout with memory against without", "≤ 5 % slower", _plan),
+    Budget("full spool → log against the best raw way of writing the same rows", "≥ 0.5 times", _log_against_raw),
+    Budget("full spool → log against eventsource-py, PostgreSQL", "≥ 10 times", _log_against_eventsource),
+    Budget(
+        "spool → every row in every table against the system of the thesis, SQLite", "≥ 50 times", _thesis("sqlite", 50)
+    ),
+    Budget("the same, PostgreSQL", "≥ 30 times", _thesis("postgresql", 30)),
+    Budget("rebuild", "≥ 100,000 events/s", _rebuild_rate),
+    Budget("rebuild, the largest log against the smallest", "≤ 1.1 times an event, memory flat", _rebuild_growth),
+    Budget("memory of a recording process", "flat (the original: 32 kB a node)", _recording),
+    Budget("the thesis' learning query over 50,000 pick-ups → DataFrame", "≤ 100 ms", _learning),
+)
