@@ -19,12 +19,15 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
     """Each test that asks for this runs on both kinds of database, each time on a new one."""
     if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'memory.db'}"
+        yield f"sqlite:///{tmp_path / 'memory.db'}"
+        return
     running: Server = request.getfixturevalue("server")
-    return running.new_database()
+    url = running.new_database()
+    yield url
+    running.drop(url)  # some hundred files, which would be written to the disk and deleted at the end of all
 
 
 _LONG = ("test_verify", "test_verify_damage", "test_own", "test_cancelled", "test_rebuild_kill", "test_copy")

@@ -9,15 +9,17 @@ import os
 import signal
 import sqlite3
 import threading
+import time
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 import asyncpg
 
-__all__ = ["Server", "server_in", "ask", "ask_to_change"]
+__all__ = ["Server", "server_in", "ask", "ask_to_change", "await_events"]
 
 
 class Server:
@@ -37,6 +39,11 @@ class Server:
         name = f"memory_{next(self._numbers)}"
         _in_a_loop_of_its_own(_run(self.url(), f"CREATE DATABASE {name}", ()))
         return self.url(name)
+
+    def drop(self, url: str) -> None:
+        """The database of that URL, whoever is connected to it."""
+        name = urlsplit(url).path.removeprefix("/")
+        _in_a_loop_of_its_own(_run(self.url(), f"DROP DATABASE IF EXISTS {name} WITH (FORCE)", ()))
 
     def stop(self) -> None:
         """At once, as if it had crashed: connections are cut, nothing is written that was not."""
@@ -99,6 +106,16 @@ def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> li
         finally:
             connection.close()
     return [tuple(row) for row in _in_a_loop_of_its_own(_run(url, statement, tuple(parameters)))]
+
+
+def await_events(file: Path, count: int) -> None:
+    """Until a SQLite memory, which another process is making, holds so many events."""
+    for _ in range(1_200):
+        with contextlib.suppress(sqlite3.OperationalError):
+            if file.exists() and ask(file, "SELECT count(*) FROM event")[0][0] >= count:
+                return
+        time.sleep(0.1)
+    raise TimeoutError(f"there are no {count} events in {file}")
 
 
 def ask_to_change(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> None:

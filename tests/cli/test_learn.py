@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import pytest
 
 from pycrorm_async.learning import load_policy, name_of
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
-from tests.databases import ask
+from tests.databases import ask, await_events
 
 SMALL = ("learn", "--rollouts", "400", "--evaluate", "150", "--held-out", "150")
 
@@ -74,11 +73,7 @@ def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path
     longer = ("--rollouts", "2500")
     command = [*COMMAND, *SMALL, *longer, "--workers", "2"]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        time.sleep(0.1)
-        if (tmp_path / "pycrorm.db").exists() and ask(tmp_path / "pycrorm.db", "SELECT count(*) FROM event") > [(500,)]:
-            break
+    await_events(tmp_path / "pycrorm.db", 500)
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=120)
     assert process.returncode == 130, said

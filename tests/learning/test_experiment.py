@@ -21,7 +21,7 @@ from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.study import study
 from pycrorm_async.learning.workers import Job, Place, WorkerLost, Workers
 from pycrorm_async.orm import MoveAndPickUpAction
-from tests.databases import ask
+from tests.databases import ask, await_events
 
 SMALL = Experiment(rollouts=700, evaluate=200, held_out=200, workers=2)
 
@@ -144,10 +144,7 @@ async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is
     url = f"sqlite:///{tmp_path}/memory.db"
     command = ["-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]
     process = await asyncio.create_subprocess_exec("python", *command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE)
-    for _ in range(600):
-        await asyncio.sleep(0.1)
-        if (tmp_path / "memory.db").exists() and ask(url, "SELECT count(*) > 3000 FROM event") == [(1,)]:
-            break
+    await asyncio.to_thread(await_events, tmp_path / "memory.db", 3_000)
     spawned = psutil.Process(process.pid).children()
     os.kill(process.pid, signal.SIGKILL)
     await process.wait()
