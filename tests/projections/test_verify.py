@@ -213,9 +213,9 @@ async def test_every_value_that_was_changed_is_told_and_nothing_else(log: EventL
 async def test_a_single_value_is_enough_also_null_for_something_and_something_for_null(
     log: EventLog, database_url: str
 ) -> None:
-    for table in shown(database_url):
+    for number_of_table, table in enumerate(shown(database_url)):
         for row in rows_of(database_url, table)[:1]:
-            for column in table.columns:
+            for column in table.columns[number_of_table % 3 :: 3]:  # each kind of column in some table
                 if column in table.key:
                     continue
                 value = another(None, table.kinds[column]) if row[column] is None else None

@@ -35,21 +35,22 @@ async def source(tmp_path: Path) -> str:
 
 
 @pytest.fixture
-async def destination(server: Server) -> str:
+async def destination(server: Server, tmp_path: Path) -> str:
     """With a run of its own, whose rows have the ids that those of the first run in the source have."""
     url = server.new_database()
-    async with Memory.open(url) as memory, memory.episode(description="was here before"):
-        with kitchen():
-            await common_plan()
+    async with Memory.open(url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="was here before"):
+            with kitchen():
+                await common_plan()
     return url
 
 
 def assert_holds(destination: str, source: Tables, before: Tables) -> None:
     """For every table, all rows of the source, and all that were there."""
+    there = tables_of(destination)
     for table, rows in source.items():
-        there = tables_of(destination)[table]
-        assert rows.items() <= there.items(), table
-    assert differences(tables_of(destination), united(source, before)) == []
+        assert rows.items() <= there[table].items(), table
+    assert differences(there, united(source, before)) == []
 
 
 async def test_merge_databases(source: str, destination: str) -> None:
