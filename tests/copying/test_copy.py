@@ -159,13 +159,16 @@ async def test_what_is_being_recorded_is_copied_as_far_as_it_is_and_then_the_res
     assert_same(source, target)
 
 
-async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(new_url: New, new_file: New) -> None:
+async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(
+    new_url: New, new_file: New, tmp_path: Path
+) -> None:
     source, target, alone = new_file(), new_url(), new_file()
     await notes(alone, *map(str, range(200)))
     await notes(source, "before")
 
     async def record(url: str, name: str) -> None:
-        async with Memory.open(url, settings=PATIENT) as memory, memory.episode(description=name):
+        opened = Memory.open(url, spool=tmp_path / f"{name}.spool", settings=PATIENT)
+        async with opened as memory, memory.episode(description=name):
             for index in range(150):
                 await NoteActionPerformable(f"{name} {index}").perform()
                 await asyncio.sleep(0.002)
