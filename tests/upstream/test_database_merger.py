@@ -38,10 +38,10 @@ async def source(tmp_path: Path) -> str:
 async def destination(server: Server, tmp_path: Path) -> str:
     """With a run of its own, whose rows have the ids that those of the first run in the source have."""
     url = server.new_database()
-    async with Memory.open(url, spool=tmp_path / "spool") as memory:
-        async with memory.episode(description="was here before"):
-            with kitchen():
-                await common_plan()
+    opened = Memory.open(url, spool=tmp_path / "spool")
+    async with opened as memory, memory.episode(description="was here before"):
+        with kitchen():
+            await common_plan()
     return url
 
 
