@@ -63,7 +63,8 @@ def make_file(path: Path, name: str) -> None:
     try:
         os.mknod(os.path.realpath(path), 0o666 | stat.S_IFREG)
     except FileExistsError:
-        return
+        if path.is_dir():
+            raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
     except OSError as error:
         raise DatabaseUnavailable(f"{name} cannot be opened: {error.strerror} ({path})") from error
 

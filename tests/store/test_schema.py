@@ -45,7 +45,7 @@ async def test_opened_again_in_the_same_process_it_stays_locked_against_others(a
     await log.append(run_of(episode(1), 1, 2))
     await (await EventLog.open(address, create=True)).close()
     asked = "import sqlite3; c = sqlite3.connect({!r}); print(*c.execute('SELECT count(*) FROM event')); c.close()"
-    subprocess.run([sys.executable, "-c", asked.format(str(address.path))], check=True)
+    subprocess.run([sys.executable, "-c", asked.format(str(address.path))], check=True)  # noqa: ASYNC221
     assert address.path.with_name("memory.db-wal").exists()
     await log.append(run_of(episode(1), 3, 4))
     assert ask(address.path, "SELECT count(*) FROM event") == [(4,)]
