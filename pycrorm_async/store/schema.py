@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import stat
 from pathlib import Path
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
@@ -52,11 +53,18 @@ async def make_or_migrate(engine: AsyncEngine, name: str, *, birth: Birth, migra
 
 
 def make_file(path: Path, name: str) -> None:
-    """Makes an empty file if there is none, which SQLite takes for an empty database."""
+    """Makes an empty file if there is none, which SQLite takes for an empty database.
+
+    Without opening it: whoever closes a file takes from his whole process the locks that SQLite has on it, and then
+    another process that closes the database deletes the write-ahead log that this one goes on writing into.
+    """
     if sqlite3.sqlite_version_info < (3, 38):
         raise DatabaseUnavailable(f"SQLite 3.38 or newer is needed, this is {sqlite3.sqlite_version}")
     try:
-        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666))
+        os.mknod(os.path.realpath(path), 0o666 | stat.S_IFREG)
+    except FileExistsError:
+        if path.is_dir():
+            raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
     except OSError as error:
         raise DatabaseUnavailable(f"{name} cannot be opened: {error.strerror} ({path})") from error
 

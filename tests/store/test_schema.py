@@ -39,6 +39,26 @@ async def test_a_new_log_has_an_id_that_stays(address: DatabaseAddress) -> None:
     assert ask(address.path, "PRAGMA journal_mode") == [("wal",)]
 
 
+async def test_opened_again_in_the_same_process_it_stays_locked_against_others(address: DatabaseAddress) -> None:
+    """They would take the log of a process that is at work for one that was left behind, and delete it."""
+    log = await EventLog.open(address, create=True)
+    await log.append(run_of(episode(1), 1, 2))
+    await (await EventLog.open(address, create=True)).close()
+    asked = "import sqlite3; c = sqlite3.connect({!r}); print(*c.execute('SELECT count(*) FROM event')); c.close()"
+    subprocess.run([sys.executable, "-c", asked.format(str(address.path))], check=True)  # noqa: ASYNC221
+    assert address.path.with_name("memory.db-wal").exists()
+    await log.append(run_of(episode(1), 3, 4))
+    assert ask(address.path, "SELECT count(*) FROM event") == [(4,)]
+    await log.close()
+
+
+async def test_a_link_to_a_file_that_is_not_there_yet_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "link.db").symlink_to("memory.db")
+    log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/link.db"), create=True)
+    await log.close()
+    assert ask(tmp_path / "memory.db", "SELECT id FROM pycrorm_log") == [(log.log_id,)]
+
+
 async def test_two_logs_have_two_ids(tmp_path: Path) -> None:
     ids = set()
     for name in ("a", "b"):
