@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -122,7 +121,6 @@ def compared(made: Tree, folder: Path, *, seed: int, repeat: int, server: Server
         theirs.append(by_baseline(new(f"baseline{turn}"), nodes, seed))
         spool = folder / f"spool{turn}"
         shutil.copytree(spooled, spool)
-        os.sync()
         ours.append(stored_by_us(new(f"ours{turn}"), spool, folder / f"drained{turn}", events))
     shutil.rmtree(spooled)
     faster = [one["seconds"] / other["seconds"] for one, other in zip(theirs, ours, strict=True)]
