@@ -40,7 +40,7 @@ class Run(NamedTuple):
 
     @property
     def script(self) -> str:
-        return self.name.split()[0]
+        return self.name.replace(",", " ").split()[0]
 
 
 RUNS = (
@@ -98,13 +98,12 @@ def main() -> int:
 
 def measured(run: Run, *, quick: bool) -> dict[str, Any] | None:
     """The line of one run; None if it failed, which its own words on stderr explain."""
-    script = run.script.rstrip(",")
     options = [*run.options, *(["--quick"] if quick else [])]
-    shown = shlex.join(["python", "-m", f"bench.{script}", *options])
+    shown = shlex.join(["python", "-m", f"bench.{run.script}", *options])
     console().rule(shown)
     began, before = time.perf_counter(), _load()
     done = subprocess.run(
-        [sys.executable, "-m", f"bench.{script}", *options], stdout=subprocess.PIPE, text=True, check=False
+        [sys.executable, "-m", f"bench.{run.script}", *options], stdout=subprocess.PIPE, text=True, check=False
     )
     took = round(time.perf_counter() - began, 1)
     lines = done.stdout.splitlines()

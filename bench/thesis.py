@@ -5,20 +5,18 @@
     python -m bench.thesis --quick            300 nodes, on both databases
 
 The trees are the same values on both sides. The baseline (`bench/baseline`) has the whole tree in memory, adds an
-object for each row to a session and commits once; ours has it as events in the spool of a recorder that is gone, and a
-daemon appends and folds them. The clock runs from there until every row is in every table, without starting Python and
-without making the baseline's tables; ours makes its own in that time. The sides take turns, each in a process of its
-own. Prints one JSON line: by size nodes a second, how many times faster ours is (median, least and most over the
-turns) and how much less of the processor it takes (on PostgreSQL without the server's), rows and insert statements a
-node, and MB of each process. The table is on stderr.
+object for each row to a session and commits once; ours has it as events in the folder of a recorder that is gone, which
+a daemon finds, appends and folds. The clock runs from there until every row is in every table, without starting
+processes and without making the tables of the baseline; those of ours for the types of nodes are made in that time, and
+finding the folder takes half a second at most. The sides take turns, each in its own process. Prints one JSON line:
+by size nodes a second, how many times faster ours is (median, least and most over the turns) and how much less of the
+processor it takes (on PostgreSQL without the server's), rows and insert statements a node, and MB of each process.
 """
 
 from __future__ import annotations
 
 import argparse
-import asyncio
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -34,13 +32,15 @@ from rich.table import Table
 
 from bench.baseline.storing import Statements, engine_of, store
 from bench.baseline.tables import BaselineBase
+from bench.daemon import start_daemon, stop
 from bench.material.rollouts import Tree, tree
 from bench.material.spooled import spool_tree
 from bench.material.watched import until_folded
-from bench.reporting.figures import MISSING, console, peak_mb, spread
-from pycrorm_async.daemon import serve
+from bench.reporting.figures import MISSING, console, cpu_s_of, held_mb, memory_free_gb, peak_mb, spread
 from tests.databases import Server, ask, server_in
 
+_BYTES_A_NODE = 36_000
+"""Of the baseline, which has all rows as objects until it commits."""
 _COMPARED = ("baseline_nodes_per_s", "ours_nodes_per_s", "times_faster", "times_less_cpu")
 
 
@@ -71,18 +71,20 @@ def _quoted(table: str, url: str) -> str:
     return f'public."{table}"' if url.startswith("postgresql:") else f'"{table}"'
 
 
-async def stored_by_us(url: str, spool: Path, events: int) -> dict[str, Any]:
-    """What it takes the daemon, with all events in the spool."""
-    leave = asyncio.Event()
-    began_cpu = time.process_time()
-    serving = asyncio.create_task(serve(url, spool=spool, leave=leave, say=lambda _: None), name="daemon")
-    watching = asyncio.create_task(asyncio.to_thread(until_folded, url, events), name="watch")
-    await asyncio.wait([serving, watching], return_when=asyncio.FIRST_COMPLETED)
-    appended_s, folded_s = await watching
-    cpu_s = time.process_time() - began_cpu
-    leave.set()
-    await serving
-    return {"seconds": folded_s, "cpu_s": cpu_s, "appended_s": appended_s, "mb": peak_mb(), "rows": rows_shown(url)}
+def stored_by_us(url: str, recorded: Path, spool: Path, events: int) -> dict[str, Any]:
+    """What it takes a daemon that runs already, from the moment the folder with all events is in its spool."""
+    daemon = start_daemon(url, spool)
+    try:
+        cpu_s = cpu_s_of(daemon.pid)
+        began = time.perf_counter()
+        for folder in recorded.iterdir():
+            folder.rename(spool / folder.name)
+        appended_s, _ = until_folded(url, events)
+        seconds = time.perf_counter() - began
+        used_s, mb = cpu_s_of(daemon.pid) - cpu_s, held_mb("VmHWM", daemon.pid)
+    finally:
+        stop(daemon)
+    return {"seconds": seconds, "cpu_s": used_s, "appended_s": appended_s, "mb": mb, "rows": rows_shown(url)}
 
 
 def rows_shown(url: str) -> int:
@@ -101,9 +103,9 @@ def rows_shown(url: str) -> int:
 # --- the two, in turns ----------------------------------------------------------------------------------------------
 
 
-def side(*arguments: object) -> dict[str, Any]:
-    """What one side's process says."""
-    command = [sys.executable, "-m", "bench.thesis", *map(str, arguments)]
+def by_baseline(url: str, nodes: int, seed: int) -> dict[str, Any]:
+    """What its process says."""
+    command = [sys.executable, "-m", "bench.thesis", "--baseline", url, "--nodes", str(nodes), "--seed", str(seed)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return dict(json.loads(done.stdout))
 
@@ -116,12 +118,10 @@ def compared(made: Tree, folder: Path, *, seed: int, repeat: int, server: Server
     theirs, ours = [], []
     nodes = made.nodes
     for turn in range(repeat):
-        theirs.append(side("--side", "baseline", "--url", new(f"baseline{turn}"), "--nodes", nodes, "--seed", seed))
+        theirs.append(by_baseline(new(f"baseline{turn}"), nodes, seed))
         spool = folder / f"spool{turn}"
         shutil.copytree(spooled, spool)
-        os.sync()
-        ours.append(side("--side", "ours", "--url", new(f"ours{turn}"), "--spool", spool, "--events", events))
-        shutil.rmtree(spool)
+        ours.append(stored_by_us(new(f"ours{turn}"), spool, folder / f"drained{turn}", events))
     shutil.rmtree(spooled)
     faster = [one["seconds"] / other["seconds"] for one, other in zip(theirs, ours, strict=True)]
     return {
@@ -152,18 +152,14 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="+", default=[1_000, 10_000, 50_000])
     parser.add_argument("--repeat", type=int, default=3, help="how often each side has its turn")
     parser.add_argument("--seed", type=int, default=69)
-    for hidden in ("--side", "--url"):
-        parser.add_argument(hidden, help=argparse.SUPPRESS)
-    parser.add_argument("--spool", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--events", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--baseline", metavar="URL", help=argparse.SUPPRESS)
     asked = parser.parse_args()
-    if asked.side == "baseline":
-        print(json.dumps(stored_by_baseline(asked.url, asked.nodes[0], asked.seed)))
-        return
-    if asked.side == "ours":
-        print(json.dumps(asyncio.run(stored_by_us(asked.url, asked.spool, asked.events))))
+    if asked.baseline:
+        print(json.dumps(stored_by_baseline(asked.baseline, asked.nodes[0], asked.seed)))
         return
     sizes, repeat = ([300], 1) if asked.quick else (asked.nodes, asked.repeat)
+    if (needed_gb := max(sizes) * _BYTES_A_NODE / 1e9) > (free_gb := memory_free_gb()):
+        parser.error(f"the baseline needs about {needed_gb:.0f} GB and {free_gb:.0f} are free: ask for fewer nodes")
     databases = ["sqlite", "postgresql"] if asked.quick else ["postgresql" if asked.postgresql else "sqlite"]
     answer: dict[str, Any] = {"bench": "thesis", "seed": asked.seed, "repeat": repeat}
     with ExitStack() as stack:

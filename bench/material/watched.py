@@ -9,7 +9,7 @@ from tests.databases import ask
 
 __all__ = ["Progress", "progress", "until_folded"]
 
-_LOOK_S = 0.02
+_LOOK_S = 0.05
 _PATIENCE_S = 60.0
 _NOT_THERE = ("no such table", "does not exist", "unable to open", "locked")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import statistics
 import sys
 from collections.abc import Sequence
@@ -10,7 +11,7 @@ from typing import Final
 
 from rich.console import Console
 
-__all__ = ["MISSING", "console", "held_mb", "peak_mb", "percentiles", "spread"]
+__all__ = ["MISSING", "console", "cpu_s_of", "held_mb", "memory_free_gb", "peak_mb", "percentiles", "spread"]
 
 MISSING: Final = "missing: pip install '.[bench]'"
 """In the place of a figure, where a library to compare with is not installed."""
@@ -38,10 +39,22 @@ def peak_mb() -> float:
     return held_mb("VmHWM")
 
 
-def held_mb(what: str) -> float:
-    """A figure of this process' memory, by the name that `proc(5)` gives it."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+def held_mb(what: str, process: int | None = None) -> float:
+    """A figure of a process' memory, by the name that `proc(5)` gives it; of this one by default."""
+    lines = Path(f"/proc/{process or 'self'}/status").read_text().splitlines()
     return next(round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith(f"{what}:"))
+
+
+def cpu_s_of(process: int) -> float:
+    """How long all threads of a running process were on a processor."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def memory_free_gb() -> float:
+    """What a process can still have without anything being thrown out."""
+    lines = Path("/proc/meminfo").read_text().splitlines()
+    return next(int(line.split()[1]) / 2**20 for line in lines if line.startswith("MemAvailable"))
 
 
 def console() -> Console:

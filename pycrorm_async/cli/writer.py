@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import signal
@@ -24,6 +25,8 @@ from pycrorm_async.writer.daemon import LEAVE_S, Moved
 
 __all__ = ["writer"]
 
+_OBJECTS_BEFORE_COLLECTING = 10_000
+"""Python's 700 have the collector look at the ten thousands of tuples of a batch again and again, and find nothing."""
 _HANGING_S = 5.0
 """How much longer than `LEAVE_S` a database that does not answer at all may keep the process."""
 
@@ -47,6 +50,7 @@ def writer(
     stopped.
     """
     projections = named(projection or ())
+    gc.set_threshold(_OBJECTS_BEFORE_COLLECTING)
     if once:
         return _once(url, spool, projections, as_json=as_json)
     moved = asyncio.run(_until_told_to_leave(url, spool, projections))

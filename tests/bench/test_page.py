@@ -1,0 +1,83 @@
+"""The page of all figures says what was measured, and whether it holds what the design promises."""
+
+from pathlib import Path
+from typing import Any
+
+from bench.__main__ import RUNS, _lines, _note
+from bench.reporting.budgets import BUDGETS, Verdict, judged
+from bench.reporting.page import page, rows_of
+
+ABOUT: dict[str, Any] = {
+    "command": "python -m bench.x",
+    "took_s": 1.5,
+    "load_before": 0.1,
+    "load_after": 2.0,
+    "versions": {"python": "3.11.7"},
+    "hardware": {"processor": "P", "cores": 2, "memory_gb": 8.0, "kernel": "6"},
+}
+ROOT = Path(__file__).parents[2]
+
+
+def plan(thread: float, daemon: float, **about: Any) -> dict[str, Any]:
+    shares = {"with_thread": {"slower_by_median": thread}, "with_daemon": {"slower_by_median": daemon}}
+    return {"plan": {"bench": "plan", **shares, **ABOUT, **about}}
+
+
+def verdict(what: str, lines: dict[str, Any]) -> Verdict:
+    [budget] = [each for each in BUDGETS if each.what.startswith(what)]
+    return judged(budget, lines)
+
+
+def test_a_budget_is_held_up_to_its_limit_and_missed_beyond_it() -> None:
+    assert verdict("the fastest", plan(0.05, -0.01)) == Verdict("thread +5.0%, daemon -1.0%", held=True)
+    assert verdict("the fastest", plan(0.01, 0.051)).held is False
+
+
+def test_what_a_quick_run_printed_is_held_against_no_budget() -> None:
+    found = verdict("the fastest", plan(0.0, 0.0, command="python -m bench.plan --quick"))
+    assert found == Verdict("not measured", None)
+
+
+def test_the_largest_number_of_nodes_that_was_measured_is_judged() -> None:
+    def of(*sizes: tuple[int, float]) -> dict[str, Any]:
+        return {**ABOUT, "sqlite": [{"nodes": nodes, "times_faster": {"median": times}} for nodes, times in sizes]}
+
+    lines = {"thesis": of((1_000, 70.0), (50_000, 60.0)), "thesis, 488,043 nodes": of((488_043, 49.9))}
+    found = verdict("spool", lines)
+    assert found == Verdict("49.9 times at 488,043 nodes", held=False)
+
+
+def test_a_library_that_is_missing_leaves_its_budget_unmeasured_and_is_on_the_page() -> None:
+    words = "missing: pip install '.[bench]'"
+    lines = {"others": {"bench": "others", **ABOUT, "postgresql": {"eventsource-py": words}}}
+    assert verdict("full spool → log against eventsource-py", lines) == Verdict("not measured", None)
+    assert f"| postgresql, eventsource-py | {words} |" in page(lines, [])
+
+
+def test_every_figure_is_on_the_page_with_its_path_and_a_spread_is_one() -> None:
+    figures = {
+        "sqlite": {"ours": {"median": 1234, "least": 1.5, "most": 2_000_000}},
+        "backlog": [1, 22],
+        "rates": [{"nodes": 10, "seconds": 2}],
+    }
+    assert list(rows_of(figures)) == [
+        ("sqlite, ours", "1,234 (least 1.5, most 2,000,000)"),
+        ("backlog", "1, 22"),
+        ("rates, 10, nodes", "10"),
+        ("rates, 10, seconds", "2"),
+    ]
+
+
+def test_what_is_measured_again_replaces_its_line_and_nothing_else(tmp_path: Path) -> None:
+    _note(tmp_path, "plan", plan(0.04, 0.0)["plan"])
+    _note(tmp_path, "hook", {"bench": "hook", **ABOUT})
+    _note(tmp_path, "plan", plan(0.02, 0.0)["plan"])
+    lines = _lines(tmp_path)
+    assert list(lines) == ["hook", "plan"]
+    assert lines["plan"]["with_thread"] == {"slower_by_median": 0.02}
+    assert "thread +2.0%" in (tmp_path / "figures.md").read_text()
+
+
+def test_every_run_names_a_script_that_is_there() -> None:
+    for run in RUNS:
+        assert (ROOT / "bench" / f"{run.script}.py").is_file()
