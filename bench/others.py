@@ -403,6 +403,8 @@ def main() -> None:
     asked = parser.parse_args()
     events, queued, turns = (1_000, 1_000, 1) if asked.quick else (asked.events, asked.queued, asked.turns)
     packages = ("eventsource-py", "eventsourcing", "persist-queue", "asyncpg", "psycopg")
+    gc.set_threshold(10_000)  # as `pycrorm writer` has it; for all of them
+    signal.signal(signal.SIGALRM, _give_up)
     answer: dict[str, Any] = {
         "bench": "others",
         "turns": turns,
