@@ -13,6 +13,7 @@ import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Settings
+from pycrorm_async.errors import CallerError
 from pycrorm_async.learning import (
     MoveAndPickUp,
     Policy,
@@ -28,7 +29,7 @@ from pycrorm_async.learning import (
 from pycrorm_async.learning.rollouts import BatchRolloutActionPerformable, randomness
 from pycrorm_async.orm import BatchRolloutAction, PickUpAction, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import collected_tree
-from pycrorm_async.world import Grasp, Pose
+from pycrorm_async.world import Grasp, ObjectType, Pose
 from pycrorm_async.world.robot import Limits
 from tests.learning.rollouts import works
 
@@ -239,6 +240,30 @@ async def test_a_fault_in_the_plan_ends_the_batch(tmp_path: Path) -> None:
         with pytest.raises(ZeroDivisionError):
             await batch_rollout(MoveAndPickUp(stage.target), 10, seed=1, reset=broken)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"first": -1}, {"count": -1}])
+async def test_what_cannot_be_counted_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(CallerError, match="are 0 or more, not"):
+        await rolled_out(**({"count": 1} | wrong))
+
+
+def test_scenes_that_differ_have_words_that_differ() -> None:
+    """By these words rollouts are told apart."""
+    scenes = [
+        Scene(),
+        Scene(object_type=ObjectType.BOWL),
+        Scene(name="bowl", object_type=ObjectType.BOWL),
+        Scene(position=(1.3, 1.0, 0.900001)),
+        Scene(yaw=1e-5),
+        Scene(yaw=1.00001e-5),
+        Scene(torso_height=0.3),
+        Scene(limits=Limits.HARD),
+        Scene(collisions=True),
+        Scene(kitchen=True),
+    ]
+    assert len({str(each) for each in scenes}) == len(scenes)
+    assert str(Scene()) == "milk at 1.3, 1, 0.9 m, torso at 0 m, soft limits"
 
 
 async def test_the_node_of_a_batch_has_its_rollouts_as_children() -> None:
