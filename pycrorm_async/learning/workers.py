@@ -71,7 +71,7 @@ class Job:
 
 
 class Workers:
-    """Processes that do rollouts.
+    """Processes that do rollouts. They are spawned: a script that uses them does so below `if __name__ == "__main__":`.
 
     >>> async with Workers(2, Place("sqlite:///learn.db")) as workers:
     ...     tally = await workers.roll_out(Job(Scene(), default_policy(), seed=69), [(0, 500), (500, 500)])

@@ -206,11 +206,11 @@ async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tm
 async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There are more than 500 here, but of the first 500 not all."""
+    """There are 500 here, but of the first 500 not all."""
     monkeypatch.setattr("pycrorm_async.learning.study.elsewhere", lambda _scene: ())
     place = Place(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
-        await workers.roll_out(Job(Scene(), default_policy(), 69), [(400, 300)])
+        await workers.roll_out(Job(Scene(), default_policy(), 69), [(400, 200)])
     small = replace(SMALL, rollouts=300, evaluate=20, held_out=60, workers=1, min_samples_leaf=5, resume=True)
     learned = await run(small, place)
     assert learned.default.tally.rollouts == 300
