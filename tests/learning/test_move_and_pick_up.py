@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from pycrorm_async.errors import ImpossibleCondition
+from pycrorm_async.errors import CallerError, ImpossibleCondition
 from pycrorm_async.learning import MoveAndPickUp, Policy, Rectangle, Region, Scene, default_policy
 from pycrorm_async.learning.grounding import free_and_visible, rectangles
 from pycrorm_async.learning.marginals import Linear
@@ -90,6 +90,8 @@ def test_arms_and_grasps_that_are_asked_for_are_the_only_ones(stage: Stage) -> N
     assert {each.grasp for each in action.plain()} == {Grasp.TOP, Grasp.LEFT}
     with pytest.raises(ImpossibleCondition):
         MoveAndPickUp(stage.target, [])
+    with pytest.raises(CallerError, match="at least one sample, not 0"):
+        MoveAndPickUp(stage.target, samples=0)
 
 
 def test_samples_that_fit_the_scene_are_clear_of_it_and_see_the_object(kitchen: Stage) -> None:
