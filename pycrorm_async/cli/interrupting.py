@@ -9,22 +9,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from pycrorm_async.cli.output import note, problem
+from pycrorm_async.cli.output import note, problem, stderr
 
 __all__ = ["Interrupting"]
 
 _SAY_S = 1.0
 _PATIENCE = 2
-"""A plan that is interrupted may have to wait for room to say so."""
+"""A plan that is interrupted may have to wait for room to say so, or to be broken off."""
 
 
 class Interrupting:
     """Once ends the plan, as asyncio does; then what it recorded is stored. Once more leaves at once.
 
     To be used in the loop's own thread. Nothing is lost by leaving: what is not in the database is in the spool.
+    With a `patience` of 1 there is no plan to break off: what is asked for the second time is to leave.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, patience: int = _PATIENCE) -> None:
+        self._patience = patience
         self._count = 0
         self._storing = False
 
@@ -36,13 +38,14 @@ class Interrupting:
 
         def told(_number: int, _frame: FrameType | None) -> None:
             self._count += 1
-            if self._storing or self._count > _PATIENCE:
+            if self._storing or self._count > self._patience:
+                stderr.show_cursor()  # a bar had hidden it
                 problem("interrupted; what is not stored yet is safe in the spool, and the next start brings it in")
                 os._exit(130)
             if self._count > 1:  # a plan that never suspends, or does not let itself be cancelled
                 raise KeyboardInterrupt
             task.cancel()
-            loop.call_soon_threadsafe(lambda: None)  # it may be asleep
+            loop.call_soon_threadsafe(self.ended if self._patience == 1 else lambda: None)  # it may be asleep
 
         before = signal.getsignal(signal.SIGINT)
         if before is not signal.default_int_handler and not _is_asyncios(before):  # ignored, or somebody else's

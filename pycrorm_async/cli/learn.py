@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pycrorm_async.cli.interrupting import Interrupting
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_facts, print_json, print_table
 from pycrorm_async.errors import CallerError, MissingExtra
@@ -130,19 +131,31 @@ def _check_files(policy: Path, figure: Path) -> None:
     if figure.suffix not in _PICTURES:
         raise CallerError(f"--figure {figure} must end in one of {', '.join(_PICTURES)}")
     for option, path in (("--policy", policy), ("--figure", figure)):
-        if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        if not _can_be_written(path):
             raise CallerError(f"{option} {path} cannot be written: choose another place")
+    if policy.resolve() == figure.resolve():
+        raise CallerError(f"--policy and --figure are both {policy}: choose another place for one")
+
+
+def _can_be_written(path: Path) -> bool:
+    """Whether files can be made beside it, and it is not in the way. Its name has to be text: it is told as JSON."""
+    try:
+        str(path).encode()
+        return not path.is_dir() and os.access(path.parent, os.W_OK) and (not path.exists() or os.access(path, os.W_OK))
+    except (OSError, UnicodeEncodeError):
+        return False
 
 
 async def _learned(
     experiment: Experiment, place: Place, study_rollouts: int, watch: Callable[..., None]
 ) -> tuple[Learned, InKitchen, Study | None]:
-    learned = await experiments.run(experiment, place, watch)
-    studied = None
-    if study_rollouts:
-        studied = await study(experiment, learned, place, rollouts=study_rollouts, watch=watch)
-    kitchen = replace(KITCHEN, limits=experiment.scene.limits)
-    return learned, await pick_up_in_kitchen(learned.policy, place, seed=experiment.seed, scene=kitchen), studied
+    with Interrupting(patience=1).heeded():
+        learned = await experiments.run(experiment, place, watch)
+        studied = None
+        if study_rollouts:
+            studied = await study(experiment, learned, place, rollouts=study_rollouts, watch=watch)
+        kitchen = replace(KITCHEN, limits=experiment.scene.limits)
+        return learned, await pick_up_in_kitchen(learned.policy, place, seed=experiment.seed, scene=kitchen), studied
 
 
 # --- telling it -----------------------------------------------------------------------------------------------
@@ -169,7 +182,7 @@ def _print(learned: Learned, in_kitchen: InKitchen, studied: Study | None) -> No
         "Learned",
         {
             "from": f"{len(learned.successes):,} successes, {len(learned.policy.leaves)} leaves",
-            "coverage": f"{learned.coverage:.1%} of the held-out successes are possible under the learned policy",
+            "coverage": _coverage(learned),
             "kitchen": _kitchen(in_kitchen),
         },
     )
@@ -182,7 +195,7 @@ def _print_study(studied: Study) -> None:
         "What is learned from fewer rollouts",
         ("rollouts", "successes", "succeeded", "95 % interval", "coverage"),
         [
-            (each.rollouts, each.successes, _percent(each.tally), _interval(each.tally), f"{each.coverage:.1%}")
+            (each.rollouts, each.successes, _percent(each.tally), _interval(each.tally), _share(each.coverage))
             for each in studied.curve
         ],
     )
@@ -210,6 +223,16 @@ def _kitchen(found: InKitchen) -> str:
     x, y, _ = found.done.standing_position.position
     how = f"with the {found.done.arm.name} arm from {found.done.grasp.name}, standing at {x:.2f}, {y:.2f} m"
     return f"picked up at try {found.tries}, {how}"
+
+
+def _coverage(learned: Learned) -> str:
+    if learned.coverage is None:
+        return "unknown: none of the held-out rollouts succeeded; see with a larger --held-out and --resume"
+    return f"{learned.coverage:.1%} of the held-out successes are possible under the learned policy"
+
+
+def _share(coverage: float | None) -> str:
+    return "" if coverage is None else f"{coverage:.1%}"
 
 
 def _percent(tally: Tally) -> str:

@@ -20,7 +20,7 @@ from pycrorm_async.learning.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policy_file import name_of
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.scene import Scene
-from pycrorm_async.learning.tree import learn
+from pycrorm_async.learning.tree import check_leaf, learn
 from pycrorm_async.learning.workers import AT_ONCE, Job, Place, Workers
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.world.enums import Arms, Grasp
@@ -28,7 +28,7 @@ from pycrorm_async.world.enums import Arms, Grasp
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Experiment", "Phase", "Learned", "Watch", "run", "known", "choices_of", "HELD_OUT_SEED"]
+__all__ = ["Experiment", "Phase", "Learned", "Watch", "run", "known", "coverage_of", "HELD_OUT_SEED"]
 
 HELD_OUT_SEED = 1_000_003
 """Added to the experiment's seed for the default rollouts that nothing is learned from."""
@@ -65,9 +65,10 @@ class Experiment:
     resume: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("rollouts", "rounds", "evaluate", "held_out"):
+        for name in ("rollouts", "rounds", "evaluate", "held_out", "workers"):
             if getattr(self, name) < 1:
                 raise CallerError(f"an experiment has at least one of {name.replace('_', '-')}")
+        check_leaf(self.min_samples_leaf)
         if not 0 <= self.seed < 2**62:
             raise CallerError("a seed is a whole number from 0 on, below 2**62")
 
@@ -110,13 +111,13 @@ class Learned:
         phases: default rollouts, further rounds, evaluation, held out.
         policy: the last one; `leaves` of its tree.
         successes: the choices it was learned from.
-        coverage: the share of the held-out successes that it could have made.
+        coverage: the share of the held-out successes that it could have made; None if there is none.
     """
 
     phases: tuple[Phase, ...]
     policy: Policy
     successes: tuple[PickUpChoice, ...]
-    coverage: float
+    coverage: float | None
 
     @property
     def default(self) -> Phase:
@@ -144,26 +145,23 @@ class _Rolling:
     async def phase(self, name: str, policy: Policy, seed: int, count: int) -> pd.DataFrame:
         """The rollouts 0 to `count` under this policy; those that are not remembered are done first."""
         experiment = self._experiment
-        found = await known(self._reading, experiment.scene, name_of(policy), seed)
-        if len(found) and not experiment.resume:
+        before = await known(self._reading, experiment.scene, name_of(policy), seed, count)
+        if len(before) and not experiment.resume:
             raise CallerError(
-                f"{len(found):,} rollouts of this experiment are remembered already (seed {experiment.seed},"
+                f"{len(before):,} rollouts of this experiment are remembered already (seed {experiment.seed},"
                 f" {experiment.scene}): go on with --resume, or take another --seed or --url"
             )
-        before = found[found["index"] < count]
-        runs = list(remembered.missing(before["index"], count, at_once=AT_ONCE))
-        began, already = time.monotonic(), remembered.tally_of(before)
-        counted = Tally()
-        if runs:
+        began, already, counted = time.monotonic(), remembered.tally_of(before), Tally()
+        frame = before
+        if len(before) < count:
             job = Job(experiment.scene, policy, seed, episode_each=experiment.episode_each)
+            runs = remembered.missing(before["index"], count, at_once=AT_ONCE)
             counted = await self._workers.roll_out(
                 job, runs, lambda tally: self._watch(name, len(before) + tally.rollouts, count, already + tally)
             )
         seconds = time.monotonic() - began
-        frame = before
-        if runs:
-            frame = await known(self._reading, experiment.scene, name_of(policy), seed)
-            frame = frame[frame["index"] < count]
+        if counted.rollouts:
+            frame = await known(self._reading, experiment.scene, name_of(policy), seed, count)
         tally = remembered.tally_of(frame)
         if tally != already + counted or tally.rollouts != count:
             raise InternalError(f"{name}: {already + counted} was counted, {tally} is remembered")
@@ -206,14 +204,13 @@ async def run(experiment: Experiment, place: Place, watch: Watch = lambda *_: No
             tuple(rolling.phases),
             policy,
             tuple(choice for frame in frames for choice in choices_of(frame)),
-            policy.coverage(choices_of(remembered.successes(held_out))),
+            coverage_of(held_out, policy),
         )
 
 
 @asynccontextmanager
 async def _rolling(experiment: Experiment, place: Place, watch: Watch) -> AsyncIterator[_Rolling]:
-    if experiment.resume:
-        await recover(place.url, spool=place.spool)  # what a killed worker had not handed over
+    await recover(place.url, spool=place.spool)  # what killed workers had not handed over; it makes the tables too
     async with Workers(experiment.workers, place) as workers, Reading.open(place.url) as reading:
         yield _Rolling(experiment, workers, reading, watch)
 
@@ -224,10 +221,17 @@ def _learned(frames: Sequence[pd.DataFrame], experiment: Experiment) -> Policy:
     return learn(pd.concat(frames), min_samples_leaf=experiment.min_samples_leaf)
 
 
-async def known(reading: Reading, scene: Scene, policy: str, seed: int) -> pd.DataFrame:
-    """The rollouts that are remembered, each once."""
+async def known(reading: Reading, scene: Scene, policy: str, seed: int, count: int) -> pd.DataFrame:
+    """Those of the rollouts 0 to `count` that are remembered, each once."""
     question = remembered.rollouts_question(scene=str(scene), seed=seed, policy=policy)
-    return remembered.once(await reading.dataframe(question))
+    frame = remembered.once(await reading.dataframe(question))
+    return frame[frame["index"] < count]
+
+
+def coverage_of(held_out: pd.DataFrame, policy: Policy) -> float | None:
+    """The share of these rollouts' successes that the policy could have made; None if there is none."""
+    choices = choices_of(remembered.successes(held_out))
+    return policy.coverage(choices) if choices else None
 
 
 def choices_of(frame: pd.DataFrame) -> list[PickUpChoice]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from sqlalchemy import Select, select
 
-from pycrorm_async.errors import ImpossibleCondition
+from pycrorm_async.errors import CallerError, ImpossibleCondition
 from pycrorm_async.learning.default_policy import default_policy
 from pycrorm_async.learning.evidence import Evidence
 from pycrorm_async.learning.grounding import free_and_visible
@@ -44,7 +44,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         samples: how many alternatives there are.
         rng: where chance comes from; left out, a new one that nobody can repeat.
 
-    Raises `ImpossibleCondition` if the policy never does it with such an arm or grasp.
+    Raises `ImpossibleCondition` if the policy never does it with such an arm or grasp, `CallerError` for no samples.
     """
 
     def __init__(
@@ -58,6 +58,8 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         rng: np.random.Generator | None = None,
     ) -> None:
         super().__init__(MoveAndPickUpPerformable)
+        if samples < 1:
+            raise CallerError(f"there is at least one sample, not {samples}")
         self.target = target.resolve() if isinstance(target, ObjectDesignatorDescription) else designator_of(target)
         wanted = Evidence(
             arms=frozenset(arms) if arms is not None else None,

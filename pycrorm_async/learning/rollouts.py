@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import Policy
 from pycrorm_async.learning.policy_file import name_of
@@ -98,8 +99,11 @@ async def batch_rollout(
         stop: asked before each rollout whether to end here.
         tell: is told after each rollout how they went so far; left out, a bar shows it, where stderr is a terminal.
 
-    Raises whatever is no `PlanFailure`: a plan may fail, a fault in it ends the batch.
+    Raises `CallerError` for a count, index or seed below 0, and whatever is no `PlanFailure`: a plan may fail, a fault
+    in it ends the batch.
     """
+    if min(count, first, seed) < 0:
+        raise CallerError(f"count, first and seed of rollouts are 0 or more, not {count}, {first} and {seed}")
     tally = Tally()
     with _shown(count) if tell is None else nullcontext(tell) as told:
         run = _Run(action, action.policy_here(), reset or world_here().reset, stop, tally, told)

@@ -41,11 +41,13 @@ class Scene:
     kitchen: bool = False
 
     def __str__(self) -> str:
-        x, y, z = self.position
-        parts = [f"{self.name} at {x:g}, {y:g}, {z:g} m"]
+        """In words, by which the rollouts in it are found again: no two scenes have the same."""
+        kind = self.object_type.name.lower()
+        what = kind if self.name == kind else f"{self.name} ({kind})"
+        parts = [f"{what} at {', '.join(map(_digits, self.position))} m"]
         if self.yaw:
-            parts.append(f"turned by {math.degrees(self.yaw):g}°")
-        parts.append(f"torso at {self.torso_height:g} m")
+            parts.append(f"turned by {_digits(math.degrees(self.yaw))}°")
+        parts.append(f"torso at {_digits(self.torso_height)} m")
         parts.append(f"{self.limits.name.lower()} limits")
         if self.collisions:
             parts.append("collisions count")
@@ -81,3 +83,7 @@ class Stage:
         description = self.robot.robot_description
         if self.scene.torso_height and description is not None:
             self.robot.set_joint_position(description.torso_joint, self.scene.torso_height)
+
+
+def _digits(number: float) -> str:
+    return f"{number:.9g}"

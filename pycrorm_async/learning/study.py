@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from pycrorm_async.errors import InternalError, NotEnoughExperience
 from pycrorm_async.learning import remembered
 from pycrorm_async.learning.default_policy import default_policy
-from pycrorm_async.learning.experiment import Experiment, Learned, Phase, Watch, choices_of, known
+from pycrorm_async.learning.experiment import Experiment, Learned, Phase, Watch, coverage_of, known
 from pycrorm_async.learning.policy import Policy
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.scene import Scene
@@ -41,7 +41,7 @@ class CurvePoint:
     rollouts: int
     successes: int
     tally: Tally
-    coverage: float
+    coverage: float | None
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def elsewhere(scene: Scene) -> tuple[Scene, ...]:
         replace(raised, position=(x, y, 1.04)),
         replace(raised, position=(x, y, 1.2)),
         replace(scene, name="bowl", object_type=ObjectType.BOWL),
-        replace(scene, collisions=True),
+        replace(scene, collisions=not scene.collisions),
     )
 
 
@@ -96,7 +96,7 @@ async def study(experiment: Experiment, learned: Learned, place: Place, *, rollo
     """Tries each so often. Raises `WorkerLost`, and `InternalError` if remembering changed what happened."""
     async with Reading.open(place.url) as reading:
         default, evaluation, held_out = [
-            await known(reading, experiment.scene, phase.policy, phase.seed)
+            await known(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
             for phase in (learned.default, learned.evaluation, learned.held_out)
         ]
     async with Workers(experiment.workers, None) as workers:
@@ -134,9 +134,8 @@ class _Trying:
                 policy = learn(successes, min_samples_leaf=self._experiment.min_samples_leaf)
             except NotEnoughExperience:
                 continue
-            coverage = policy.coverage(choices_of(remembered.successes(held_out)))
             tally = await self._tried(f"learned from {size:,} rollouts", self._experiment.scene, policy)
-            yield CurvePoint(size, len(successes), tally, coverage)
+            yield CurvePoint(size, len(successes), tally, coverage_of(held_out, policy))
 
     async def elsewhere(self, scene: Scene, policy: Policy) -> Elsewhere:
         default = await self._tried(f"default policy: {scene}", scene, default_policy())

@@ -29,7 +29,7 @@ from pycrorm_async.learning.policy import ARMS, GRASPS, Leaf, Policy
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["learn"]
+__all__ = ["learn", "check_leaf"]
 
 SYMBOLS: dict[str, Sequence[Enum]] = {"arm": ARMS, "grasp": GRASPS}
 PLACE = ("object_x", "object_y")
@@ -57,8 +57,7 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
         CallerError: columns that are missing, labels that are no arm or grasp, numbers that are missing or infinite.
         MissingExtra: pyjpt is not installed.
     """
-    if min_samples_leaf < 2:
-        raise CallerError(f"a leaf needs two samples or more, not min_samples_leaf={min_samples_leaf}")
+    check_leaf(min_samples_leaf)
     if len(successes) < min_samples_leaf:
         message = f"{len(successes)} successes are too few to learn from: a leaf takes {min_samples_leaf}"
         raise NotEnoughExperience(f"{message}; try more, or with a smaller min_samples_leaf")
@@ -72,6 +71,12 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
         else:
             columns[HEIGHT] = heights
     return Policy(tuple(_fitted(columns, min_samples_leaf)), constant_height=constant_height)
+
+
+def check_leaf(min_samples_leaf: int) -> None:
+    """Raises `CallerError` for leaves in which nothing can be distributed."""
+    if min_samples_leaf < 2:
+        raise CallerError(f"a leaf needs two samples or more, not min_samples_leaf={min_samples_leaf}")
 
 
 def _fitted(columns: dict[str, Any], min_samples_leaf: int) -> list[Leaf]:

@@ -22,7 +22,7 @@ from typing import Any, Self
 
 from pycrorm_async.config import Settings
 from pycrorm_async.daemon import serve
-from pycrorm_async.errors import CallerError, PycrormError, SpoolTaken
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, PycrormError, SpoolTaken
 from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.policy import Policy
 from pycrorm_async.learning.policy_file import name_of
@@ -36,6 +36,8 @@ AT_ONCE = 500
 """A worker is given so many rollouts at once: they are one episode."""
 _TELL_S = 0.2
 _LOOK_S = 0.02
+_TAKE_OVER_S = 1.0
+"""So often it is looked whether another daemon has left."""
 _SETTINGS = Settings(flush_timeout_s=120)
 _log = logging.getLogger(__name__)
 
@@ -69,7 +71,7 @@ class Job:
 
 
 class Workers:
-    """Processes that do rollouts.
+    """Processes that do rollouts. They are spawned: a script that uses them does so below `if __name__ == "__main__":`.
 
     >>> async with Workers(2, Place("sqlite:///learn.db")) as workers:
     ...     tally = await workers.roll_out(Job(Scene(), default_policy(), seed=69), [(0, 500), (500, 500)])
@@ -82,6 +84,7 @@ class Workers:
         self._count = count
         self._place = place
         self._links: list[_Link] = []
+        self._is_free = False
         self._stack = AsyncExitStack()
         self._check_daemon: Callable[[], None] = lambda: None
 
@@ -90,7 +93,9 @@ class Workers:
             if self._place is not None:
                 self._check_daemon = await self._stack.enter_async_context(_daemon(self._place))
             with _uninterrupted():
-                self._links = [_Link.started(self._place) for _ in range(self._count)]
+                for _ in range(self._count):
+                    self._links.append(_Link.started(self._place))
+            self._is_free = True
         except BaseException:
             await self._end()
             raise
@@ -101,6 +106,7 @@ class Workers:
 
     async def _end(self) -> None:
         """Every worker ends what it is at, hands over what it recorded, and leaves; then the daemon drains the rest."""
+        self._is_free = False
         for link in self._links:
             link.leave()
         for link in self._links:
@@ -112,8 +118,15 @@ class Workers:
     ) -> Tally:
         """Does these runs of indexes (first, length); returns when all is done and, if remembered, in the tables.
 
-        Cancelled, the workers stop after the rollout they are at; what was done is remembered. Raises `WorkerLost`.
+        Cancelled, the workers stop after the rollout they are at; what was done is remembered.
+
+        Raises:
+            WorkerLost: one died or raised; what was done is remembered.
+            CallerError: these workers are not started, at another job, or were interrupted in one.
         """
+        if not self._is_free:
+            raise CallerError("workers do one job at a time, and none after one that was interrupted: start others")
+        self._is_free = False
         waiting = iter(runs)
         tallies = {link: Tally() for link in self._links}
         ended = Tally()
@@ -138,6 +151,7 @@ class Workers:
             raise
         if job.remembered:
             await self._flushed()
+        self._is_free = True
         return ended
 
     async def _flushed(self) -> None:
@@ -216,30 +230,45 @@ def _uninterrupted() -> Iterator[None]:
 
 @asynccontextmanager
 async def _daemon(place: Place) -> AsyncIterator[Callable[[], None]]:
-    """Drains the workers' recorders while the context lasts; where another daemon does so already, that one does.
+    """Drains the workers' recorders while the context lasts; while another daemon does so, that one does.
 
     Gives a function that raises what stopped it. Raises as `serve` does.
     """
     leave, ready = asyncio.Event(), asyncio.Event()
 
-    def say(line: str) -> None:
-        _log.info(line)
-        ready.set()
-
     def check() -> None:
-        if task.done() and not isinstance(task.exception(), SpoolTaken):
+        if task.done():
             task.result()
 
-    task = asyncio.create_task(serve(place.url, spool=place.spool, leave=leave, say=say), name="pycrorm daemon")
+    task = asyncio.create_task(_drained(place, leave, ready), name="pycrorm daemon")
     task.add_done_callback(lambda _: ready.set())
-    await ready.wait()
-    check()
     try:
+        await ready.wait()
+        check()
         yield check
     finally:
         leave.set()
         await asyncio.wait([task])
         check()
+
+
+async def _drained(place: Place, leave: asyncio.Event, ready: asyncio.Event) -> None:
+    """Until told to leave; `ready` once somebody drains. Raises as `serve` does, but for `SpoolTaken`."""
+
+    def say(line: str) -> None:
+        _log.info(line)
+        ready.set()
+
+    while not leave.is_set():
+        try:
+            await serve(place.url, spool=place.spool, leave=leave, say=say)
+        except SpoolTaken:
+            ready.set()
+        except DatabaseUnavailable:
+            if not ready.is_set():
+                raise
+        with suppress(TimeoutError):
+            await asyncio.wait_for(leave.wait(), _TAKE_OVER_S)
 
 
 # --- in the worker --------------------------------------------------------------------------------------------
@@ -250,9 +279,7 @@ def _work(pipe: Connection, place: Place | None) -> None:
     logging.disable(logging.WARNING)
     try:
         asyncio.run(_working(pipe, place))
-    except (EOFError, OSError):
-        return
-    except Exception as error:  # noqa: BLE001  told to who started it, in one line
+    except Exception as error:  # noqa: BLE001  told to who started it, in one line, if he is still there
         with suppress(OSError):
             pipe.send(("failed", f"{type(error).__name__}: {error}"))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from collections.abc import Set as AbstractSet
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -24,15 +23,14 @@ def touched_at(
     *,
     links: Collection[str],
     carried: Iterable[Object] = (),
-    ignore: AbstractSet[Object] = frozenset(),
 ) -> list[tuple[str, Object]]:
     """What these links of the robot, and what they carry, would reach into with these joints (rad or m) there.
 
     Pairs of a link, or the name of what is carried, and the object it meets. Nothing is moved. The floor, the robot
-    itself, what hangs on it and `ignore` do not count.
+    itself and what hangs on it do not count.
     """
     attached = robot.world.attachments.below(robot)
-    others = [each for each in robot.world.objects if each is not robot and each not in attached and each not in ignore]
+    others = [each for each in robot.world.objects if each is not robot and each not in attached]
     found: list[tuple[str, Object]] = []
     with _as_if(robot, positions, carried):
         for other in others:

@@ -77,10 +77,33 @@ def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=120)
     assert process.returncode == 130, said
-    assert said.strip() == "pycrorm: interrupted; what was recorded up to here is kept"
+    *note, told = said.strip().splitlines()
+    assert told == "pycrorm: interrupted; what was recorded up to here is kept"
+    assert note in ([], ["what was recorded is being stored. Ctrl-C again leaves at once, and loses nothing"])
     document = answer(*SMALL, *longer, "--resume", cwd=tmp_path)
     assert [each["rollouts"] for each in document["phases"]] == [2_500, 150, 150]
     assert 0 < document["phases"][0]["done_now"] < 2_500
+
+
+def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: Path) -> None:
+    command = [*COMMAND, *SMALL, "--rollouts", "100000", "--json"]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        time.sleep(0.1)
+        if (tmp_path / "pycrorm.db").exists() and ask(tmp_path / "pycrorm.db", "SELECT count(*) FROM event") > [(500,)]:
+            break
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.2)
+    printed, said = process.communicate(timeout=120)
+    assert (process.returncode, printed) == (130, "")
+    line = "interrupted; what is not stored yet is safe in the spool, and the next start brings it in"
+    assert said.strip() == f"pycrorm: {line}"
+    phase = answer(*SMALL, "--resume", cwd=tmp_path)["phases"][0]
+    assert (phase["rollouts"], phase["done_now"] < 400) == (400, True)
 
 
 @pytest.mark.parametrize(
@@ -92,6 +115,9 @@ def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path
         (("--figure", "policies.doc"), 2, "--figure policies.doc must end in one of .png, .svg, .pdf"),
         (("--policy", "/nowhere/policy.json"), 2, "--policy /nowhere/policy.json cannot be written"),
         (("--figure", "folder.png"), 2, "--figure folder.png cannot be written"),
+        (("--policy", "x" * 300), 2, "cannot be written"),
+        (("--policy", "\udcff.json"), 2, "cannot be written"),
+        (("--policy", "both.png", "--figure", "folder.png/../both.png"), 2, "are both both.png"),
         (("--rollouts", "30"), 2, "successes are too few to learn from"),
     ],
 )

@@ -13,12 +13,13 @@ import psutil
 import pytest
 
 from pycrorm_async import Reading
+from pycrorm_async.daemon import serve
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.learning import Scene, default_policy, name_of, remembered
 from pycrorm_async.learning.experiment import Experiment, Learned, known, run
 from pycrorm_async.learning.kitchen import pick_up_in_kitchen
 from pycrorm_async.learning.rollouts import Tally
-from pycrorm_async.learning.study import study
+from pycrorm_async.learning.study import elsewhere, study
 from pycrorm_async.learning.workers import Job, Place, WorkerLost, Workers
 from pycrorm_async.orm import MoveAndPickUpAction
 from tests.databases import ask, await_events
@@ -57,6 +58,7 @@ async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_ofte
     assert [each.seed for each in learned.phases] == [69, 70, 69 + 1_000_003]
     assert 0.11 < learned.default.tally.success_rate < 0.21
     assert learned.evaluation.tally.success_rate > 0.4
+    assert learned.coverage is not None
     assert learned.coverage > 0.6
     assert len(learned.successes) == learned.default.tally.successes
     assert learned.default.grasps["TOP"].successes == 0
@@ -99,9 +101,8 @@ async def finished(experiment: Experiment, place: Place) -> Learned:
     learned = await run(replace(experiment, resume=True), place)
     for phase in learned.phases:
         async with Reading.open(place.url) as reading:
-            frame = await known(reading, experiment.scene, phase.policy, phase.seed)
-        done = [each for each in sorted(frame["index"]) if each < phase.tally.rollouts]
-        assert done == list(range(phase.tally.rollouts))
+            frame = await known(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
+        assert sorted(frame["index"]) == list(range(phase.tally.rollouts))
     async with Workers(1, None) as workers:
         job = Job(experiment.scene, default_policy(), experiment.seed, remembered=False)
         undisturbed = await workers.roll_out(job, [(0, experiment.rollouts)])
@@ -119,7 +120,7 @@ async def test_a_worker_that_is_killed_is_told_and_resumed_nothing_is_lost_or_co
         await run(SMALL, place, after(300, kill_one))
     assert not workers_running()
     async with Reading.open(place.url) as reading:
-        before = await known(reading, Scene(), name_of(default_policy()), 69)
+        before = await known(reading, Scene(), name_of(default_policy()), 69, 700)
     learned = await finished(SMALL, place)
     assert 0 < learned.default.done_now < 700
     assert len(before) > 0
@@ -153,12 +154,83 @@ async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is
     await finished(replace(SMALL, workers=1, evaluate=50, held_out=50), Place(url))
 
 
+async def test_the_one_who_drains_may_leave_and_what_comes_after_is_drained_too(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    job = Job(Scene(), default_policy(), 5)
+    leave, ready = asyncio.Event(), asyncio.Event()
+    other = asyncio.create_task(serve(place.url, spool=None, leave=leave, say=lambda _: ready.set()))
+    await ready.wait()
+    async with Workers(1, place) as workers:
+        await workers.roll_out(job, [(0, 10)])
+        leave.set()
+        assert (await other).records > 0
+        async with asyncio.timeout(60):
+            await workers.roll_out(job, [(10, 10)])  # returns when it is in the tables
+    async with Reading.open(place.url) as reading:
+        assert len(await known(reading, Scene(), name_of(default_policy()), 5, 20)) == 20
+
+
+async def test_of_experiments_on_one_memory_the_one_that_is_over_first_leaves_the_other_at_work(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    small = replace(SMALL, rollouts=150, evaluate=20, held_out=60, workers=1, min_samples_leaf=5)
+    first, second = await asyncio.gather(run(small, place), run(replace(small, seed=70, rollouts=500), place))
+    assert [each.tally.rollouts for each in first.phases] == [150, 20, 60]
+    assert [each.tally.rollouts for each in second.phases] == [500, 20, 60]
+
+
+async def test_workers_that_are_not_free_take_no_job() -> None:
+    job = Job(Scene(), default_policy(), 5, remembered=False)
+    workers = Workers(1, None)
+    with pytest.raises(CallerError, match="workers do one job at a time"):
+        await workers.roll_out(job, [(0, 5)])
+    async with workers:
+        one = asyncio.create_task(workers.roll_out(job, [(0, 100_000)]))
+        await asyncio.sleep(0)
+        with pytest.raises(CallerError, match="workers do one job at a time"):
+            await workers.roll_out(job, [(0, 5)])
+        one.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await one
+        with pytest.raises(CallerError, match="none after one that was interrupted: start others"):
+            await workers.roll_out(job, [(0, 5)])
+
+
+async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tmp_path: Path) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    tiny = replace(SMALL, rollouts=150, evaluate=20, held_out=1, workers=1, min_samples_leaf=5)
+    learned = await run(tiny, place)
+    assert learned.held_out.tally.successes == 0
+    assert learned.coverage is None
+
+
+async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """There are 500 here, but of the first 500 not all."""
+    monkeypatch.setattr("pycrorm_async.learning.study.elsewhere", lambda _scene: ())
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    async with Workers(1, place) as workers:
+        await workers.roll_out(Job(Scene(), default_policy(), 69), [(400, 200)])
+    small = replace(SMALL, rollouts=300, evaluate=20, held_out=60, workers=1, min_samples_leaf=5, resume=True)
+    learned = await run(small, place)
+    assert learned.default.tally.rollouts == 300
+    studied = await study(small, learned, place, rollouts=5, watch=lambda *_: None)
+    assert studied.curve == ()
+
+
+@pytest.mark.parametrize("collisions", [True, False])
+def test_a_policy_is_tried_elsewhere_with_collisions_and_without(collisions: bool) -> None:
+    scenes = elsewhere(Scene(collisions=collisions))
+    assert len(set(scenes)) == len(scenes)
+    assert replace(scenes[0], collisions=not collisions) in scenes
+
+
 async def test_too_few_successes_are_told_and_all_rollouts_kept(tmp_path: Path) -> None:
     place = Place(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(NotEnoughExperience, match="too few to learn from"):
         await run(replace(SMALL, rollouts=40, workers=1), place)
     async with Reading.open(place.url) as reading:
-        frame = await known(reading, Scene(), name_of(default_policy()), 69)
+        frame = await known(reading, Scene(), name_of(default_policy()), 69, 700)
     assert len(frame) == 40
 
 
@@ -177,7 +249,7 @@ async def test_each_rollout_may_be_an_episode(tmp_path: Path) -> None:
         tally = await workers.roll_out(job, [(0, 15), (15, 15)])
         assert ask(place.url, "SELECT count(*) FROM process_metadata") == [(30,)]
     async with Reading.open(place.url) as reading:
-        frame = await known(reading, Scene(), name_of(default_policy()), 5)
+        frame = await known(reading, Scene(), name_of(default_policy()), 5, 30)
     assert remembered.tally_of(frame) == tally
 
 
@@ -190,7 +262,7 @@ async def test_what_is_not_to_be_remembered_leaves_no_trace_beside_what_is(tmp_p
         assert await workers.roll_out(job, [(0, 30)]) == forgotten
         await workers.roll_out(replace(job, remembered=False), [(0, 30)])
     async with Reading.open(place.url) as reading:
-        assert len(await known(reading, Scene(), name_of(default_policy()), 5)) == 30
+        assert len(await known(reading, Scene(), name_of(default_policy()), 5, 30)) == 30
 
 
 async def test_what_a_worker_raises_is_told_in_one_line(tmp_path: Path) -> None:
@@ -204,6 +276,10 @@ async def test_what_a_worker_raises_is_told_in_one_line(tmp_path: Path) -> None:
 def test_what_cannot_be_an_experiment_is_refused() -> None:
     with pytest.raises(CallerError, match="at least one of held-out"):
         Experiment(held_out=0)
+    with pytest.raises(CallerError, match="at least one of workers"):
+        Experiment(workers=0)
+    with pytest.raises(CallerError, match="a leaf needs two samples or more"):
+        Experiment(min_samples_leaf=1)
     with pytest.raises(CallerError, match="a seed is"):
         Experiment(seed=-1)
     with pytest.raises(CallerError, match="at least one worker"):

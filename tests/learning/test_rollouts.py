@@ -13,6 +13,7 @@ import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Settings
+from pycrorm_async.errors import CallerError
 from pycrorm_async.learning import (
     MoveAndPickUp,
     Policy,
@@ -28,7 +29,7 @@ from pycrorm_async.learning import (
 from pycrorm_async.learning.rollouts import BatchRolloutActionPerformable, randomness
 from pycrorm_async.orm import BatchRolloutAction, PickUpAction, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import collected_tree
-from pycrorm_async.world import Grasp, Pose
+from pycrorm_async.world import Grasp, ObjectType
 from pycrorm_async.world.robot import Limits
 from tests.learning.rollouts import works
 
@@ -180,7 +181,11 @@ async def test_told_to_stop_it_ends_before_the_next_one(tmp_path: Path) -> None:
         assert (await rolled_out(5, stop=lambda: True)).rollouts == 0
 
 
-async def test_what_is_interrupted_in_the_middle_does_not_count_and_is_done_again(tmp_path: Path) -> None:
+async def test_what_is_interrupted_in_the_middle_does_not_count_and_is_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the middle of its pick-up: a rollout that did not get that far has no row to be counted."""
+
     class Enough(BaseException):
         pass
 
@@ -194,14 +199,15 @@ async def test_what_is_interrupted_in_the_middle_does_not_count_and_is_done_agai
                 attempts += 1
                 stage.reset()
                 if attempts == 4:
-                    stage.robot.set_pose = raising  # type: ignore[method-assign,assignment]
+                    monkeypatch.setattr("pycrorm_async.plan.simulated.solve", raising)
 
-            def raising(_pose: Pose) -> None:
+            def raising(*_: object, **__: object) -> None:
                 raise Enough
 
             with pytest.raises(Enough):
                 await batch_rollout(action, 10, seed=69, scene=str(Scene()), reset=reset)
         assert (await frame_of(memory))["index"].tolist() == [0, 1, 2, 3]
+        monkeypatch.undo()
         await rolled_out(6, first=4)
         frame = await frame_of(memory)
         assert frame["index"].tolist() == list(range(10))
@@ -239,6 +245,30 @@ async def test_a_fault_in_the_plan_ends_the_batch(tmp_path: Path) -> None:
         with pytest.raises(ZeroDivisionError):
             await batch_rollout(MoveAndPickUp(stage.target), 10, seed=1, reset=broken)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"first": -1}, {"count": -1}])
+async def test_what_cannot_be_counted_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(CallerError, match="are 0 or more, not"):
+        await rolled_out(**({"count": 1} | wrong))
+
+
+def test_scenes_that_differ_have_words_that_differ() -> None:
+    """By these words rollouts are told apart."""
+    scenes = [
+        Scene(),
+        Scene(object_type=ObjectType.BOWL),
+        Scene(name="bowl", object_type=ObjectType.BOWL),
+        Scene(position=(1.3, 1.0, 0.900001)),
+        Scene(yaw=1e-5),
+        Scene(yaw=1.00001e-5),
+        Scene(torso_height=0.3),
+        Scene(limits=Limits.HARD),
+        Scene(collisions=True),
+        Scene(kitchen=True),
+    ]
+    assert len({str(each) for each in scenes}) == len(scenes)
+    assert str(Scene()) == "milk at 1.3, 1, 0.9 m, torso at 0 m, soft limits"
 
 
 async def test_the_node_of_a_batch_has_its_rollouts_as_children() -> None:
