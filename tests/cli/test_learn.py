@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -90,11 +91,7 @@ def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: P
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline:
-        time.sleep(0.1)
-        if (tmp_path / "pycrorm.db").exists() and ask(tmp_path / "pycrorm.db", "SELECT count(*) FROM event") > [(500,)]:
-            break
+    await_events(tmp_path / "pycrorm.db", 500)
     for _ in range(2):
         process.send_signal(signal.SIGINT)
         time.sleep(0.2)
