@@ -127,7 +127,7 @@ def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> Chose
     >>> with simulated_robot_within(Limits.HARD):
     ...     await MoveTCPMotion(Pose([0.9495, 0.188, 0.790675]), Arms.LEFT).perform()
     """
-    name = f"simulated ({limits.name.lower()} limits{', no collisions' if collisions else ''})"
+    name = f"simulated ({limits.name.lower()} limits{', minding collisions' if collisions else ''})"
     return ChosenRobot(name, SimulatedModules(limits, collisions=collisions), limits=limits)
 
 

@@ -176,7 +176,7 @@ async def test_a_hand_that_minds_collisions_fails_where_its_arm_would_be_in_some
     await NavigateActionPerformable(Pose([0.62, 0.2, 0])).perform()
     before = scene.robot.joint_positions()
     with simulated_robot_within(Limits.SOFT, collisions=True) as robot:
-        assert repr(robot) == "<simulated (soft limits, no collisions) robot>"
+        assert repr(robot) == "<simulated (soft limits, minding collisions) robot>"
         with pytest.raises(ManipulationGoalInCollision, match="LEFT arm would be in kitchen") as failed:
             await MoveTCPMotion(goal, Arms.LEFT).perform()
     part, thing = failed.value.data
