@@ -1,4 +1,4 @@
-"""The simulated robot: motions as exact jumps of the robot in the world. No time, no noise, no collisions.
+"""The simulated robot: motions as exact jumps of the robot in the world. No time, no noise, collisions if asked for.
 
 A motion either has its whole effect, which the world tells once for each thing that moved, or fails and has none.
 """
