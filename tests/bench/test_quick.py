@@ -25,6 +25,7 @@ def measured(script: str, *options: str) -> dict[str, Any]:
     return dict(result)
 
 
+@pytest.mark.soak
 def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> None:
     result = measured("hook")
     states = [f"{writer}, {state}" for writer in ("thread", "daemon") for state in ("up", "slow", "down")]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -144,7 +145,9 @@ async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it
 async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is_lost(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     command = ["-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]
-    process = await asyncio.create_subprocess_exec("python", *command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE)
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, *command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE
+    )
     await asyncio.to_thread(await_events, tmp_path / "memory.db", 3_000)
     spawned = psutil.Process(process.pid).children()
     os.kill(process.pid, signal.SIGKILL)
