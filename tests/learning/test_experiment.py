@@ -144,10 +144,8 @@ async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it
 
 async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is_lost(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
-    command = ["-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, *command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE
-    )
+    command = [sys.executable, "-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]
+    process = await asyncio.create_subprocess_exec(*command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE)
     await asyncio.to_thread(await_events, tmp_path / "memory.db", 3_000)
     spawned = psutil.Process(process.pid).children()
     os.kill(process.pid, signal.SIGKILL)
