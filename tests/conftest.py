@@ -30,9 +30,12 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str
     running.drop(url)  # some hundred files, which would be written to the disk and deleted at the end of all
 
 
-_LONG = ("test_verify", "test_verify_damage", "test_own", "test_cancelled", "test_rebuild_kill", "test_copy")
+_LONG = """
+test_verify test_verify_damage test_own test_cancelled test_rebuild_kill test_copy test_types_without_a_class
+test_contradictions test_thoughts
+""".split()
 """Modules whose tests take long on a server; there they run on demand, and the others show that it answers alike."""
-_LONGER = ("test_bad_server", "test_bad_spool", "test_refused_killed")
+_LONGER = "test_bad_server test_bad_spool test_refused_killed cli/test_own".split()
 """Modules that walk through many processes, each started anew: all of them run on demand."""
 
 
@@ -40,5 +43,7 @@ _LONGER = ("test_bad_server", "test_bad_spool", "test_refused_killed")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes long is left to `-m soak`."""
     for item in items:
-        if item.path.stem in _LONGER or (item.path.stem in _LONG and "[postgresql" in item.name):
+        stem = item.path.stem
+        is_longer = stem in _LONGER or f"{item.path.parent.name}/{stem}" in _LONGER
+        if is_longer or (stem in _LONG and "[postgresql" in item.name):
             item.add_marker(pytest.mark.soak)
