@@ -41,9 +41,9 @@ async def serve(
     another meanwhile, and as `Memory.open` does.
     """
     address = shared_address(url)
-    # The database first: where it is refused, no spool is made beside it.
-    await (await EventLog.open(address, create=True)).close()
     place = Spool(spool or address.default_spool)
+    if not place.path.exists():  # the database first: where it is refused, no spool is made beside it
+        await (await EventLog.open(address, create=True)).close()
     lock = place.take_writer()
     if lock is None:
         raise SpoolTaken(place.path, "another `pycrorm writer` drains it already")
