@@ -14,8 +14,6 @@ from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from pycrorm_async.adoption import LogAndTables, open_destination, recover
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
@@ -187,7 +185,6 @@ async def test_opening_is_cancelled_at_each_of_its_awaits_and_leaves_no_lock(dat
     proved(database_url, script_of(1))
 
 
-@pytest.mark.soak  # on a busy machine a closing that SQLAlchemy leaves to the loop may wait for aiosqlite for ever
 async def test_the_writer_beside_a_plan_is_cancelled_at_each_of_its_awaits(database_url: str, tmp_path: Path) -> None:
     async with opened(database_url, tmp_path / "spool") as destination:
 

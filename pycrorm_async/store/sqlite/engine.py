@@ -7,6 +7,7 @@ writing transaction takes the write lock at once, so it waits at the start or no
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ __all__ = ["make_engine", "BEGIN"]
 BEGIN = "sqlite_begin"
 """Execution option: the statement that begins a transaction, None for none at all."""
 
+_ROWS_AT_ONCE = 64
 _WRITE_PRAGMAS = (
     "PRAGMA synchronous = FULL",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
     "PRAGMA wal_autocheckpoint = 4000",  # 16 MB: about every fourth full batch instead of every one
@@ -41,8 +43,26 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
     return engine
 
 
+class _Connection(aiosqlite.Connection):
+    """Its thread is asked to end once, and whoever asks again waits for the same end.
+
+    When a closing is cancelled SQLAlchemy asks the thread to end while the closing goes on to ask for itself: the
+    thread had ended by then, and the closing waited for ever, and `asyncio.run` for it.
+    """
+
+    _end: tuple[asyncio.Future[Any] | None] | None = None
+
+    def stop(self) -> asyncio.Future[Any] | None:
+        if self._end is None:
+            self._end = (super().stop(),)
+        return self._end[0]
+
+
 async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
-    connection = aiosqlite.connect(uri, uri=True, isolation_level=None, timeout=busy_timeout_s)
+    def connector() -> sqlite3.Connection:
+        return sqlite3.connect(uri, uri=True, isolation_level=None, timeout=busy_timeout_s)
+
+    connection = _Connection(connector, _ROWS_AT_ONCE)
     thread = connection._thread  # noqa: SLF001 - as SQLAlchemy's own connecting does: there is no public way to it
     thread.daemon = True
     try:

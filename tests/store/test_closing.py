@@ -1,0 +1,19 @@
+"""A connection to SQLite is closed once, whoever asks for it and when."""
+
+import asyncio
+import time
+from pathlib import Path
+
+from pycrorm_async.store.sqlite.engine import _connect
+
+
+async def test_a_closing_ends_although_its_thread_was_asked_to_end_meanwhile(tmp_path: Path) -> None:
+    """As SQLAlchemy does it when a closing is cancelled: the closing goes on, and the thread is told to end as well."""
+    file = tmp_path / "memory.db"
+    file.touch()
+    connection = await _connect(f"{file.as_uri()}?mode=rw", 1.0)
+    closing = asyncio.create_task(connection.close())
+    await asyncio.sleep(0)
+    connection.stop()
+    time.sleep(0.2)  # noqa: ASYNC251  the thread does all it was told before this loop hears of any of it
+    await asyncio.wait_for(closing, 10)
