@@ -16,13 +16,13 @@ import functools
 import io
 import logging
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from typing import Any
 
 import typer
 from rich.logging import RichHandler
 
-from pycrorm_async.cli import copy, demo, episodes, events, learn, rebuild, run, show, spool, status, verify, writer
 from pycrorm_async.cli.output import problem, stderr
 from pycrorm_async.errors import (
     CallerError,
@@ -72,34 +72,43 @@ def _told_in_a_line(verb: Callable[..., int | None]) -> Callable[..., None]:
     return told
 
 
-app = typer.Typer(
-    name="pycrorm",
-    help="Episodic memory for robots: plans remembered as events, asked about as tables.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-_VERBS: dict[str, Callable[..., int | None]] = {
-    "demo": demo.demo,
-    "run": run.run,
-    "episodes": episodes.episodes,
-    "show": show.show,
-    "events": events.events,
-    "copy": copy.copy,
-    "writer": writer.writer,
-    "status": status.status,
-    "rebuild": rebuild.rebuild,
-    "verify": verify.verify,
-    "learn": learn.learn,
+_HELP = "Episodic memory for robots: plans remembered as events, asked about as tables."
+_VERBS = ("demo", "run", "episodes", "show", "events", "copy", "writer", "status", "rebuild", "verify", "learn")
+_GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "spool": ("Look into the write-ahead queue's files, and mend damaged ones.", ("inspect", "repair")),
 }
-for _name, _verb in _VERBS.items():
-    app.command(_name)(_told_in_a_line(_verb))
 
-_spool = typer.Typer(help="Look into the write-ahead queue's files, and mend damaged ones.", no_args_is_help=True)
-_spool.command("inspect")(_told_in_a_line(spool.inspect))
-_spool.command("repair")(_told_in_a_line(spool.repair))
-app.add_typer(_spool, name="spool")
+
+def app(asked: str | None = None) -> typer.Typer:
+    """The command with the verb that is asked for; with all of them if that is none of them.
+
+    Each verb is a function of its name in a module of its name (those of a group in the group's), loaded when it is
+    needed: all of them take a second, most of them half of it.
+    """
+    known = {*_VERBS, *_GROUPS}
+    chosen = {asked} if asked in known else known
+    made = typer.Typer(
+        name="pycrorm",
+        help=_HELP,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    made.callback()(lambda: None)  # one verb alone would be taken for the whole command
+    for verb in (each for each in _VERBS if each in chosen):
+        made.command(verb)(_verb(verb, verb))
+    for group, (text, verbs) in _GROUPS.items():
+        if group in chosen:
+            under = typer.Typer(help=text, no_args_is_help=True)
+            for verb in verbs:
+                under.command(verb)(_verb(group, verb))
+            made.add_typer(under, name=group)
+    return made
+
+
+def _verb(module: str, name: str) -> Callable[..., None]:
+    return _told_in_a_line(getattr(import_module(f"pycrorm_async.cli.{module}"), name))
 
 
 def main() -> None:
@@ -111,4 +120,4 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    app()
+    app(next(iter(sys.argv[1:]), None))()

@@ -19,7 +19,7 @@ from pycrorm_async.plan.descriptions import ActionDescription
 from pycrorm_async.plan.failures import ObjectUnreachable
 from pycrorm_async.plan.here import robot_here
 from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike, designator_of, in_world
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose, rotated
 

@@ -11,7 +11,7 @@ from sqlalchemy.orm import aliased
 
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.orm import BatchRolloutAction, PickUpWithContextView, TaskTreeNode
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
     import pandas as pd

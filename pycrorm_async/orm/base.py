@@ -14,7 +14,7 @@ from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship
 
 from pycrorm_async.orm.types import Moment, Named
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
 
 __all__ = ["Base", "ProcessMetaData", "Position", "Quaternion", "Pose", "RobotState"]

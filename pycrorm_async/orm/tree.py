@@ -11,7 +11,7 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship
 from pycrorm_async.orm.base import Base, Pose, ProcessMetaData
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.types import JsonText
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
 
 __all__ = ["TaskTreeNode", "LocationResolution", "LocationCandidate"]

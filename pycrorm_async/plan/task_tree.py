@@ -11,8 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from enum import Enum
 from typing import TYPE_CHECKING, Any, Literal
+
+from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import Designator
@@ -28,22 +29,6 @@ __all__ = [
 ]
 
 NodeKind = Literal["root", "action", "motion", "language"]
-
-
-class TaskStatus(Enum):
-    """How far a node got."""
-
-    RUNNING = "RUNNING"
-    SUCCEEDED = "SUCCEEDED"
-    FAILED = "FAILED"
-    """A plan failure was raised, or a group of nothing but plan failures."""
-    ERROR = "ERROR"
-    """Any other exception was raised."""
-    CANCELLED = "CANCELLED"
-    INTERRUPTED = "INTERRUPTED"
-    """By a monitor."""
-    LOST = "LOST"
-    """Nobody saw it end: its process died, or its episode ended while it was running. Never seen by a plan."""
 
 
 class TaskTreeNode:

@@ -13,7 +13,6 @@ from functools import cached_property
 from typing import Any
 
 from sqlalchemy import ColumnElement, Dialect, Select, TableClause, column, select, table
-from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
@@ -80,34 +79,34 @@ def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> d
 
 
 def _pick_up_with_context() -> Select[*tuple[Any, ...]]:
-    # Joined at the ids themselves: a node, its designator and its leaf row have the same one.
-    picked = PickUpAction.__table__
-    node = TaskTreeNode.__table__
-    robot, there = aliased(Pose, name="robot"), aliased(Pose, name="there")
+    # Joined at the ids themselves: a node, its designator and its leaf row have the same one. Of tables and not of
+    # classes, which would all be configured when this is imported (0.2 s).
+    picked, node, thing = PickUpAction.__table__, TaskTreeNode.__table__, Object.__table__
+    robot, there = Pose.__table__.alias("robot"), Pose.__table__.alias("there")
     return (
         select(
             picked.c.id,
             picked.c.arm,
             picked.c.grasp,
             node.c.torso_height,
-            (robot.x - there.x).label("relative_x"),
-            (robot.y - there.y).label("relative_y"),
-            robot.qx.label("quaternion_x"),
-            robot.qy.label("quaternion_y"),
-            robot.qz.label("quaternion_z"),
-            robot.qw.label("quaternion_w"),
-            Object.obj_type,
+            (robot.c.x - there.c.x).label("relative_x"),
+            (robot.c.y - there.c.y).label("relative_y"),
+            robot.c.qx.label("quaternion_x"),
+            robot.c.qy.label("quaternion_y"),
+            robot.c.qz.label("quaternion_z"),
+            robot.c.qw.label("quaternion_w"),
+            thing.c.obj_type,
             node.c.status,
             node.c.process_metadata_id,
             node.c.id.label("node_id"),
-            *_seen_from(there, robot),
-            (there.z - robot.z - node.c.torso_height).label("height_over_torso"),
+            *_seen_from(there.c, robot.c),
+            (there.c.z - robot.c.z - node.c.torso_height).label("height_over_torso"),
         )
         .select_from(picked)
         .join(node, node.c.id == picked.c.id)
-        .join(robot, robot.id == node.c.robot_pose_id)
-        .join(Object, Object.id == picked.c.object_designator_id)
-        .join(there, there.id == Object.pose_id)
+        .join(robot, robot.c.id == node.c.robot_pose_id)
+        .join(thing, thing.c.id == picked.c.object_designator_id)
+        .join(there, there.c.id == thing.c.pose_id)
     )
 
 

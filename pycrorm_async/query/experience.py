@@ -19,8 +19,8 @@ from sqlalchemy import Select, select
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import PickUpWithContextView, TaskTreeNode
 from pycrorm_async.plan.experience import PastSuccess
-from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose
 

@@ -13,8 +13,8 @@ from sqlalchemy.orm import aliased
 
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.orm import Designator, Object, ProcessMetaData, TaskTreeNode
-from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.store.naming import number_named
+from pycrorm_async.task_status import TaskStatus
 
 __all__ = ["EpisodeSummary", "NodeSummary", "Thinker", "episodes", "episode_named", "task_tree"]
 

@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.errors import InternalError
 from pycrorm_async.store.dialect import Dialect
-from pycrorm_async.store.postgresql.dialect import PostgreSQL
-from pycrorm_async.store.sqlite.dialect import SQLite
 
 __all__ = ["dialect_of"]
-
-_DIALECTS: dict[str, Dialect] = {"sqlite": SQLite(), "postgresql": PostgreSQL()}
 
 
 def dialect_of(place: AsyncConnection | AsyncEngine) -> Dialect:
     """That of a connection or an engine."""
-    return _DIALECTS[place.dialect.name]
+    return _dialect(place.dialect.name)
+
+
+@cache
+def _dialect(name: str) -> Dialect:
+    # Loaded when it is needed: the driver of a server takes a tenth of a second.
+    match name:
+        case "sqlite":
+            from pycrorm_async.store.sqlite.dialect import SQLite
+
+            return SQLite()
+        case "postgresql":
+            from pycrorm_async.store.postgresql.dialect import PostgreSQL
+
+            return PostgreSQL()
+    raise InternalError(f"there is no dialect for {name}")

@@ -144,6 +144,6 @@ def test_every_verb_the_readme_names_exists(tmp_path: Path) -> None:
     }
     assert pycrorm("--help", cwd=tmp_path).returncode == 0
     for verb in sorted(verbs):
-        done = CliRunner().invoke(app, [verb, "--help"])
+        done = CliRunner().invoke(app(), [verb, "--help"])
         assert done.exit_code == 0
         assert {"spool": "repair", "copy": "--from"}.get(verb, "--url") in done.stdout
