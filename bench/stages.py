@@ -1,0 +1,254 @@
+"""What a hook is made of, and what a perform costs with one task and with a hundred, with and without state samples.
+
+    python -m bench.stages            20 turns of 1,000 performs each, a minute
+    python -m bench.stages --quick    two short ones
+
+The action of `bench.hook`, performed one after the other without a pause: where that one has the plan compute for a
+millisecond in between, after which a processor has forgotten what a hook needs, here it has it at hand. The plans take
+turns in random order; the hundred tasks give each other a turn after each perform, which is in their figure, a mean of
+each turn. *Stages* are measured by themselves, each in a loop of its own, with the same action, world and episode: so
+much of the two hooks of a perform each of them is. Prints one JSON line, in µs: of a perform median, p99, p99.9 and the
+longest; of a stage median, least and most over the turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import random
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.table import Table
+
+from bench.hook import NothingActionPerformable
+from bench.reporting.figures import console, percentiles, spread
+from pycrorm_async import Memory, Settings
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.events.codec import encode
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.happenings import EpisodeStarted, NodeEnded, NodeStarted
+from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.hooks.declaration import Declarations
+from pycrorm_async.hooks.recorder import current_episode
+from pycrorm_async.hooks.values import written
+from pycrorm_async.plan import BaseMotion
+from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.plan.ports import recorder
+from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+
+_TASKS = 100
+_SAMPLED = Settings(sample_interval_ms=50)
+
+
+class NothingMotion(BaseMotion):
+    """No parameters, and nothing done: samples of the robot's state are taken while a motion runs."""
+
+    async def perform(self) -> None:
+        return
+
+
+class Kind(NamedTuple):
+    """How it is performed."""
+
+    remembered: bool
+    tasks: int = 1
+    motion: bool = False
+    settings: Settings | None = None
+
+
+KINDS = {
+    "none": Kind(remembered=False),
+    "memory": Kind(remembered=True),
+    f"none, {_TASKS} tasks": Kind(remembered=False, tasks=_TASKS),
+    f"memory, {_TASKS} tasks": Kind(remembered=True, tasks=_TASKS),
+    "memory, motions": Kind(remembered=True, motion=True),
+    "memory, motions sampled": Kind(remembered=True, motion=True, settings=_SAMPLED),
+}
+
+
+class Plan:
+    """Performs when it is its turn, in a task, a world and an episode of its own."""
+
+    def __init__(self, kind: Kind, url: str) -> None:
+        self.took_us: list[list[float]] = []
+        self._kind = kind
+        self._url = url
+        self._asked: asyncio.Queue[int] = asyncio.Queue()
+
+    async def take_turn(self, performs: int) -> None:
+        """Returns when so many are performed and stored; 0 ends the plan."""
+        self._asked.put_nowait(performs)
+        await self._asked.join()
+
+    async def run(self) -> None:
+        async with AsyncExitStack() as stack:
+            memory = await _remembering(stack, self._url, self._kind) if self._kind.remembered else None
+            stack.enter_context(BulletWorld())
+            action = NothingMotion() if self._kind.motion else _action()
+            while performs := await self._asked.get():
+                self.took_us.append(await self._turn(action, performs))
+                if memory is not None:
+                    await memory.flush()
+                self._asked.task_done()
+        self._asked.task_done()
+
+    async def _turn(self, action: NothingActionPerformable | NothingMotion, performs: int) -> list[float]:
+        if self._kind.tasks > 1:
+            return [await self._turn_of_many(action, performs)]
+        took: list[float] = []
+        for _ in range(performs):
+            began = time.perf_counter_ns()
+            await action.perform()
+            took.append((time.perf_counter_ns() - began) / 1e3)
+        return took
+
+    async def _turn_of_many(self, action: NothingActionPerformable | NothingMotion, performs: int) -> float:
+        """The mean: a perform lets the others have their turn now and then, so one by itself cannot be told."""
+
+        async def some(count: int) -> None:
+            for _ in range(count):
+                await action.perform()
+                await asyncio.sleep(0)
+
+        began = time.perf_counter_ns()
+        await asyncio.gather(*(some(performs // self._kind.tasks) for _ in range(self._kind.tasks)))
+        return (time.perf_counter_ns() - began) / performs / 1e3
+
+
+async def _remembering(stack: AsyncExitStack, url: str, kind: Kind) -> Memory:
+    memory = await stack.enter_async_context(Memory.open(url, settings=kind.settings))
+    await stack.enter_async_context(memory.episode(description="bench"))
+    return memory
+
+
+def _action() -> NothingActionPerformable:
+    Object("pr2", ObjectType.ROBOT)
+    milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))
+    return NothingActionPerformable(designator_of(milk), Arms.LEFT, Grasp.FRONT)
+
+
+# --- stages ---------------------------------------------------------------------------------------------------------
+
+
+async def stages(folder: Path, *, turns: int, performs: int) -> dict[str, dict[str, float]]:
+    """Each of them a median, µs: how long it took on average in each of the turns."""
+    async with AsyncExitStack() as stack:
+        memory = await _remembering(stack, f"sqlite:///{folder}/stages.db", Kind(remembered=True))
+        stack.enter_context(BulletWorld())
+        queue = RecorderQueue.create(
+            folder / "queue", settings=Settings(), clock=SYSTEM_CLOCK, recorder=_identity(b"recorder..")
+        )
+        stack.callback(queue.release)
+        parts = _parts(_action(), queue)
+        took: dict[str, list[float]] = {name: [] for name in parts}
+        for _ in range(turns):
+            for name, part in parts.items():
+                began = time.perf_counter_ns()
+                for _ in range(performs):
+                    part()
+                took[name].append((time.perf_counter_ns() - began) / performs / 1e3)
+            await memory.flush()
+        return {name: spread(values) for name, values in took.items()}
+
+
+def _parts(action: NothingActionPerformable, queue: RecorderQueue) -> dict[str, Callable[[], Any]]:
+    observer, episode = recorder.get(), current_episode.get()
+    assert observer is not None
+    assert episode is not None
+    assert episode.world is not None
+    world = episode.world
+    declared = Declarations().of(type(action), lambda _: None)
+    values = [(field, enum, getattr(action, field.name)) for field, _, enum in declared.fields]
+
+    def parameters() -> dict[str, Any]:
+        return {field.name: written(field, enum, value, episode) for field, enum, value in values}
+
+    start = NodeStarted("action", 2, declared.fingerprint, parameters(), world.robot())
+    payload = encode(start)
+    name = _identity(b"episode...")
+    queue.put_nowait(Heading(name, "EpisodeStarted", 1), encode(EpisodeStarted("bench", "", "", "", "")))
+
+    def hooks() -> None:
+        node = TaskTreeNode(action, "action", None, time.monotonic_ns())
+        observer.node_started(node)
+        observer.node_ended(node)
+
+    return {
+        "both hooks of a perform": hooks,
+        "the robot's state, read": world.robot,
+        "parameters, copied and checked": parameters,
+        "start, encoded": lambda: encode(start),
+        "end, encoded": lambda: encode(NodeEnded(3, "SUCCEEDED")),
+        "put into the queue, each of the two": lambda: queue.put_nowait(
+            Heading(name, "NodeStarted", 1), payload, reserved=True
+        ),
+    }
+
+
+def _identity(randomness: bytes) -> EpisodeId:
+    return episode_id(time.time_ns(), randomness)
+
+
+# --- measuring ------------------------------------------------------------------------------------------------------
+
+
+async def measured(folder: Path, *, turns: int, performs: int) -> dict[str, Any]:
+    plans = {name: Plan(kind, f"sqlite:///{folder}/{place}.db") for place, (name, kind) in enumerate(KINDS.items())}
+    async with asyncio.TaskGroup() as tasks:
+        for name, plan in plans.items():
+            tasks.create_task(plan.run(), name=name)
+        for plan in plans.values():  # whatever happens only once
+            await plan.take_turn(_TASKS)
+            plan.took_us.clear()
+        order = random.Random(1)
+        for _ in range(turns):
+            for plan in order.sample([*plans.values()], len(plans)):
+                await plan.take_turn(performs)
+        for plan in plans.values():
+            await plan.take_turn(0)
+    figures: dict[str, Any] = {
+        name: percentiles([each for turn in plan.took_us for each in turn]) for name, plan in plans.items()
+    }
+    for name, without in (("memory", "none"), (f"memory, {_TASKS} tasks", f"none, {_TASKS} tasks")):
+        more = [
+            statistics.median(one) - statistics.median(other)
+            for one, other in zip(plans[name].took_us, plans[without].took_us, strict=True)
+        ]
+        figures[f"one hook, {name}"] = spread([each / 2 for each in more])
+    return figures | {"stages": await stages(folder, turns=turns, performs=performs)}
+
+
+def _table(result: dict[str, Any]) -> Table:
+    table = Table(title="A perform without a pause before it, and its stages, µs", title_justify="left")
+    for name in ("what", "median", "…"):
+        table.add_column(name, justify="left" if name == "what" else "right")
+    for name, found in {**result, **result["stages"]}.items():
+        if isinstance(found, dict) and "median" in found:
+            median, *rest = found.items()
+            table.add_row(name, f"{median[1]:,}", ", ".join(f"{which} {each:,}" for which, each in rest))
+    return table
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="two short turns each")
+    quick = parser.parse_args().quick
+    turns, performs = (2, 100) if quick else (20, 1_000)
+    with tempfile.TemporaryDirectory(prefix="b") as folder:
+        figures = asyncio.run(measured(Path(folder), turns=turns, performs=performs))
+    result = {"bench": "stages", "turns": turns, "performs_a_turn": performs, **figures}
+    print(json.dumps(result))
+    console().print(_table(result))
+
+
+if __name__ == "__main__":
+    main()
