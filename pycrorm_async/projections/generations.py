@@ -27,6 +27,7 @@ from pycrorm_async.projections.tables import (
     CORE,
     OWN,
     Storage,
+    expected,
     index_name,
     indexed,
     make_table,
@@ -237,6 +238,9 @@ async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[s
         statements += [str(each.compile(dialect=connection.dialect)) for each in made]
     if statements:
         await dialect_of(connection).execute_all(connection, statements)
+        await dialect_of(connection).expect(
+            connection, [expected(name, dict(columns), generation) for name, columns in tables.items()]
+        )
 
 
 async def _add_columns(

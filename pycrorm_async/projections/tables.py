@@ -12,7 +12,20 @@ from typing import Any, Literal, TypeAlias
 from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, Table, Text
 from sqlalchemy.types import TypeEngine
 
-__all__ = ["Storage", "OWN", "CORE", "COLUMNS", "make_table", "physical_name", "column_type", "indexed", "index_name"]
+from pycrorm_async.store.dialect import Expected
+
+__all__ = [
+    "Storage",
+    "OWN",
+    "CORE",
+    "COLUMNS",
+    "make_table",
+    "physical_name",
+    "column_type",
+    "indexed",
+    "index_name",
+    "expected",
+]
 
 Storage: TypeAlias = Literal["key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json"]
 """How a column is stored: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON."""
@@ -200,6 +213,12 @@ _INDEXED = {
     "state_sample": ("process_metadata_id", "node_id"),
 }
 
+_EXPECTED = {"process_metadata": 1_000, "simulated_episode": 100}
+_EXPECTED_CORE, _EXPECTED_LEAF = 1_000_000, 50_000
+_ALIKE = {"process_metadata_id": 1_000, "parent_id": 4, "status": 250_000, "dtype": 50_000, "obj_type": 10_000}
+_ALIKE_OTHERS = 10
+"""Of a memory of a thousand episodes: rows of each table, and rows that have the same value in an indexed column."""
+
 
 def physical_name(table: str, generation: int) -> str:
     """Where the rows are: `pose__1`."""
@@ -231,6 +250,15 @@ def indexed(name: str, columns: dict[str, Storage]) -> tuple[str, ...]:
     if name in CORE:
         return _INDEXED.get(name, ())
     return tuple(column for column, storage in columns.items() if storage == "object")
+
+
+def expected(name: str, columns: dict[str, Storage], generation: int) -> Expected:
+    """How a planner that counts nothing by itself is to take this table: the proportions matter, not the sizes."""
+    rows = _EXPECTED.get(name, _EXPECTED_CORE if name in CORE else _EXPECTED_LEAF)
+    alike = {
+        index_name(name, column, generation): _ALIKE.get(column, _ALIKE_OTHERS) for column in indexed(name, columns)
+    }
+    return Expected(physical_name(name, generation), rows, alike)
 
 
 def index_name(name: str, column: str, generation: int) -> str:

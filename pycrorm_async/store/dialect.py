@@ -11,7 +11,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 
-__all__ = ["Dialect", "Birth", "Found", "Migrations", "Progress", "RowRefused"]
+__all__ = ["Dialect", "Birth", "Expected", "Found", "Migrations", "Progress", "RowRefused"]
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; format N is what the first N of them make."""
@@ -36,6 +36,14 @@ class Found(NamedTuple):
 
 class RowRefused(ValueError):
     """A row that the database cannot hold: a key that is taken, a value that does not fit its column."""
+
+
+class Expected(NamedTuple):
+    """How many rows of a table are expected, and by index how many of them have a value in common."""
+
+    table: str
+    rows: int
+    alike: Mapping[str, int]
 
 
 class Dialect(Protocol):
@@ -139,6 +147,10 @@ class Dialect(Protocol):
 
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
         """Whether there is a table of that name among them."""
+        ...
+
+    async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
+        """Of empty tables: how they will be. Which of them a question is best begun with depends on it."""
         ...
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:

@@ -10,7 +10,7 @@ from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Found, Migrations, Progress, RowRefused
+from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused
 from pycrorm_async.store.postgresql import faults, tables
 from pycrorm_async.store.postgresql import statements as sql
 from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
@@ -138,6 +138,9 @@ class PostgreSQL:
 
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
         return bool((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).scalar_one())
+
+    async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
+        """The server counts by itself."""
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
         quote = connection.dialect.identifier_preparer.quote

@@ -24,6 +24,7 @@ __all__ = [
     "SELECT_DECLARATIONS",
     "ADVANCE_FOLDED",
     "PARK",
+    "EXPECT",
 ]
 
 # --- append ---------------------------------------------------------------------------------------------------
@@ -82,3 +83,8 @@ FROM (SELECT value->>0 AS number, value->>1 AS before, value->>2 AS folded FROM 
 WHERE episode.number = step.number AND episode.folded = step.before"""
 
 PARK = "UPDATE episode SET parked = ? WHERE number = ?"
+
+# --- the planner ----------------------------------------------------------------------------------------------
+
+EXPECT = """
+INSERT INTO sqlite_stat1 (tbl, idx, stat) SELECT value->>0, value->>1, value->>2 FROM json_each(?)"""

@@ -1,0 +1,47 @@
+"""Which table SQLite begins a question with: what it is told of new tables, for it never counts by itself."""
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory
+from pycrorm_async.rebuilding import rebuild_memory
+
+VIEW = 'SELECT arm, relative_x FROM "PickUpWithContextView" WHERE {}'
+
+
+@pytest.mark.parametrize(
+    ("question", "begins"),
+    [
+        (VIEW.format("status = 'SUCCEEDED'"), "SCAN pick_up_action__1"),
+        (VIEW.format("obj_type = 'MILK'"), "SCAN pick_up_action__1"),
+        (VIEW.format("process_metadata_id = 3"), "SEARCH task_tree_node__1 USING INDEX task_tree_node__1_by_process"),
+        ("SELECT id FROM task_tree_node WHERE status = 'FAILED'", "SEARCH task_tree_node__1 USING INDEX"),
+        ("SELECT n.id FROM action a JOIN task_tree_node n USING (id) WHERE n.parent_id = 64", "SEARCH task_tree_node"),
+    ],
+)
+async def test_a_question_begins_with_what_is_fewest(tmp_path: Path, question: str, begins: str) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
+        pass
+    with closing(sqlite3.connect(tmp_path / "memory.db")) as file:
+        first, *_ = [row[3] for row in file.execute(f"EXPLAIN QUERY PLAN {question}")]
+    assert first.startswith(begins)
+
+
+async def test_what_is_expected_of_a_table_goes_with_it_when_it_is_made_anew(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url):
+        pass
+
+    def told() -> set[str]:
+        with closing(sqlite3.connect(tmp_path / "memory.db")) as file:
+            tables = file.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchall()
+            known = {name for (name,) in file.execute("SELECT DISTINCT tbl FROM sqlite_stat1")}
+            assert known <= {name for (name,) in tables}
+            return {name for name in known if name.startswith("task_tree_node")}
+
+    assert told() == {"task_tree_node__1"}
+    await rebuild_memory(url)
+    assert told() == {"task_tree_node__2"}
