@@ -13,6 +13,7 @@ from multiprocessing.process import BaseProcess
 from typing import NamedTuple, TypeAlias
 
 from pycrorm_async.adoption import shared_address
+from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.projections.generations import all_noted, projections_in
@@ -174,6 +175,7 @@ def _not_interrupted() -> Iterator[None]:
 
 
 def _work(address: DatabaseAddress, share: Share) -> None:
+    collect_seldom()
     with suppress(PycrormError):
         asyncio.run(_work_on(address, share))
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption
 from pycrorm_async.cli.output import print_json, print_table, problem
 from pycrorm_async.cli.waiting import note_what_waits
@@ -37,6 +38,7 @@ def copy(
     still recorded the next one takes the rest. Exit code 4 if a memory is damaged or both hold different events under
     one number, 1 if an episode is stopped; the other episodes are copied.
     """
+    collect_seldom()
     done = asyncio.run(_watched(source, target, episode or []))
     note_what_waits(source, spool)
     if as_json:

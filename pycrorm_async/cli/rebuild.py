@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
 from pycrorm_async.cli.output import duration, note, print_json, stdout
 from pycrorm_async.errors import CallerError
@@ -47,6 +48,7 @@ def rebuild(
     """
     named_here = named(projection or ())
     known = {each.name: each for each in (*named_here, *installed_besides(named_here))}
+    collect_seldom()
     chosen = asyncio.run(_chosen(url, names or [], known))
     done = {name: asyncio.run(_rebuild(url, workers, known.get(name))) for name in chosen}
     if as_json:

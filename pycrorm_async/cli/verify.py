@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, stdout
 from pycrorm_async.projections.own import Projection
@@ -39,6 +40,7 @@ def verify(
     """
     projections = named(projection or ())
     known = [*projections, *installed_besides(projections)]
+    collect_seldom()
     found, ids = asyncio.run(_verify(url, episode, known))
     for name, reason in found.not_compared.items():
         note(f"the projection {name} was not looked at: {reason}")

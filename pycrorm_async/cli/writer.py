@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import logging
 import os
 import signal
@@ -15,6 +14,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.adoption import RecoveryReport, recover
+from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
 from pycrorm_async.daemon import serve
@@ -25,8 +25,6 @@ from pycrorm_async.writer.daemon import LEAVE_S, Moved
 
 __all__ = ["writer"]
 
-_OBJECTS_BEFORE_COLLECTING = 10_000
-"""Python's 700 have the collector look at the ten thousands of tuples of a batch again and again, and find nothing."""
 _HANGING_S = 5.0
 """How much longer than `LEAVE_S` a database that does not answer at all may keep the process."""
 
@@ -50,7 +48,7 @@ def writer(
     stopped.
     """
     projections = named(projection or ())
-    gc.set_threshold(_OBJECTS_BEFORE_COLLECTING)
+    collect_seldom()
     if once:
         return _once(url, spool, projections, as_json=as_json)
     moved = asyncio.run(_until_told_to_leave(url, spool, projections))
