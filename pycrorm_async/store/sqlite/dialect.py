@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from itertools import accumulate, chain
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
@@ -18,7 +19,7 @@ from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
 from pycrorm_async.store.sqlite.claim import claim
-from pycrorm_async.store.sqlite.engine import BEGIN
+from pycrorm_async.store.sqlite.engine import BEGIN, Connection
 
 __all__ = ["SQLite"]
 
@@ -27,7 +28,7 @@ class SQLite:
     """Implements `Dialect`. A batch goes as JSON, because `executemany` gives up the interpreter at every row."""
 
     migrations: Migrations = tables.MIGRATIONS
-    faults: tuple[type[Exception], ...] = (DBAPIError,)
+    faults: tuple[type[Exception], ...] = (DBAPIError, sqlite3.Error, UnicodeDecodeError)  # of a name in a damaged file
 
     # --- making -------------------------------------------------------------------------------------------------
 
@@ -191,28 +192,23 @@ class SQLite:
     ) -> None:
         quote = connection.dialect.identifier_preparer.quote
         into = f"INSERT INTO {quote(table)} ({', '.join(map(quote, columns))}) VALUES "  # noqa: S608
-        with _rows_refused():
-            for part in _parts(rows, len(columns)):
-                await connection.exec_driver_sql(f"{into}{_placeholders(part)}", tuple(chain.from_iterable(part)))
+        await _execute(connection, [(into + _placeholders(part), _flat(part)) for part in _parts(rows, len(columns))])
 
     async def update_rows(
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
     ) -> None:
         names = list(columns)[1:]
         changes = ", ".join(f"{column} = change.column{place}" for place, column in enumerate(names, 2))
-        with _rows_refused():
-            for part in _parts(rows, len(columns)):
-                await connection.exec_driver_sql(
-                    f"UPDATE {table} SET {changes}"  # noqa: S608
-                    f" FROM (VALUES {_placeholders(part)}) AS change WHERE {table}.id = change.column1",
-                    tuple(chain.from_iterable(part)),
-                )
+        update = f"UPDATE {table} SET {changes} FROM (VALUES "  # noqa: S608
+        of = f") AS change WHERE {table}.id = change.column1"
+        await _execute(
+            connection, [(update + _placeholders(part) + of, _flat(part)) for part in _parts(rows, len(columns))]
+        )
 
     # --- faults -------------------------------------------------------------------------------------------------
 
     def ours(self, error: Exception, name: str) -> PycrormError:
-        assert isinstance(error, DBAPIError)
-        return faults.ours(error, name)
+        return faults.ours(error.orig if isinstance(error, DBAPIError) else error, name)
 
 
 _PARAMETERS_MAX = 8_000
@@ -221,9 +217,13 @@ often."""
 
 
 def _parts(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[Sequence[tuple[Any, ...]]]:
-    size = _PARAMETERS_MAX // columns
-    for start in range(0, len(rows), size):
+    """Powers of two, so that few different statements are ever made: to compile one takes longer than to run it."""
+    size, start = 1 << (_PARAMETERS_MAX // columns).bit_length() - 1, 0
+    while start < len(rows):
+        while size > len(rows) - start:
+            size //= 2
         yield rows[start : start + size]
+        start += size
 
 
 def _placeholders(rows: Sequence[tuple[Any, ...]]) -> str:
@@ -231,13 +231,23 @@ def _placeholders(rows: Sequence[tuple[Any, ...]]) -> str:
     return ", ".join([one] * len(rows))
 
 
+def _flat(rows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
+    return tuple(chain.from_iterable(rows))
+
+
+async def _execute(connection: AsyncConnection, statements: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
+    """All of them in one visit to the connection's thread, within the transaction that has begun."""
+    driver = (await connection.get_raw_connection()).driver_connection
+    assert isinstance(driver, Connection)
+    with _rows_refused():
+        await driver.execute_in_turn(statements)
+
+
 @contextmanager
 def _rows_refused() -> Iterator[None]:
     try:
         yield
-    except (DataError, IntegrityError) as error:
-        raise RowRefused(str(error.orig)) from error
-    except OverflowError as error:
+    except (sqlite3.DataError, sqlite3.IntegrityError, OverflowError) as error:
         raise RowRefused(str(error)) from error
 
 

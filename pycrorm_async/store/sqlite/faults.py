@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 
-from sqlalchemy.exc import DBAPIError
-
 from pycrorm_async.errors import (
     DamageError,
     DatabaseForeign,
@@ -31,11 +29,10 @@ _AWAY = {
 }
 
 
-def ours(error: DBAPIError, database: str) -> PycrormError:
-    """The error to raise in its place."""
-    fault = error.orig
+def ours(fault: BaseException | None, database: str) -> PycrormError:
+    """The error to raise in place of the driver's."""
     code = getattr(fault, "sqlite_errorcode", None)
-    if code is None and str(fault).startswith("Could not decode to UTF-8"):
+    if isinstance(fault, UnicodeDecodeError) or (code is None and str(fault).startswith("Could not decode to UTF-8")):
         return DamageError(f"{database} is damaged: {fault}")
     if code is None:  # raised by the driver between us and SQLite: a connection that is gone
         return DatabaseUnavailable(f"{database}: {fault}")
