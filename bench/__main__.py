@@ -1,8 +1,8 @@
 """All figures, side by side: every script of `bench` in a process of its own, one after the other.
 
-    python -m bench                            some hours; the figures in ./figures
+    python -m bench                            two hours and more; the figures in bench/figures
     python -m bench --quick                    that every script still runs
-    python -m bench --only thesis --only hook  those whose name begins with one of these words
+    python -m bench --only thesis --only questions,  one by its name, or all whose name begins so
     python -m bench --report FOLDER            figures.jsonl, figures.md and the plots there
 
 `figures.jsonl` has a line for each run: what the script printed, with its command, how long it took, versions,
@@ -69,12 +69,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="that every script still runs")
     parser.add_argument("--only", action="append", help="those whose name begins with this; can be repeated")
-    parser.add_argument("--report", type=Path, default=Path("figures"), help="the folder of the figures")
+    parser.add_argument("--report", type=Path, default=Path("bench/figures"), help="the folder of the figures")
     asked = parser.parse_args()
     chosen = [
         run
         for run in RUNS
-        if (run.quick or not asked.quick) and any(run.name.startswith(word) for word in asked.only or [""])
+        if (run.quick or not asked.quick) and any(_means(word, run.name) for word in asked.only or [""])
     ]
     if not chosen:
         parser.error(f"no such figure: {', '.join(asked.only)} (there are {', '.join(run.name for run in RUNS)})")
@@ -95,6 +95,11 @@ def main() -> int:
     for name in failed:
         console().print(f"[bold red]{name} failed[/]")
     return 1 if failed else 0
+
+
+def _means(word: str, name: str) -> bool:
+    """A whole name means that run, the beginning of several means all of them."""
+    return name == word if any(run.name == word for run in RUNS) else name.startswith(word)
 
 
 def measured(run: Run, *, quick: bool) -> dict[str, Any] | None:

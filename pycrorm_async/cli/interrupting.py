@@ -1,4 +1,4 @@
-"""Ctrl-C while a plan runs, and while what it recorded is being stored."""
+"""Ctrl-C, or SIGTERM, while a plan runs, and while what it recorded is being stored."""
 
 from __future__ import annotations
 
@@ -47,11 +47,10 @@ class Interrupting:
             task.cancel()
             loop.call_soon_threadsafe(self.ended if self._patience == 1 else lambda: None)  # it may be asleep
 
-        before = signal.getsignal(signal.SIGINT)
-        if before is not signal.default_int_handler and not _is_asyncios(before):  # ignored, or somebody else's
-            yield
-            return
-        signal.signal(signal.SIGINT, told)
+        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        ours = [number for number, handler in before.items() if _is_nobodys(handler)]
+        for number in ours:
+            signal.signal(number, told)
         try:
             yield
         except asyncio.CancelledError:
@@ -59,7 +58,8 @@ class Interrupting:
                 raise KeyboardInterrupt from None
             raise
         finally:
-            signal.signal(signal.SIGINT, before)
+            for number in ours:
+                signal.signal(number, before[number])
 
     @property
     def asked(self) -> bool:
@@ -75,5 +75,8 @@ class Interrupting:
         self._storing = True
 
 
-def _is_asyncios(handler: object) -> bool:
+def _is_nobodys(handler: object) -> bool:
+    """Whether it is what Python or asyncio does by itself: not ignored, and no handler of somebody else's."""
+    if handler in (signal.default_int_handler, signal.SIG_DFL):
+        return True
     return getattr(getattr(handler, "func", handler), "__module__", None) == "asyncio.runners"

@@ -120,4 +120,9 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-    app(next(iter(sys.argv[1:]), None))()
+    try:
+        command = app(next(iter(sys.argv[1:]), None))
+    except KeyboardInterrupt:  # while it was being loaded
+        problem("interrupted before anything was done")
+        sys.exit(130)
+    command()

@@ -25,7 +25,6 @@ def measured(script: str, *options: str) -> dict[str, Any]:
     return dict(result)
 
 
-@pytest.mark.soak
 def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> None:
     result = measured("hook")
     states = [f"{writer}, {state}" for writer in ("thread", "daemon") for state in ("up", "slow", "down")]
@@ -42,7 +41,6 @@ def test_the_backlog_beside_a_busy_plan_is_measured(options: tuple[str, ...]) ->
     assert max(result["backlog_at_the_end"], *result["backlog"]) <= result["backlog_max"] <= result["events"] + 10
 
 
-@pytest.mark.soak
 @pytest.mark.parametrize("script", OTHERS)
 def test_every_other_script_measures_something(script: str) -> None:
     assert len(measured(script)) >= 2

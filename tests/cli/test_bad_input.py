@@ -170,7 +170,10 @@ def test_a_plan_that_leaves_the_program_has_failed_and_keeps_its_record(folder: 
     assert [node["status"] for node in shown["tree"]] == ["ERROR", "SUCCEEDED"]
 
 
-def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(folder: Path) -> None:
+@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
+    folder: Path, told: signal.Signals
+) -> None:
     process = subprocess.Popen(
         [*COMMAND, "run", "plans.py:endless"],
         cwd=folder,
@@ -183,7 +186,7 @@ def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(fo
     assert process.stderr is not None
     assert process.stdout.read(1) == b"."
     time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(told)
     dots = 1
     while chunk := process.stdout.read(1 << 16):
         dots += chunk.count(b".")

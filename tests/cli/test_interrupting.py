@@ -12,6 +12,19 @@ from pathlib import Path
 
 from tests.commands import answer, pycrorm
 
+LOADING = """
+import builtins, os, signal, sys
+load = builtins.__import__
+def interrupted(name, *rest, **options):
+    if name == "pycrorm_async.memory":
+        os.kill(os.getpid(), signal.SIGINT)
+    return load(name, *rest, **options)
+builtins.__import__ = interrupted
+sys.argv = ["pycrorm", "run", "plan.py"]
+from pycrorm_async.cli.main import main
+main()
+"""
+
 PLAN = """
 import pathlib, time
 from dataclasses import dataclass
@@ -65,3 +78,11 @@ def test_a_plan_whose_database_is_away_at_its_end_is_left_with_ctrl_c_and_stored
     (episode,) = answer("episodes", cwd=tmp_path)
     assert episode["nodes"] == 2
     assert [node["status"] for node in answer("show", "1", cwd=tmp_path)["tree"]] == ["SUCCEEDED", "SUCCEEDED"]
+
+
+def test_interrupted_while_it_loads_it_says_so_in_a_line(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LOADING], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "pycrorm: interrupted before anything was done\n")
+    assert not list(tmp_path.iterdir())
