@@ -61,7 +61,7 @@ LONG = Sizes(
     episodes=(100, 1_000, 10_000),
     recorded=(10_000, 100_000, 500_000),
 )
-QUICK = Sizes(nodes=500, an_episode=(10, 100), recorders=(1, 2), daemons=(1, 2), episodes=(10, 20), recorded=(200, 400))
+QUICK = Sizes(nodes=500, an_episode=(10,), recorders=(2,), daemons=(2,), episodes=(10, 20), recorded=(200, 400))
 
 
 class Place:

@@ -184,10 +184,10 @@ def _pass_on(server_socket: str, late_s: float) -> None:
 # --- measuring ------------------------------------------------------------------------------------------------------
 
 
-async def measured(stack: ExitStack, *, turns: int, performs: int) -> dict[str, object]:
+async def measured(stack: ExitStack, *, turns: int, performs: int, late_s: float) -> dict[str, object]:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="h")))
     server = stack.enter_context(server_in(folder / "pg"))
-    slow, gone = _Way(server, _LATE_S), _Way(server, 0.0)
+    slow, gone = _Way(server, late_s), _Way(server, 0.0)
     stack.callback(slow.end)
     databases = {"up": server.new_database, "slow": slow.new_database, "down": gone.new_database}
     kinds = [
@@ -267,7 +267,8 @@ def main() -> None:
     quick = parser.parse_args().quick
     logging.disable(logging.WARNING)  # that the database is away is known here
     with ExitStack() as stack:
-        result = asyncio.run(measured(stack, turns=2 if quick else 20, performs=100 if quick else 1_000))
+        turns, performs, late_s = (2, 100, _LATE_S / 20) if quick else (20, 1_000, _LATE_S)
+        result = asyncio.run(measured(stack, turns=turns, performs=performs, late_s=late_s))
     print(json.dumps(result))
     Console(stderr=True, width=None if sys.stderr.isatty() else 140).print(_table(result))
 

@@ -41,10 +41,11 @@ class EpisodeEnd(NamedTuple):
     failure_message: str | None
 
 
-_NODE_END = tuple(_NODE.index(name) for name in NodeEnd._fields)
+_STATUS, _END_TIME, _END_NS = (_NODE.index(name) for name in ("status", "end_time", "end_ns"))
+_OUTCOME = slice(_NODE.index("reason"), _NODE.index("result") + 1)
+assert NodeEnd._fields == ("id", "status", "end_time", "end_ns", *_NODE[_OUTCOME])
 _EPISODE_END = tuple(_EPISODE.index(name) for name in EpisodeEnd._fields)
 _NODE_NUMBER = _NODE.index("process_metadata_id")
-_NODE_STATUS = _NODE.index("status")
 
 
 class Rows:
@@ -73,8 +74,7 @@ class Rows:
         if row is None:
             self.node_ends.append(end)
             return
-        for index, value in zip(_NODE_END, end, strict=True):
-            row[index] = value
+        _, row[_STATUS], row[_END_TIME], row[_END_NS], *row[_OUTCOME] = end
 
     def end_episode(self, end: EpisodeEnd) -> None:
         """The episode's row has an end, here or in the tables."""
@@ -90,8 +90,8 @@ class Rows:
     def _lose_nodes(self, number: int) -> None:
         self.lost.append(number)
         for row in self.nodes.values():
-            if row[_NODE_NUMBER] == number and row[_NODE_STATUS] == "RUNNING":
-                row[_NODE_STATUS] = "LOST"
+            if row[_NODE_NUMBER] == number and row[_STATUS] == "RUNNING":
+                row[_STATUS] = "LOST"
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
         """All rows to insert, by (table, columns)."""

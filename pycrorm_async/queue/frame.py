@@ -11,6 +11,8 @@ from struct import Struct
 from typing import Final, NamedTuple, TypeAlias
 from zlib import crc32
 
+from pycrorm_async.bulk import make
+
 __all__ = [
     "Buffer",
     "Frame",
@@ -191,18 +193,21 @@ def decode(buffer: Buffer, offset: int, salt: int) -> Frame | None:
     (checksum,) = CHECKSUM.unpack_from(buffer, body_start - 4)
     if crc32(head, crc32(body)) != checksum:
         return None
-    return Frame(
-        kind,
-        version,
-        position,
-        sequence,
-        wall_ns,
-        monotonic_ns,
-        episode,
-        body[:type_length],
-        body[type_length : type_length + length],
-        checksum,
-        body_end - offset,
+    return make(
+        Frame,
+        (
+            kind,
+            version,
+            position,
+            sequence,
+            wall_ns,
+            monotonic_ns,
+            episode,
+            body[:type_length],
+            body[type_length : type_length + length],
+            checksum,
+            body_end - offset,
+        ),
     )
 
 

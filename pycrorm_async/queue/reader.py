@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from pycrorm_async.bulk import make
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
@@ -91,7 +92,8 @@ class Reader:
                 if type_name is None:
                     type_name = types[name] = name.decode()
                 owner = EpisodeId(episode) if kind == EVENT else None
-                records.append(Record(position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload))
+                values = (position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
+                records.append(make(Record, values))
             offset += size
         complete = complete or len(records) >= events_max or total >= bytes_max
         return Batch(records, total, Cursor(number, offset, position), complete)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from pycrorm_async.bulk import make
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.frame import CHECKSUM, COMMIT, EVENT, HEADER_BYTES, Buffer, Frame, chain, decode
@@ -30,6 +31,7 @@ from pycrorm_async.queue.segment import (
 __all__ = ["Kept", "Survey", "scan", "survey", "whole_frames", "checked_header"]
 
 _SALT_OFFSET = HEADER_BYTES - 8
+_CLOSES = CLOSES.encode()
 
 
 class Kept(NamedTuple):
@@ -100,11 +102,12 @@ class _Walk:
         self._seen = seen
         self._start = self._cut = Cursor(0, 0, 0)
         self._bases: dict[int, int] = {}
-        self._open: dict[EpisodeId, Last] = {}
+        self._open: dict[EpisodeId, Last | Frame] = {}
         self._unsaid: list[int] = []  # checksums of the records that no commit frame has covered yet
 
     def kept(self, numbers: list[int]) -> Kept:
-        return Kept(self._start, self._cut, self._bases, self._open, numbers)
+        last = {name: Last(each.sequence, each.wall_ns, each.monotonic_ns) for name, each in self._open.items()}
+        return Kept(self._start, self._cut, self._bases, last, numbers)
 
     @property
     def unsaid(self) -> tuple[int, ...]:
@@ -138,7 +141,7 @@ class _Walk:
                 position = frame.position
             else:
                 break
-            self._cut = Cursor(number, self._cut.offset + frame.size, position)
+            self._cut = make(Cursor, (number, self._cut.offset + frame.size, position))
             self._seen(number, frame)
         return True
 
@@ -157,8 +160,8 @@ class _Walk:
                 self._cut.offset,
                 f"event {frame.sequence} of episode {episode_text(episode)} follows {before and before.sequence}",
             )
-        self._open[episode] = Last(frame.sequence, frame.wall_ns, frame.monotonic_ns)
-        if frame.type == CLOSES.encode():
+        self._open[episode] = frame
+        if frame.type == _CLOSES:
             del self._open[episode]
 
     def _check_commit(self, path: Path, frame: Frame) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
+from pycrorm_async.bulk import make
 from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
@@ -35,7 +36,7 @@ async def append_batch(
     changed = [each.after for identity, each in steps.items() if each.after != known[identity]]
     if changed:
         await dialect.upsert_episodes(connection, changed)
-    fresh = [StoredEvent(each.after.number, *record[2:]) for each in steps.values() for record in each.fresh]
+    fresh = [make(StoredEvent, (each.after.number, *record[2:])) for each in steps.values() for record in each.fresh]
     if fresh:
         await dialect.insert_events(connection, fresh)
     await _compare(dialect, connection, [each for each in steps.values() if each.again])

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.bulk import make
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused
 from pycrorm_async.store.postgresql import faults, tables
@@ -263,7 +264,7 @@ def _rows_refused() -> Iterator[None]:
 
 
 async def _rows(kind: Any, connection: AsyncConnection, statement: str, *parameters: Any) -> list[Any]:
-    return [kind._make(row) for row in await connection.exec_driver_sql(statement, parameters)]
+    return [make(kind, row) for row in await connection.exec_driver_sql(statement, parameters)]
 
 
 def _arrays(rows: Sequence[tuple[Any, ...]], columns: int) -> tuple[list[Any], ...]:

@@ -13,6 +13,7 @@ import msgspec
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.bulk import make
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
@@ -252,7 +253,7 @@ def _rows_refused() -> Iterator[None]:
 
 
 async def _rows(kind: Any, connection: AsyncConnection, statement: str, *parameters: Any) -> list[Any]:
-    return [kind._make(row) for row in await connection.exec_driver_sql(statement, parameters)]
+    return [make(kind, row) for row in await connection.exec_driver_sql(statement, parameters)]
 
 
 def _columns(row: EpisodeRow) -> tuple[Any, ...]:
