@@ -57,9 +57,9 @@ RUNS = (
     Run("thesis postgresql", ("--postgresql",), quick=False),
     Run("questions"),
     Run("questions, large", ("--pick-ups", "500000"), quick=False),
-    Run("rebuild"),
-    Run("rebuild postgresql", ("--postgresql",)),
-    Run("growth"),
+    Run("rebuild", ("--workers", "1", "2")),
+    Run("rebuild postgresql", ("--postgresql", "--workers", "1", "2")),
+    Run("growth", ("--turns", "2")),
     Run("thesis, 488,043 nodes", ("--nodes", "488043", "--repeat", "1"), quick=False),
     Run("thesis postgresql, 488,043 nodes", ("--postgresql", "--nodes", "488043", "--repeat", "1"), quick=False),
 )

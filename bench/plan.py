@@ -1,17 +1,18 @@
 """A plan with memory against the same plan without: navigate, face, look and try to pick up, as fast as it goes.
 
 Prints one JSON line: rollouts a second without, with a memory that writes by a thread, and with one whose events a
-daemon writes meanwhile, paired in turns within one run; and what either costs.
+daemon writes meanwhile, paired in turns within one run; what either costs, and how many events a rollout has.
 Run it with `python -m bench.plan`; `--quick` for two short turns.
 """
 
 import asyncio
 import json
+import sqlite3
 import statistics
 import sys
 import tempfile
 import time
-from contextlib import AsyncExitStack, suppress
+from contextlib import AsyncExitStack, closing, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -74,11 +75,14 @@ async def measured() -> dict[str, object]:
             with_memory.append(await turn(f"sqlite:///{folder}/bench.db", seed))
             by_daemon.append(await turn(url, seed, writer="daemon"))
         stop(daemon)
+        with closing(sqlite3.connect(f"{folder}/daemon.db")) as file:
+            [(events,)] = file.execute("SELECT count(*) FROM event")
     return {
         "bench": "plan",
         "rollouts_a_turn": ROLLOUTS,
         "turns": TURNS,
         "rollouts_per_s_without": rate(without),
+        "events_a_rollout": round(events / TURNS / ROLLOUTS, 1),
         "with_thread": {"rollouts_per_s": rate(with_memory), **cost(with_memory, without)},
         "with_daemon": {"rollouts_per_s": rate(by_daemon), **cost(by_daemon, without)},
     }
