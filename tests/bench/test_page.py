@@ -81,3 +81,10 @@ def test_what_is_measured_again_replaces_its_line_and_nothing_else(tmp_path: Pat
 def test_every_run_names_a_script_that_is_there() -> None:
     for run in RUNS:
         assert (ROOT / "bench" / f"{run.script}.py").is_file()
+
+
+def test_the_readme_shows_the_budgets_as_they_were_measured() -> None:
+    measured = (ROOT / "bench" / "figures" / "figures.md").read_text()
+    budgets = measured[measured.index("| what | budget |") :].split("\n\n")[0]
+    assert len(budgets.splitlines()) == 2 + len(BUDGETS)
+    assert budgets in (ROOT / "README.md").read_text()
