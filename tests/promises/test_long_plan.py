@@ -1,4 +1,4 @@
-"""A plan that never suspends, 100,000 actions long: all of them stored, and the process does not grow."""
+"""A plan that never suspends, 200,000 actions long: all of them stored, and the process does not grow."""
 
 import json
 import subprocess
@@ -49,7 +49,7 @@ asyncio.run(main(sys.argv[1], int(sys.argv[2])))
 """
 
 
-@pytest.mark.parametrize("total", [100_000])
+@pytest.mark.parametrize("total", [200_000])
 def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path, total: int) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, f"sqlite:///{tmp_path}/long.db", str(total)],
@@ -63,6 +63,6 @@ def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path,
     found = json.loads(done.stdout)
     assert found["rows"] == [total, 0, total - 1, total]
     assert found["done"] == total + 1  # the root of the episode as well
-    # In KiB, over the second half. 32 kB a node, as in the reference system, would be 1.6 GB; until the largest batch
-    # of the writer has come it grows by some MB (and not at all from 160,000 to 400,000 actions).
-    assert found["sizes"][-1] - found["sizes"][4] < 24_000, found["sizes"]
+    # In KiB, over the second half, when the largest batch of the writer has come. 32 kB a node, as in the reference
+    # system, would be 3.2 GB.
+    assert found["sizes"][-1] - found["sizes"][4] < 12_000, found["sizes"]
