@@ -72,7 +72,9 @@ class DynamicClasses:
             if self._shared(dtype) is None:
                 grown |= self._make(dtype)
         if grown:
-            # A statement compiled before knows nothing of new classes and would meet them unfinished.
+            # A statement compiled before knows nothing of new classes and would meet them unfinished. The shared
+            # mappers first: finished later, they would meet classes that are unmapped by then and not yet collected.
+            Base.registry.configure()
             self._registry.configure(cascade=True)
             for engine in self._engines:
                 self._introduce(engine)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 import weakref
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -30,6 +32,7 @@ from pycrorm_async.projections.union import unite
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms
+from tests.commands import environment
 from tests.projections.asking import stored_and_folded
 from tests.projections.script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose, row
 
@@ -288,3 +291,25 @@ async def test_a_type_is_answered_for_while_its_base_is_unknown(
     async with classes_of(log):
         (found,) = await every(log, select(Action))
         assert (type(found).__name__, found.n) == ("OrphanAction", 1)
+
+
+IN_A_NEW_PROCESS = """
+import gc
+from sqlalchemy.orm import configure_mappers
+from pycrorm_async.orm.dynamic import DynamicClasses
+from tests.projections.script import SAYING
+
+gc.disable()
+for _ in range(2):
+    classes = DynamicClasses()
+    classes.learn([SAYING])
+    classes.dispose()
+configure_mappers()
+"""
+
+
+def test_a_class_that_is_gone_before_anything_was_asked_is_in_nobodys_way() -> None:
+    root = Path(__file__).parents[2]
+    command = [sys.executable, "-c", IN_A_NEW_PROCESS]
+    done = subprocess.run(command, cwd=root, env=environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
