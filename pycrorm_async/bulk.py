@@ -10,7 +10,7 @@ __all__ = ["collect_seldom", "make"]
 make: Final = tuple.__new__
 """`make(Record, values)` is `Record(*values)` at half the cost: nobody looks whether there are too few or too many."""
 
-_OBJECTS: Final = 10_000
+_OBJECTS: Final = 50_000
 
 
 def collect_seldom() -> None:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
+from socket import socket
 
 from pycrorm_async.adoption import open_destination, shared_address
+from pycrorm_async.apart import FoldedApart
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseForeign, PycrormError, SpoolTaken
@@ -19,7 +22,7 @@ from pycrorm_async.queue.spool import RecorderFolder, Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, Moved
-from pycrorm_async.writer.ports import Found, Held, LetGo
+from pycrorm_async.writer.ports import Found, Held, LetGo, Shown
 
 __all__ = ["serve"]
 
@@ -32,10 +35,12 @@ async def serve(
     say: Callable[[str], None],
     settings: Settings | None = None,
     projections: Sequence[Projection] = (),
+    folding: socket | None = None,
 ) -> Moved:
     """Drains every recorder of the spool and folds, until `leave` is set; `say` gets one line for each notable thing.
 
-    `projections` of one's own are kept up to date too, with those that are installed.
+    `projections` of one's own are kept up to date too, with those that are installed. `folding` is the process that
+    folds (`folding_process`); without, this one does.
 
     Raises `SpoolTaken` when another daemon drains this spool, `DatabaseForeign` when a SQLite file is replaced by
     another meanwhile, and as `Memory.open` does.
@@ -47,15 +52,17 @@ async def serve(
     lock = place.take_writer()
     if lock is None:
         raise SpoolTaken(place.path, "another `pycrorm writer` drains it already")
-    try:
+    with ExitStack() as held:
+        held.callback(lock.release)
         async with open_destination(
             address, place, clock=SYSTEM_CLOCK, projections=checked(projections)
         ) as destination:
             say(f"draining {place.path} into {address}")
             look = _Folders(place, destination.log_id, address)
-            return await Daemon(destination, look, settings=settings or Settings(), say=say).run(leave)
-    finally:
-        lock.release()
+            shown: Shown = destination
+            if folding is not None:
+                shown = held.enter_context(closing(await FoldedApart.connect(destination, folding, say)))
+            return await Daemon(shown, look, settings=settings or Settings(), say=say).run(leave)
 
 
 class _Folders:

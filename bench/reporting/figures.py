@@ -11,7 +11,17 @@ from typing import Final
 
 from rich.console import Console
 
-__all__ = ["MISSING", "console", "cpu_s_of", "held_mb", "memory_free_gb", "peak_mb", "percentiles", "spread"]
+__all__ = [
+    "MISSING",
+    "console",
+    "cpu_s_of",
+    "held_mb",
+    "memory_free_gb",
+    "peak_mb",
+    "percentiles",
+    "spread",
+    "with_children",
+]
 
 MISSING: Final = "missing: pip install '.[bench]'"
 """In the place of a figure, where a library to compare with is not installed."""
@@ -49,6 +59,12 @@ def cpu_s_of(process: int) -> float:
     """How long all threads of a running process were on a processor."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def with_children(process: int) -> list[int]:
+    """A running process and those it has started."""
+    children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
+    return [process, *map(int, children)]
 
 
 def memory_free_gb() -> float:

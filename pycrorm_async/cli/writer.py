@@ -9,11 +9,13 @@ import signal
 import threading
 from collections.abc import Sequence
 from pathlib import Path
+from socket import socket
 from typing import Annotated
 
 import typer
 
 from pycrorm_async.adoption import RecoveryReport, recover
+from pycrorm_async.apart import folding_process
 from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
@@ -51,7 +53,8 @@ def writer(
     collect_seldom()
     if once:
         return _once(url, spool, projections, as_json=as_json)
-    moved = asyncio.run(_until_told_to_leave(url, spool, projections))
+    with folding_process(url, spool=spool, projections=projections) as folding:
+        moved = asyncio.run(_until_told_to_leave(url, spool, projections, folding))
     if as_json:
         print_json(moved._asdict())
     else:
@@ -59,7 +62,9 @@ def writer(
     return 0
 
 
-async def _until_told_to_leave(url: str, spool: Path | None, projections: Sequence[Projection]) -> Moved:
+async def _until_told_to_leave(
+    url: str, spool: Path | None, projections: Sequence[Projection], folding: socket
+) -> Moved:
     leave = asyncio.Event()
 
     def told() -> None:
@@ -72,7 +77,7 @@ async def _until_told_to_leave(url: str, spool: Path | None, projections: Sequen
 
     for each in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(each, told)
-    return await serve(url, spool=spool, leave=leave, say=note, projections=projections)
+    return await serve(url, spool=spool, leave=leave, say=note, projections=projections, folding=folding)
 
 
 def _once(url: str, spool: Path | None, projections: Sequence[Projection], *, as_json: bool) -> int:

@@ -51,10 +51,9 @@ class Decoder:
     """
 
     def __init__(self, types: Mapping[str, type[Happening]], upcasters: Mapping[tuple[str, int], Upcaster]) -> None:
-        self._versions = {name: kind.version for name, kind in types.items()}
-        self._shapes = {name: msgspec.json.Decoder(kind) for name, kind in types.items()}
+        self._present = {name: (kind.version, msgspec.json.Decoder(kind).decode) for name, kind in types.items()}
         self._upcasters = dict(upcasters)
-        older = {(name, each) for name, version in self._versions.items() for each in range(1, version)}
+        older = {(name, each) for name, (version, _) in self._present.items() for each in range(1, version)}
         assert self._upcasters.keys() == older, self._upcasters.keys() ^ older
 
     def decode(self, type_name: str, payload: bytes, version: int | None = None) -> Happening:
@@ -62,18 +61,18 @@ class Decoder:
 
         Raises `UnknownShape`; `msgspec.DecodeError` for bytes that are not of that shape. Both are a `ValueError`.
         """
-        present = self._versions.get(type_name)
-        if present is None:
+        known = self._present.get(type_name)
+        if known is None:
             raise UnknownShape(f"{type_name} is not an event this version knows")
-        if version is not None and not 1 <= version <= present:
-            raise UnknownShape(f"{type_name} has version {version}, this version knows {present}")
+        present, read = known
         try:
-            if version is not None and version != present:
+            if version != present and version is not None:
+                if not 1 <= version < present:
+                    raise UnknownShape(f"{type_name} has version {version}, this version knows {present}")
                 payload = self._upcast(type_name, payload, version, present)
-            event: Happening = self._shapes[type_name].decode(payload)
+            return read(payload)
         except (UnicodeDecodeError, RecursionError) as error:  # no UTF-8, or nested too deep
             raise msgspec.DecodeError(str(error)) from None
-        return event
 
     def declaration_of(self, payload: bytes) -> DesignatorTypeDeclared:
         """The declaration in these bytes. Raises as `decode` does."""

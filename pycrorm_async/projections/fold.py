@@ -26,13 +26,12 @@ from pycrorm_async.events.happenings import (
     ObjectDetected,
     ObjectMoved,
     ObjectRemoved,
-    RobotValue,
     StateSampled,
 )
 from pycrorm_async.events.ids import SLOT_ROBOT_POSE
-from pycrorm_async.projections.parameters import Designators, Parameters
-from pycrorm_async.projections.rows import EpisodeEnd, NodeEnd, Row, Rows
-from pycrorm_async.projections.values import CannotFold, json_text, microseconds, pose_columns, row
+from pycrorm_async.projections.parameters import Designators, Made
+from pycrorm_async.projections.rows import EpisodeEnd, Row, Rows
+from pycrorm_async.projections.values import CannotFold, json_text, microseconds, pose_columns, pose_row, row
 from pycrorm_async.store.rows import StoredEvent
 
 __all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "Undecodable"]
@@ -44,7 +43,8 @@ class Undecodable(CannotFold):
 
 def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
     """Adds what this event means to `rows`. Raises `CannotFold`, and then has added nothing."""
-    fold_happening(event, happening_of(event), designators, rows)
+    happening = happening_of(event)
+    _FOLDS[event.type](event, happening, designators, rows)
 
 
 def fold_happening(event: StoredEvent, happening: Happening, designators: Designators, rows: Rows) -> None:
@@ -54,14 +54,15 @@ def fold_happening(event: StoredEvent, happening: Happening, designators: Design
 
 def happening_of(event: StoredEvent) -> Happening:
     """What happened, of an event of an episode: for every fold there is. Raises `CannotFold`, `Undecodable`."""
-    if event.type not in _FOLDS:
-        raise CannotFold(f"{event.type} is not an event this version knows")
+    _, _, type_, version, _, _, payload = event
+    if type_ not in _FOLDS:
+        raise CannotFold(f"{type_} is not an event this version knows")
     try:
-        return decode(event.type, event.payload, event.version)
+        return decode(type_, payload, version)
     except UnknownShape as reason:
         raise CannotFold(str(reason)) from None
     except msgspec.DecodeError as error:
-        raise Undecodable(f"{event.type} cannot be decoded: {error}") from None
+        raise Undecodable(f"{type_} cannot be decoded: {error}") from None
 
 
 # --- episodes -------------------------------------------------------------------------------------------------
@@ -110,62 +111,65 @@ def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Design
 
 
 def _node_started(event: StoredEvent, started: NodeStarted, designators: Designators, rows: Rows) -> None:
-    number = event.number
-    node = row(number, event.sequence)
+    number, sequence, _, _, wall_ns, monotonic_ns, _ = event
+    node = row(number, sequence)
+    made: Made = []
     designator = designators.of(started)
-    parameters = designator.parameters(event, started.parameters) if designator else Parameters()
+    leaf = designator.rows(event, node, started.parameters, made) if designator is not None else ()
     parent = row(number, started.parent) if started.parent is not None else None
-    robot = _robot_columns(event, started.robot)
+    robot = started.robot
+    robot_object = row(number, robot.object.row) if robot is not None and robot.object is not None else None
     # Nothing raises from here on: an event leaves all of its rows or none.
-    if started.robot is not None:
-        rows.inserts["pose"].append(_pose_row(event, SLOT_ROBOT_POSE, started.robot.pose))
+    if robot is not None:
+        rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
     if designator is not None:
-        rows.leaves.setdefault((designator.table, designator.columns), []).append((node, *parameters.columns))
-        for table, made in parameters.rows.items():
-            rows.inserts[table].extend(made)
+        rows.leaves.setdefault(designator.leaf, []).append(leaf)
+        for table, each in made:
+            rows.inserts[table].append(each)
     rows.nodes[node] = [
         node,
         number,
         parent,
         started.kind,
-        designator.dtype if designator else None,
+        designator.dtype if designator is not None else None,
         "RUNNING",
-        microseconds(event.wall_ns),
+        wall_ns // 1000,
         None,
-        event.monotonic_ns,
-        None,
-        None,
+        monotonic_ns,
         None,
         None,
         None,
-        *robot,
+        None,
+        None,
+        node + SLOT_ROBOT_POSE if robot is not None else None,
+        robot.torso_height if robot is not None else None,
+        robot.object_type if robot is not None else None,
+        robot_object,
         started.simulated,
     ]
 
 
-def _robot_columns(event: StoredEvent, robot: RobotValue | None) -> Row:
-    """A node's columns robot_pose_id to robot_object_id."""
-    if robot is None:
-        return None, None, None, None
-    pose = row(event.number, event.sequence, SLOT_ROBOT_POSE)
-    robot_object = row(event.number, robot.object.row) if robot.object is not None else None
-    return pose, robot.torso_height, robot.object_type, robot_object
-
-
 def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:
+    number, _, _, _, wall_ns, monotonic_ns, _ = event
+    node, status = row(number, ended.node), ended.status
+    outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else _NO_OUTCOME
+    if status == "LOST":  # nobody saw when it ended
+        rows.end_node(node, status, None, None, outcome)
+    else:
+        rows.end_node(node, status, wall_ns // 1000, monotonic_ns, outcome)
+
+
+_NO_OUTCOME = (None, None, None, None)
+
+
+def _outcome(ended: NodeEnded) -> Row:
+    """A node's columns reason to result."""
     failure = ended.failure
-    lost = ended.status == "LOST"  # nobody saw when it ended
-    rows.end_node(
-        NodeEnd(
-            row(event.number, ended.node),
-            ended.status,
-            None if lost else microseconds(event.wall_ns),
-            None if lost else event.monotonic_ns,
-            failure.type.rpartition(".")[2] if failure else None,
-            failure.message if failure else None,
-            json_text(failure.arguments) if failure and failure.arguments else None,
-            json_text(ended.result) if ended.result is not None else None,
-        )
+    return (
+        failure.type.rpartition(".")[2] if failure else None,
+        failure.message if failure else None,
+        json_text(failure.arguments) if failure and failure.arguments else None,
+        json_text(ended.result) if ended.result is not None else None,
     )
 
 
@@ -173,23 +177,23 @@ def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators,
 
 
 def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designators, rows: Rows) -> None:
-    identity, node = row(event.number, event.sequence), _node(event, added.node)
+    own, number = _own(event)
+    node = _node(event, added.node)
     joints = json_text(added.joints) if added.joints else None
-    rows.inserts["pose"].append(_pose_row(event, 0, added.pose))
-    rows.inserts["object"].append(_object_row(event, added, identity, node, joints))
+    rows.inserts["pose"].append(pose_row(own, number, added.pose))
+    rows.inserts["object"].append(_object_row(event, added, own, own, node, joints))
 
 
 def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designators, rows: Rows) -> None:
     identity, node = row(event.number, moved.object), _node(event, moved.node)
-    pose = _pose_row(event, 0, moved.pose)
-    rows.inserts["pose"].append(pose)
-    rows.inserts["object"].append(_object_row(event, moved, identity, node, None))
+    own, number = _own(event)
+    rows.inserts["pose"].append(pose_row(own, number, moved.pose))
+    rows.inserts["object"].append(_object_row(event, moved, own, identity, node, None))
 
 
 def _object_row(
-    event: StoredEvent, value: ObjectAdded | ObjectMoved, identity: int, node: int | None, joints: str | None
+    event: StoredEvent, value: ObjectAdded | ObjectMoved, own: int, identity: int, node: int | None, joints: str | None
 ) -> Row:
-    own = row(event.number, event.sequence)
     time = microseconds(event.wall_ns)
     return own, event.number, "Object", value.name, value.object_type, own, None, identity, time, node, joints
 
@@ -216,7 +220,7 @@ def _joints_moved(event: StoredEvent, moved: JointsMoved, _designators: Designat
     own, number = _own(event)
     seen, node, time = row(number, moved.object.row), _node(event, moved.node), microseconds(event.wall_ns)
     rows.inserts["joint_change"].extend(
-        (own, joint, number, seen, position, time, node) for joint, position in moved.joints.items()
+        [(own, joint, number, seen, position, time, node) for joint, position in moved.joints.items()]
     )
 
 
@@ -231,7 +235,7 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
     node, time = _node(event, resolved.node), microseconds(event.wall_ns)
     pose_id = own if taken is not None else None
     if taken is not None:
-        rows.inserts["pose"].append(_pose_row(event, 0, offered[taken].pose))
+        rows.inserts["pose"].append(pose_row(own, number, offered[taken].pose))
     rows.inserts["location_resolution"].append(
         (own, number, node, resolved.location, resolved.considered, len(offered), taken, pose_id, time)
     )
@@ -248,7 +252,7 @@ def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators:
     own, number = _own(event)
     asked = (number, _node(event, detected.node), detected.source, detected.object_type)
     time = microseconds(event.wall_ns)
-    rows.inserts["detection"].extend(
+    made = [  # a list, for `row` may raise
         (
             own,
             rank,
@@ -261,15 +265,16 @@ def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators:
             time,
         )
         for rank, each in enumerate(detected.seen)
-    )
+    ]
+    rows.inserts["detection"].extend(made)
 
 
 def _state_sampled(event: StoredEvent, sampled: StateSampled, _designators: Designators, rows: Rows) -> None:
     own, number = _own(event)
-    seen, node, time = row(number, sampled.object.row), _node(event, sampled.node), microseconds(event.wall_ns)
+    seen, node = row(number, sampled.object.row), _node(event, sampled.node)
+    time, ns = microseconds(event.wall_ns), event.monotonic_ns
     rows.inserts["state_sample"].extend(
-        (own, channel, number, seen, node, value, time, event.monotonic_ns)
-        for channel, value in sampled.channels.items()
+        [(own, channel, number, seen, node, value, time, ns) for channel, value in sampled.channels.items()]
     )
 
 
@@ -282,11 +287,6 @@ def _own(event: StoredEvent) -> tuple[int, int]:
 
 def _node(event: StoredEvent, sequence: int | None) -> int | None:
     return row(event.number, sequence) if sequence is not None else None
-
-
-def _pose_row(event: StoredEvent, slot: int, pose: Any) -> Row:
-    own = row(event.number, event.sequence, slot)
-    return own, event.number, *pose_columns(pose), microseconds(pose.time_ns)
 
 
 _FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {

@@ -133,7 +133,7 @@ class Folding:
         types = await self._types_now()
         done = _folded(spans, events, types.batch())
         try:
-            async with self._log.engine.begin() as connection:
+            async with self._log.writing() as connection:
                 written = await self._write(connection, done, types)
                 if written is None:
                     await connection.rollback()
@@ -195,7 +195,7 @@ class Folding:
             cut = events[middle - 1].sequence
             count = await self.batch([span._replace(last=cut)], events[:middle])
             return count + (await self.batch([span._replace(after=cut)], events[middle:]) if count == middle else 0)
-        async with self._log.engine.begin() as connection:
+        async with self._log.writing() as connection:
             reason = f"event {events[0].sequence}: the database refuses it: {refusal}"
             await self._goal.park(connection, events[0].number, reason)
         return 0

@@ -70,8 +70,10 @@ class OwnRows:
     async def write(self, connection: AsyncConnection, generation: int) -> None:
         """All of it, in this transaction. Raises `RowRefused`."""
         dialect, quote = dialect_of(connection), connection.dialect.identifier_preparer.quote
-        for (table, columns), made in self.to_insert().items():
-            await dialect.insert_rows(connection, physical_name(table, generation), columns, made)
+        inserts = self.to_insert().items()
+        await dialect.insert_rows(
+            connection, {(physical_name(table, generation), columns): rows for (table, columns), rows in inserts}
+        )
         for table, rows in self._updates.items():
             alike: dict[tuple[str, ...], list[Row]] = {}
             for id_, values in rows.items():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, TypeAlias
 
+from pycrorm_async.bulk import make
 from pycrorm_async.projections.tables import COLUMNS
 
 __all__ = ["Rows", "Row", "NodeEnd", "EpisodeEnd"]
@@ -68,13 +69,16 @@ class Rows:
         self.episode_ends: list[EpisodeEnd] = []
         self.lost: list[int] = []
 
-    def end_node(self, end: NodeEnd) -> None:
-        """The node's row has an end, here or in the tables."""
-        row = self.nodes.get(end.id)
+    def end_node(self, node: int, status: str, end_time: int | None, end_ns: int | None, outcome: Row) -> None:
+        """The node's row has an end, here or in the tables. `outcome` is the columns reason to result."""
+        row = self.nodes.get(node)
         if row is None:
-            self.node_ends.append(end)
+            self.node_ends.append(make(NodeEnd, (node, status, end_time, end_ns, *outcome)))
             return
-        _, row[_STATUS], row[_END_TIME], row[_END_NS], *row[_OUTCOME] = end
+        row[_STATUS] = status
+        row[_END_TIME] = end_time
+        row[_END_NS] = end_ns
+        row[_OUTCOME] = outcome
 
     def end_episode(self, end: EpisodeEnd) -> None:
         """The episode's row has an end, here or in the tables."""
@@ -95,7 +99,7 @@ class Rows:
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
         """All rows to insert, by (table, columns)."""
-        self.inserts["task_tree_node"] = [tuple(row) for row in self.nodes.values()]
-        self.inserts["process_metadata"] = [tuple(row) for row in self.episodes.values()]
+        self.inserts["task_tree_node"] = list(map(tuple, self.nodes.values()))
+        self.inserts["process_metadata"] = list(map(tuple, self.episodes.values()))
         core = {(table, COLUMNS[table]): rows for table, rows in self.inserts.items()}
         return {key: rows for key, rows in (core | self.leaves).items() if rows}

@@ -5,19 +5,24 @@ What stands where another type was declared, or names what cannot be, raises `Ca
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import msgspec
 
 from pycrorm_async.events.happenings import FieldDeclared, ObjectReference, ObjectValue, PoseValue
-from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_id
+from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_id, row_key
+from pycrorm_async.projections.rows import Row
 
 __all__ = [
+    "AS_IT_IS",
     "CannotFold",
     "row",
+    "in_slot",
     "microseconds",
     "pose_columns",
+    "pose_row",
     "is_missing",
     "scalar",
     "pose_of",
@@ -36,6 +41,9 @@ _SCALARS: dict[str, tuple[type, ...]] = {
     "boolean": (bool,),
 }
 
+AS_IT_IS: Mapping[str, type] = {kind: types[0] for kind, types in _SCALARS.items()}
+"""By a field's type, the Python type whose values its column holds just as they are."""
+
 
 class CannotFold(ValueError):
     """An event that no row can be made of; the message says why."""
@@ -43,9 +51,16 @@ class CannotFold(ValueError):
 
 def row(number: int, sequence: int, slot: int = 0) -> int:
     """The row's id. Raises `CannotFold` for a sequence or slot that no row can have."""
-    if not 0 < sequence <= SEQUENCE_MAX or not 0 <= slot <= SLOT_MAX:
-        raise CannotFold(f"no row can have the sequence {sequence} and the slot {slot}")
-    return number * _ROWS_OF_EPISODE + sequence * _ROWS_OF_EVENT + slot  # as `row_id`, whose checks were made
+    if 0 < sequence <= SEQUENCE_MAX and 0 <= slot <= SLOT_MAX:
+        return number * _ROWS_OF_EPISODE + sequence * _ROWS_OF_EVENT + slot  # as `row_id`, whose checks were made
+    raise CannotFold(f"no row can have the sequence {sequence} and the slot {slot}")
+
+
+def in_slot(own: int, slot: int) -> int:
+    """The id of another row of the event whose own row that is. Raises `CannotFold` for a slot that no row can have."""
+    if 0 <= slot <= SLOT_MAX:
+        return own + slot
+    raise CannotFold(f"no row can have the sequence {row_key(own).sequence} and the slot {slot}")
 
 
 def microseconds(nanoseconds: int) -> int:
@@ -58,9 +73,18 @@ def pose_columns(pose: PoseValue) -> tuple[float, float, float, float, float, fl
     return (*pose.position, *pose.orientation, pose.frame)
 
 
+def pose_row(own: int, number: int, pose: PoseValue) -> Row:
+    """The row of `pose` with this id, in the episode of this number."""
+    x, y, z = pose.position
+    qx, qy, qz, qw = pose.orientation
+    return own, number, x, y, z, qx, qy, qz, qw, pose.frame, pose.time_ns // 1000
+
+
 def is_missing(value: Any) -> bool:
     """Whether a `MissingValue` stands here."""
-    return isinstance(value, dict) and isinstance(value.get("missing"), str) and value.keys() <= {"missing", "repr"}
+    if not isinstance(value, dict) or "missing" not in value:
+        return False
+    return isinstance(value["missing"], str) and value.keys() <= {"missing", "repr"}
 
 
 def scalar(field: FieldDeclared, kind: str, value: Any) -> Any:

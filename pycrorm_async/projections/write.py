@@ -23,8 +23,8 @@ async def write_rows(connection: AsyncConnection, rows: Rows, generation: int) -
     No row may be there already; one that is would be a fault of the fold or of the log, and raises `RowRefused`.
     """
     dialect = dialect_of(connection)
-    for (table, columns), made in rows.to_insert().items():
-        await dialect.insert_rows(connection, physical_name(table, generation), columns, made)
+    made = {(physical_name(table, generation), columns): some for (table, columns), some in rows.to_insert().items()}
+    await dialect.insert_rows(connection, made)
     for table, fields, ends in (
         ("task_tree_node", NodeEnd._fields, rows.node_ends),
         ("process_metadata", EpisodeEnd._fields, rows.episode_ends),

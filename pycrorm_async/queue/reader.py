@@ -13,8 +13,7 @@ from typing import NamedTuple
 from pycrorm_async.bulk import make
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.queue.frame import COMMIT, EVENT, Buffer, decode
+from pycrorm_async.queue.frame import COMMIT, EVENT, Buffer, decode_each
 from pycrorm_async.queue.segment import decode_header, header_bytes, salt_of
 
 __all__ = ["Cursor", "Batch", "Reader", "map_segment"]
@@ -63,39 +62,36 @@ class Reader:
         """
         records, total, (number, offset, position), _ = begun or Batch([], 0, self.cursor, complete=False)
         types = self._types
-        complete = False
         if number != self._number:
             self._turn_to(number)
-        salt = salt_of(self._recorder, number)
-        while position < last:
-            if len(records) >= events_max:
-                complete = True
-                break
-            frame = decode(self._buffer, offset, salt)
-            if frame is None:
+        until = min(last, position + events_max - len(records))
+        full = False
+        while position < until and not full:
+            for frame in decode_each(self._buffer, offset, salt_of(self._recorder, number)):
+                kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, _, size = frame
+                if kind != COMMIT:
+                    total += len(payload)
+                    if total > bytes_max and records:
+                        total -= len(payload)
+                        full = True
+                        break
+                    if at != position + 1:
+                        raise SpoolDamaged(self._path, offset, f"holds position {at} where {position + 1} belongs")
+                    position = at
+                    type_name = types.get(name)
+                    if type_name is None:
+                        type_name = types[name] = name.decode()
+                    owner = episode if kind == EVENT else None
+                    values = (position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
+                    records.append(make(Record, values))
+                offset += size
+                if position == until:
+                    break
+            else:
                 number, offset = number + 1, self._next_segment(number + 1, offset, position)
-                salt = salt_of(self._recorder, number)
                 if not records:  # the segment that ended may be deleted before the next read
                     self.cursor = Cursor(number, offset, position)
-                continue
-            kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, _, size = frame
-            if kind != COMMIT:
-                total += len(payload)
-                if total > bytes_max and records:
-                    total -= len(payload)
-                    complete = True
-                    break
-                if at != position + 1:
-                    raise SpoolDamaged(self._path, offset, f"holds position {at} where {position + 1} belongs")
-                position = at
-                type_name = types.get(name)
-                if type_name is None:
-                    type_name = types[name] = name.decode()
-                owner = EpisodeId(episode) if kind == EVENT else None
-                values = (position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
-                records.append(make(Record, values))
-            offset += size
-        complete = complete or len(records) >= events_max or total >= bytes_max
+        complete = full or len(records) >= events_max or total >= bytes_max
         return Batch(records, total, Cursor(number, offset, position), complete)
 
     def close(self) -> None:

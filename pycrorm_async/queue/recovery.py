@@ -28,7 +28,7 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
 
     None also for what was refused of a recorder whose own folder is still there: whoever drains that may put more in.
 
-    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte, some 300,000
+    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte, some 500,000
     records a second, and has the disk keep what is given away. Raises `SpoolDamaged`, `SpoolForeign` and
     `SpoolUnavailable`, holding nothing.
     """

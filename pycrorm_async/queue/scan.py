@@ -13,7 +13,17 @@ from typing import NamedTuple
 from pycrorm_async.bulk import make
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.queue.frame import CHECKSUM, COMMIT, EVENT, HEADER_BYTES, Buffer, Frame, chain, decode
+from pycrorm_async.queue.frame import (
+    CHECKSUM,
+    COMMIT,
+    EVENT,
+    HEADER_BYTES,
+    Buffer,
+    Frame,
+    decode,
+    decode_each,
+    span_checksum,
+)
 from pycrorm_async.queue.reader import Cursor
 from pycrorm_async.queue.segment import (
     CLOSES,
@@ -78,7 +88,7 @@ def scan(folder: Path, recorder: bytes) -> Kept:
     return kept
 
 
-def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] = lambda *_: None) -> Survey:
+def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] | None = None) -> Survey:
     """What `scan` looks at, with damage as an answer. `seen` is told of each kept frame and its segment's number."""
     numbers = segment_numbers(folder)
     walk = _Walk(folder, recorder, seen)
@@ -96,18 +106,18 @@ def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] 
 class _Walk:
     """Goes from the oldest segment to the first hole."""
 
-    def __init__(self, folder: Path, recorder: bytes, seen: Callable[[int, Frame], None]) -> None:
+    def __init__(self, folder: Path, recorder: bytes, seen: Callable[[int, Frame], None] | None) -> None:
         self._folder = folder
         self._recorder = recorder
         self._seen = seen
         self._start = self._cut = Cursor(0, 0, 0)
         self._bases: dict[int, int] = {}
-        self._open: dict[EpisodeId, Last | Frame] = {}
+        self._open: dict[bytes, tuple[int, int, int]] = {}
         self._unsaid: list[int] = []  # checksums of the records that no commit frame has covered yet
 
     def kept(self, numbers: list[int]) -> Kept:
-        last = {name: Last(each.sequence, each.wall_ns, each.monotonic_ns) for name, each in self._open.items()}
-        return Kept(self._start, self._cut, self._bases, last, numbers)
+        opened = {EpisodeId(episode): Last(*last) for episode, last in self._open.items()}
+        return Kept(self._start, self._cut, self._bases, opened, numbers)
 
     @property
     def unsaid(self) -> tuple[int, ...]:
@@ -128,41 +138,39 @@ class _Walk:
         first = header_bytes(len(header.open))
         if not self._bases:
             self._start = Cursor(number, first, header.base - 1)
-            self._open = dict(header.open)
+            self._open = dict(header.open.items())
         self._bases[number] = header.base
         self._cut = Cursor(number, first, header.base - 1)
-        salt = salt_of(self._recorder, number)
-        while (frame := decode(buffer, self._cut.offset, salt)) is not None:
-            if frame.kind == COMMIT:
-                self._check_commit(path, frame)
-                position = self._cut.position
-            elif frame.position == self._cut.position + 1:
-                self._keep(path, frame)
-                position = frame.position
-            else:
-                break
-            self._cut = make(Cursor, (number, self._cut.offset + frame.size, position))
-            self._seen(number, frame)
+        self._go_through(path, buffer, number)
         return True
 
-    def _keep(self, path: Path, frame: Frame) -> None:
-        if frame.kind == EVENT:
-            self._follow(path, frame)
-        self._unsaid.append(frame.checksum)
-
-    def _follow(self, path: Path, frame: Frame) -> None:
-        """The event is the next one of its episode."""
-        episode = EpisodeId(frame.episode)
-        before = self._open.get(episode)
-        if frame.sequence != (before.sequence if before else 0) + 1:
-            raise SpoolDamaged(
-                path,
-                self._cut.offset,
-                f"event {frame.sequence} of episode {episode_text(episode)} follows {before and before.sequence}",
-            )
-        self._open[episode] = frame
-        if frame.type == _CLOSES:
-            del self._open[episode]
+    def _go_through(self, path: Path, buffer: Buffer, number: int) -> None:
+        """Keeps a segment's records from the cut on, up to the first hole or damage; there is the cut then."""
+        opened, unsaid, seen = self._open, self._unsaid, self._seen
+        _, offset, position = self._cut
+        try:
+            for frame in decode_each(buffer, offset, salt_of(self._recorder, number)):
+                kind, _, at, sequence, wall_ns, monotonic_ns, episode, type_name, _, checksum, size = frame
+                if kind == COMMIT:
+                    self._cut = Cursor(number, offset, position)
+                    self._check_commit(path, make(Frame, frame))
+                elif at == position + 1:
+                    if kind == EVENT:
+                        before = opened.get(episode)
+                        if sequence != (before[0] if before else 0) + 1:
+                            raise _not_next(path, offset, episode, sequence, before)
+                        opened[episode] = (sequence, wall_ns, monotonic_ns)
+                        if type_name == _CLOSES:
+                            del opened[episode]
+                    unsaid.append(checksum)
+                    position = at
+                else:
+                    break
+                offset += size
+                if seen is not None:
+                    seen(number, make(Frame, frame))
+        finally:
+            self._cut = Cursor(number, offset, position)
 
     def _check_commit(self, path: Path, frame: Frame) -> None:
         """The records it covers are all here and are those it was written for."""
@@ -170,13 +178,17 @@ class _Walk:
         if later < 0:
             raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was safe and is missing")
         covered = self._unsaid[: max(0, len(self._unsaid) - later)]
-        if len(covered) >= frame.sequence:  # else segments with records it covers are stored and gone
-            checksum = 0
-            for each in covered:
-                checksum = chain(each, checksum)
-            if len(covered) != frame.sequence or frame.payload != CHECKSUM.pack(checksum):
-                raise SpoolDamaged(path, self._cut.offset, "the records before are not those that were safe here")
-        self._unsaid = self._unsaid[len(covered) :]
+        gone = frame.sequence - len(covered)  # more than 0: segments with records it covers are stored and deleted
+        if gone < 0 or (gone == 0 and frame.payload != CHECKSUM.pack(span_checksum(covered))):
+            raise SpoolDamaged(path, self._cut.offset, "the records before are not those that were safe here")
+        del self._unsaid[: len(covered)]
+
+
+def _not_next(
+    path: Path, offset: int, episode: bytes, sequence: int, before: tuple[int, int, int] | None
+) -> SpoolDamaged:
+    name = episode_text(EpisodeId(episode))
+    return SpoolDamaged(path, offset, f"event {sequence} of episode {name} follows {before and before[0]}")
 
 
 def checked_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:

@@ -11,11 +11,13 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 
-__all__ = ["Dialect", "Birth", "Expected", "Found", "Migrations", "Progress", "RowRefused"]
+__all__ = ["Dialect", "Birth", "Expected", "Found", "Migrations", "Progress", "RowRefused", "RowsByTable"]
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; format N is what the first N of them make."""
 
+RowsByTable: TypeAlias = Mapping[tuple[str, tuple[str, ...]], Sequence[tuple[Any, ...]]]
+"""Rows to insert, by table and its columns."""
 Progress: TypeAlias = tuple[int, int, int]
 """An episode's number, how far it was folded, how far it is now."""
 
@@ -190,9 +192,7 @@ class Dialect(Protocol):
         """
         ...
 
-    async def insert_rows(
-        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
-    ) -> None:
+    async def insert_rows(self, connection: AsyncConnection, rows: RowsByTable) -> None:
         """Raises `RowRefused`."""
         ...
 

@@ -8,10 +8,11 @@ await log.close()
 
 from __future__ import annotations
 
+import asyncio
 import os
 import uuid
 from collections.abc import AsyncIterator, Iterator, Sequence
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
@@ -46,6 +47,7 @@ class EventLog:
         self._reads = engine.execution_options(**{BEGIN: "BEGIN"})
         self._dialect = dialect_of(engine)
         self._file = _identity(address.path) if address.is_sqlite else None
+        self._turn = asyncio.Lock() if address.is_sqlite else None
 
     @classmethod
     async def open(
@@ -104,7 +106,7 @@ class EventLog:
         if not records:
             return {}
         with self.translated():
-            async with self.engine.begin() as connection:
+            async with self.writing() as connection:
                 refusals = await append_batch(self._dialect, connection, records)
         # SQLite goes on writing into a file that was removed or replaced, where nobody will find it.
         if self.address.is_sqlite and _identity(self.address.path) != self._file:
@@ -175,6 +177,13 @@ class EventLog:
         """The payloads of all DesignatorTypeDeclared, in the order of their first arrival."""
         async with self.reading() as connection:
             return await self._dialect.declarations(connection)
+
+    @asynccontextmanager
+    async def writing(self) -> AsyncIterator[AsyncConnection]:
+        """A transaction that writes, committed at the end. Those of this log wait for each other here if the database
+        has one writer at a time: whoever waits there sleeps and looks again, and looks too late."""
+        async with self._turn or nullcontext(), self.engine.begin() as connection:
+            yield connection
 
     @asynccontextmanager
     async def snapshot(self) -> AsyncIterator[AsyncConnection]:

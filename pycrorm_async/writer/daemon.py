@@ -25,7 +25,7 @@ __all__ = ["Daemon", "Moved", "LEAVE_S"]
 
 LEAVE_S: Final = 10.0
 """How long leaving may take. What is not stored by then stays in its folder, and the next daemon finds it."""
-_LOOK_S: Final = 0.5
+_LOOK_S: Final = 0.2
 _REST = Backoff(first_s=1.0, longest_s=60.0)
 """Before a folder is tried again that could not be drained to its end: it is damaged, or nothing can be set aside."""
 

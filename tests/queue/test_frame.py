@@ -1,5 +1,6 @@
 """A frame is read whole and unchanged, or not at all; the golden bytes are reckoned here by hand."""
 
+import mmap
 import struct
 import zlib
 from pathlib import Path
@@ -8,7 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pycrorm_async.queue.frame import COMMIT, DECLARATION, EVENT, Frame, decode, encode, encode_commit
+from pycrorm_async.queue.frame import (
+    COMMIT,
+    DECLARATION,
+    EVENT,
+    Frame,
+    decode,
+    decode_each,
+    encode,
+    encode_commit,
+    span_checksum,
+)
 
 SALT = 0xA1B2C3D4
 EPISODE = bytes(range(0x10, 0x20))
@@ -148,3 +159,50 @@ def test_any_payload_comes_back_and_frames_end_at_multiples_of_8(payload: bytes,
     assert frame is not None
     assert (frame.payload, frame.position, frame.size) == (payload, position, len(encoded))
     assert len(encoded) % 8 == 0
+
+
+ROW = (GOLDEN["event"], GOLDEN["declaration"], GOLDEN["commit"], event(b""))
+OFFSETS = (0, 88, 176, 248)
+
+
+def test_frames_that_follow_one_another_come_as_each_decodes_alone() -> None:
+    row = b"".join(ROW)
+    each = list(decode_each(b"12345678" + row + bytes(64), 8, SALT))
+    assert each == [decode(row, offset, SALT) for offset in OFFSETS]
+    assert list(decode_each(row, 88, SALT)) == each[1:]
+    assert list(decode_each(row, len(row), SALT)) == []
+
+
+def test_frames_end_before_the_first_that_is_cut_at_any_byte() -> None:
+    row = b"".join(ROW)
+    whole = list(decode_each(row, 0, SALT))
+    for end in range(len(row)):
+        count = sum(offset + len(frame) <= end for offset, frame in zip(OFFSETS, ROW, strict=True))
+        assert list(decode_each(row[:end], 0, SALT)) == whole[:count], end
+
+
+def test_no_frame_comes_after_one_with_any_one_bit_flipped() -> None:
+    row = b"".join(ROW)
+    whole = list(decode_each(row, 0, SALT))
+    for bit in range(88 * 8, 176 * 8):
+        changed = bytearray(row)
+        changed[bit // 8] ^= 1 << bit % 8
+        assert list(decode_each(bytes(changed), 0, SALT)) == whole[:1], bit
+
+
+def test_a_frame_is_looked_at_when_it_is_asked_for_and_not_before() -> None:
+    with mmap.mmap(-1, 4096) as buffer:
+        buffer[:88] = GOLDEN["event"]
+        each = decode_each(buffer, 0, SALT)
+        assert next(each) == decode(GOLDEN["event"], 0, SALT)
+        buffer[88:176] = GOLDEN["declaration"]
+        assert next(each) == decode(GOLDEN["declaration"], 0, SALT)
+        assert next(each, None) is None
+
+
+@given(st.lists(st.integers(min_value=0, max_value=2**32 - 1), max_size=50))
+def test_the_checksum_of_a_span_is_that_of_its_records_one_after_the_other(checksums: list[int]) -> None:
+    span = 0
+    for checksum in checksums:
+        span = zlib.crc32(struct.pack("<I", checksum), span)
+    assert span_checksum(checksums) == span

@@ -93,7 +93,7 @@ async def test_finding_what_is_behind_looks_at_no_other_episode(file_log: EventL
     assert "episode_behind" in behind
     assert "TEMP B-TREE" not in behind
     spans = " | ".join(
-        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_SPANS}", ("[]",))
+        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_SPAN}", (1, 0, 9))
     )
     assert "SEARCH event USING INDEX" in spans
     assert "SCAN event" not in spans

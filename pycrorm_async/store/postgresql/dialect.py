@@ -11,7 +11,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk import make
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused
+from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused, RowsByTable
 from pycrorm_async.store.postgresql import faults, tables
 from pycrorm_async.store.postgresql import statements as sql
 from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
@@ -211,10 +211,9 @@ class PostgreSQL:
             connection, [f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()]
         )
 
-    async def insert_rows(
-        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
-    ) -> None:
-        await _copy(connection, TABLES_SCHEMA, table, columns, rows)
+    async def insert_rows(self, connection: AsyncConnection, rows: RowsByTable) -> None:
+        for (table, columns), some in rows.items():
+            await _copy(connection, TABLES_SCHEMA, table, columns, some)
 
     async def update_rows(
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]

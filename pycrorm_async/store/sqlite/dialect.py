@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
-from itertools import accumulate, chain
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk import make
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused
+from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused, RowsByTable
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
@@ -76,11 +76,8 @@ class SQLite:
         return list(range(taken + 1, taken + 1 + count))
 
     async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None:
-        payloads = [each.payload for each in events]
-        lengths = [len(payload) for payload in payloads]
-        cuts = zip(accumulate(lengths, initial=1), lengths, strict=False)  # SQL counts from 1
-        placed = [each[:6] + cut for each, cut in zip(events, cuts, strict=True)]
-        await connection.exec_driver_sql(sql.INSERT_EVENTS, (b"".join(payloads), _json(placed)))
+        rows = [(*each[:6], each.payload.decode()) for each in events]
+        await (await _driver(connection)).execute_in_turn(_inserts("event", sql.EVENT_COLUMNS, rows))
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(each) for each in episodes]),))
@@ -106,7 +103,9 @@ class SQLite:
         return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
 
     async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
-        return await _rows(StoredEvent, connection, sql.SELECT_SPANS, _json(spans))
+        parts = [part for span in spans for part in _parts_of(span)]
+        found = await (await _driver(connection)).rows_in_turn(sql.SELECT_SPAN, parts)
+        return [event for part, row in zip(parts, found, strict=True) for event in _events(part.number, *row)]
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
@@ -188,12 +187,11 @@ class SQLite:
         for name, text in views.items():
             await connection.exec_driver_sql(f"CREATE TEMP VIEW {quote(name)} AS {text}")
 
-    async def insert_rows(
-        self, connection: AsyncConnection, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
-    ) -> None:
+    async def insert_rows(self, connection: AsyncConnection, rows: RowsByTable) -> None:
         quote = connection.dialect.identifier_preparer.quote
-        into = f"INSERT INTO {quote(table)} ({', '.join(map(quote, columns))}) VALUES "  # noqa: S608
-        await _execute(connection, [(into + _placeholders(part), _flat(part)) for part in _parts(rows, len(columns))])
+        statements = (_inserts(quote(table), [*map(quote, columns)], some) for (table, columns), some in rows.items())
+        with _rows_refused():
+            await (await _driver(connection)).execute_in_turn(chain.from_iterable(statements))
 
     async def update_rows(
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
@@ -202,9 +200,9 @@ class SQLite:
         changes = ", ".join(f"{column} = change.column{place}" for place, column in enumerate(names, 2))
         update = f"UPDATE {table} SET {changes} FROM (VALUES "  # noqa: S608
         of = f") AS change WHERE {table}.id = change.column1"
-        await _execute(
-            connection, [(update + _placeholders(part) + of, _flat(part)) for part in _parts(rows, len(columns))]
-        )
+        statements = ((update + _placeholders(part) + of, _flat(part)) for part in _parts(rows, len(columns)))
+        with _rows_refused():
+            await (await _driver(connection)).execute_in_turn(statements)
 
     # --- faults -------------------------------------------------------------------------------------------------
 
@@ -212,6 +210,8 @@ class SQLite:
         return faults.ours(error.orig if isinstance(error, DBAPIError) else error, name)
 
 
+_EVENTS_AT_ONCE = 250
+_HEADS = msgspec.json.Decoder(list[tuple[int, str, int, int, int, int]])
 _PARAMETERS_MAX = 8_000
 """In one statement. SQLite takes 32,766, but is a third slower with so many; with fewer, a busy plan is waited for more
 often."""
@@ -236,12 +236,36 @@ def _flat(rows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
     return tuple(chain.from_iterable(rows))
 
 
-async def _execute(connection: AsyncConnection, statements: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
-    """All of them in one visit to the connection's thread, within the transaction that has begun."""
+def _inserts(table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, Any]]:
+    """The statements that insert these rows, with their parameters."""
+    into = f"INSERT INTO {table} ({', '.join(columns)}) VALUES "  # noqa: S608
+    return ((into + _placeholders(part), _flat(part)) for part in _parts(rows, len(columns)))
+
+
+def _parts_of(span: Span) -> Iterator[Span]:
+    """So few events at once that their payloads fit into what SQLite gives as one value."""
+    for after in range(span.after, span.last, _EVENTS_AT_ONCE):
+        yield Span(span.number, after, min(after + _EVENTS_AT_ONCE, span.last))
+
+
+def _events(number: int, heads: str, payloads: bytes | None) -> Iterator[StoredEvent]:
+    try:
+        found = _HEADS.decode(heads)
+    except msgspec.DecodeError as error:
+        raise DamageError(f"events of episode {number} are damaged: {error}") from None
+    at = 0
+    for *head, length in found:
+        yield make(StoredEvent, (number, *head, payloads[at : at + length] if payloads else b""))
+        at += length
+
+
+async def _driver(connection: AsyncConnection) -> Connection:
+    """What is under it, for many statements in one visit to its thread; in a transaction that it is in or begins."""
+    if not connection.in_transaction():
+        await connection.begin()
     driver = (await connection.get_raw_connection()).driver_connection
     assert isinstance(driver, Connection)
-    with _rows_refused():
-        await driver.execute_in_turn(statements)
+    return driver
 
 
 @contextmanager

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Self, TypeVar
 
 import aiosqlite
 from sqlalchemy import URL, event
@@ -19,9 +20,14 @@ from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 
 __all__ = ["make_engine", "BEGIN", "Connection"]
 
+_T = TypeVar("_T")
+
 BEGIN = "sqlite_begin"
 """Execution option: the statement that begins a transaction, None for none at all."""
 
+_WRITE = "BEGIN IMMEDIATE"
+_LOOK_S = 0.001
+"""So often who waits for its turn to write looks whether it has come."""
 _ROWS_AT_ONCE = 64
 _STATEMENTS = 512
 """Kept compiled: some ten for each table that is written."""
@@ -37,7 +43,7 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
     engine = create_async_engine(
         URL.create("sqlite+aiosqlite", database=str(path)),
         async_creator=lambda: _connect(uri, busy_timeout_s),
-        execution_options={BEGIN: "BEGIN" if read_only else "BEGIN IMMEDIATE"},
+        execution_options={BEGIN: "BEGIN" if read_only else _WRITE},
         hide_parameters=True,
     )
     event.listen(engine.sync_engine, "begin", _begin)
@@ -54,6 +60,8 @@ class Connection(aiosqlite.Connection):
     thread had ended by then, and the closing waited for ever, and `asyncio.run` for it.
     """
 
+    patience_s = 0.0
+    """How long a transaction that writes waits for its turn."""
     _end: tuple[asyncio.Future[Any] | None] | None = None
 
     def stop(self) -> asyncio.Future[Any] | None:
@@ -61,14 +69,89 @@ class Connection(aiosqlite.Connection):
             self._end = (super().stop(),)
         return self._end[0]
 
-    async def execute_in_turn(self, statements: Sequence[tuple[str, tuple[Any, ...]]]) -> None:
-        """These statements, one after the other, in one visit to the thread. Raises as `sqlite3` does."""
+    def cursor(self) -> Cursor:  # type: ignore[override]
+        return Cursor(self)
 
-        def execute() -> None:
+    async def visit(self, work: Callable[[sqlite3.Connection], _T]) -> _T:
+        """Does this in the connection's thread."""
+        done: _T = await self._execute(work, self._conn)  # type: ignore[no-untyped-call]
+        return done
+
+    async def execute_in_turn(self, statements: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
+        """These statements, each made when its turn comes, in one visit to the thread. Raises as `sqlite3` does."""
+
+        def execute(connection: sqlite3.Connection) -> None:
             for statement, parameters in statements:
-                self._conn.execute(statement, parameters)
+                connection.execute(statement, parameters)
 
-        await self._execute(execute)  # type: ignore[no-untyped-call]
+        await self.visit(execute)
+
+    async def rows_in_turn(self, statement: str, asked: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """The one row that this statement gives for each of these parameters, in one visit to the thread. Raises so."""
+
+        return await self.visit(lambda connection: [connection.execute(statement, each).fetchone() for each in asked])
+
+
+class Cursor:
+    """What SQLAlchemy uses of a cursor. A statement and its first rows take one visit to the thread, which takes longer
+    than most statements do; with the driver's own they take four."""
+
+    arraysize = 1
+
+    def __init__(self, connection: Connection) -> None:
+        self.description: Any = None
+        self.rowcount = -1
+        self.lastrowid: int | None = None
+        self._connection = connection
+        self._cursor: sqlite3.Cursor | None = None  # while it has more rows than those here
+        self._rows: list[Any] = []
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def execute(self, statement: str, parameters: Any = ()) -> Self:
+        def execute(connection: sqlite3.Connection) -> None:
+            if statement == _WRITE:
+                _wait_for_turn(connection, self._connection.patience_s)
+            else:
+                self._keep(connection.execute(statement, parameters))
+
+        await self._connection.visit(execute)
+        return self
+
+    async def executemany(self, statement: str, parameters: Any) -> Self:
+        await self._connection.visit(lambda connection: self._keep(connection.executemany(statement, parameters)))
+        return self
+
+    async def fetchall(self) -> list[Any]:
+        if (cursor := self._cursor) is not None:
+            self._rows += await self._connection.visit(lambda _: cursor.fetchall())
+        rows, self._rows, self._cursor = self._rows, [], None
+        return rows
+
+    async def fetchmany(self, size: int | None = None) -> list[Any]:
+        size = size or self.arraysize
+        if len(self._rows) < size and (cursor := self._cursor) is not None:
+            self._rows += await self._connection.visit(lambda _: cursor.fetchmany(size))
+        rows, self._rows = self._rows[:size], self._rows[size:]
+        return rows
+
+    async def fetchone(self) -> Any:
+        return next(iter(await self.fetchmany(1)), None)
+
+    async def close(self) -> None:
+        self._rows = []
+        if (cursor := self._cursor) is not None:
+            self._cursor = None
+            await self._connection.visit(lambda _: cursor.close())
+
+    def _keep(self, cursor: sqlite3.Cursor) -> None:
+        self._rows = cursor.fetchmany(_ROWS_AT_ONCE)
+        self.description, self.rowcount, self.lastrowid = cursor.description, cursor.rowcount, cursor.lastrowid
+        if len(self._rows) == _ROWS_AT_ONCE:
+            self._cursor = cursor
+        else:
+            cursor.close()
 
 
 async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
@@ -78,6 +161,7 @@ async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
         )
 
     connection = Connection(connector, _ROWS_AT_ONCE)
+    connection.patience_s = busy_timeout_s
     thread = connection._thread  # noqa: SLF001 - as SQLAlchemy's own connecting does: there is no public way to it
     thread.daemon = True
     try:
@@ -87,6 +171,25 @@ async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
         while thread.is_alive():  # noqa: ASYNC110 - a thread sets no event of ours
             await asyncio.sleep(0.001)
         raise
+
+
+def _wait_for_turn(connection: sqlite3.Connection, patience_s: float) -> None:
+    """Begins a transaction that writes. SQLite itself would wait too, but sleep longer with every time it looks: two
+    processes that both write all the time used to sleep a third of theirs."""
+    connection.execute("PRAGMA busy_timeout = 0")
+    until_s = time.monotonic() + patience_s
+    try:
+        while True:
+            try:
+                connection.execute(_WRITE)
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() >= until_s:
+                    raise
+                time.sleep(_LOOK_S)
+            else:
+                return
+    finally:
+        connection.execute(f"PRAGMA busy_timeout = {int(patience_s * 1000)}")
 
 
 def _begin(connection: Begun) -> None:

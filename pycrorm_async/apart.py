@@ -1,0 +1,165 @@
+"""A process that folds, beside the one that appends: so that each has a core.
+
+    with folding_process(url, spool=spool, projections=projections) as process:
+        asyncio.run(serve(url, ..., folding=process))
+
+It is forked before anything is open, opens the database for itself when it is asked for the first time, and folds a
+batch each time it is asked. It holds nothing: when it dies, whoever asked folds from then on, and when that one dies
+it ends too.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from pycrorm_async.adoption import LogAndTables, open_destination, shared_address
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import DatabaseError, DatabaseUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.projections.own import Projection
+from pycrorm_async.queue.spool import Spool
+from pycrorm_async.writer.ports import Shown
+
+__all__ = ["folding_process", "FoldedApart"]
+
+_NOT_FOR_IT = (signal.SIGINT, signal.SIGTERM)
+"""What a terminal or a service manager sends to all processes at once: the one that appends ends it."""
+
+
+class _Answer(msgspec.Struct, omit_defaults=True):
+    """Whether there was something to fold; or why not: the database is away, something else is wrong."""
+
+    more: bool = False
+    away: str | None = None
+    fault: str | None = None
+
+
+class _Streams(NamedTuple):
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+
+
+@contextmanager
+def folding_process(url: str, *, spool: Path | None, projections: Sequence[Projection] = ()) -> Iterator[socket.socket]:
+    """A process that folds this memory when asked through the socket; it is gone when the context is left.
+
+    To be called while this process has one thread.
+    """
+    ours, theirs = socket.socketpair()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _NOT_FOR_IT)
+    process = os.fork()
+    if process == 0:
+        try:
+            ours.close()
+            for each in _NOT_FOR_IT:
+                signal.signal(each, signal.SIG_IGN)
+            asyncio.run(_fold_when_asked(theirs, url, spool, projections))
+        finally:
+            os._exit(0)
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    theirs.close()
+    try:
+        yield ours
+    finally:
+        ours.close()
+        os.kill(process, signal.SIGKILL)  # nothing is lost: what it had not committed is folded again
+        os.waitpid(process, 0)
+
+
+class FoldedApart(Shown):
+    """A destination of which the other process folds the tables."""
+
+    def __init__(self, destination: LogAndTables, streams: _Streams, say: Callable[[str], None]) -> None:
+        self._destination = destination
+        self._streams: _Streams | None = streams
+        self._say = say
+
+    @classmethod
+    async def connect(
+        cls, destination: LogAndTables, process: socket.socket, say: Callable[[str], None]
+    ) -> FoldedApart:
+        """Takes over the socket of `folding_process`; `say` is told if that dies."""
+        return cls(destination, _Streams(*await asyncio.open_connection(sock=process)), say)
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        return await self._destination.append(records)
+
+    async def fold(self) -> int:
+        return await self._destination.fold()
+
+    async def fold_some(self) -> bool:
+        if self._streams is None:
+            return await self._destination.fold_some()
+        line = await self._ask(self._streams)
+        if not line:
+            self._say("the process that folds has died: from now on this one does")
+            return await self._destination.fold_some()
+        answer = msgspec.json.decode(line, type=_Answer)
+        if answer.away is not None:
+            raise DatabaseUnavailable(answer.away)
+        if answer.fault is not None:
+            raise DatabaseError(answer.fault)
+        return answer.more
+
+    async def behind(self) -> Mapping[str, int]:
+        return await self._destination.behind()
+
+    async def stopped(self) -> Mapping[str, str]:
+        return await self._destination.stopped()
+
+    def close(self) -> None:
+        """Asks no more."""
+        if self._streams is not None:
+            self._streams.writer.close()
+            self._streams = None
+
+    async def _ask(self, streams: _Streams) -> bytes:
+        """The answer; empty if nobody is there any more."""
+        line = b""
+        try:
+            with suppress(ConnectionError):
+                streams.writer.write(b"\n")
+                await streams.writer.drain()
+                line = await streams.reader.readline()
+        finally:
+            if not line:  # nobody is there, or an answer is on its way that nobody waits for any more
+                self.close()
+        return line
+
+
+async def _fold_when_asked(
+    asked: socket.socket, url: str, spool: Path | None, projections: Sequence[Projection]
+) -> None:
+    """Until nobody is there who could ask."""
+    # What is notable when the memory is opened was told by the one that asks.
+    logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)
+    logging.getLogger("pycrorm_async.projections").setLevel(logging.WARNING)
+    address = shared_address(url)
+    place = Spool(spool or address.default_spool)
+    destination: LogAndTables | None = None
+    async with AsyncExitStack() as stack:
+        with suppress(ConnectionError), asked.makefile("rwb") as stream:
+            while stream.readline():
+                try:
+                    if destination is None:
+                        destination = await stack.enter_async_context(
+                            open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections)
+                        )
+                    answer = _Answer(more=await destination.fold_some())
+                except DatabaseUnavailable as error:
+                    answer = _Answer(away=str(error))
+                except Exception as error:  # noqa: BLE001 - told to the one that asks
+                    answer = _Answer(fault=str(error) or repr(error))
+                stream.write(msgspec.json.encode(answer) + b"\n")
+                stream.flush()
