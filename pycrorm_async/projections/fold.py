@@ -37,6 +37,9 @@ from pycrorm_async.store.rows import StoredEvent
 __all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "Undecodable"]
 
 
+_NO_OUTCOME: Row = (None, None, None, None)
+
+
 class Undecodable(CannotFold):
     """The payload is none of its type and version: nobody has written it like that."""
 
@@ -157,9 +160,6 @@ def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators,
         rows.end_node(node, status, None, None, outcome)
     else:
         rows.end_node(node, status, wall_ns // 1000, monotonic_ns, outcome)
-
-
-_NO_OUTCOME = (None, None, None, None)
 
 
 def _outcome(ended: NodeEnded) -> Row:

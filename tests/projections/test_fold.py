@@ -358,8 +358,16 @@ def test_nodes_of_the_language_have_their_table_too() -> None:
             LocationResolved("CostmapLocation", (), taken=0),
             "candidate 0 was taken of 0",
         ),
+        (
+            ObjectDetected(
+                "camera",
+                None,
+                (SeenValue("cup", "CUP", pose(1)), SeenValue("milk", "MILK", pose(2), ObjectReference(1, 2**26))),
+            ),
+            "no row can have the sequence 67108864 and the slot 0",
+        ),
     ],
-    ids=["undeclared", "another type", "no pose", "no sequence", "no candidate"],
+    ids=["undeclared", "another type", "no pose", "no sequence", "no candidate", "no object"],
 )
 def test_an_event_that_cannot_be_folded_says_why_and_leaves_no_row(event: Any, reason: str) -> None:
     script = Script()
