@@ -60,7 +60,7 @@ from pycrorm_async.store.rows import Span
 __all__ = ["Rebuild", "Share", "claimed", "clear", "recorded"]
 
 _MAKING, _GONE = "/making", "/gone/"
-_BATCH_EVENTS = 4_000
+_BATCH_EVENTS = 8_000
 """So that nobody waits long for a turn to write: on SQLite such a batch holds the write lock for some 50 ms."""
 _SLICE_ROWS = 10_000
 """So many rows of a table that is not shown any more are deleted at once."""

@@ -5,10 +5,12 @@ import sqlite3
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import advance_folded, park
-from pycrorm_async.store.rows import EpisodeRow, StoredEvent
+from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 from pycrorm_async.store.sqlite import statements
+from pycrorm_async.store.sqlite.engine import Connection
 from tests.databases import ask
 from tests.store.making import episode, record, run_of
 
@@ -99,6 +101,18 @@ async def test_finding_what_is_behind_looks_at_no_other_episode(file_log: EventL
     assert "SCAN event" not in spans
     stopped = ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_STOPPED}")
     assert "episode_stopped" in stopped[0][3]
+
+
+async def test_events_are_read_also_if_together_they_are_more_than_one_value_can_be(file_log: EventLog) -> None:
+    records = [record(episode(1), sequence, payload=b'"%s"' % (b"x" * 500)) for sequence in range(1, 11)]
+    await file_log.append(records)
+    whole = await file_log.spans([Span(1, 2, 9)])
+    assert [(each.sequence, each.payload) for each in whole] == [(each.sequence, each.payload) for each in records[2:9]]
+    async with file_log.reading() as connection:
+        driver = (await connection.get_raw_connection()).driver_connection
+        assert isinstance(driver, Connection)
+        await driver.visit(lambda raw: raw.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 3_000))
+        assert await dialect_of(file_log.engine).spans(connection, [Span(1, 2, 9)]) == whole
 
 
 async def test_a_reader_sees_what_is_committed_while_another_writes(file_log: EventLog) -> None:

@@ -26,7 +26,7 @@ __all__ = ["SQLite"]
 
 
 class SQLite:
-    """Implements `Dialect`. A batch goes as JSON, because `executemany` gives up the interpreter at every row."""
+    """Implements `Dialect`. A batch is few statements, because `executemany` gives up the interpreter at every row."""
 
     migrations: Migrations = tables.MIGRATIONS
     faults: tuple[type[Exception], ...] = (DBAPIError, sqlite3.Error, UnicodeDecodeError)  # of a name in a damaged file
@@ -103,8 +103,13 @@ class SQLite:
         return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
 
     async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
-        parts = [part for span in spans for part in _parts_of(span)]
-        found = await (await _driver(connection)).rows_in_turn(sql.SELECT_SPAN, parts)
+        driver = await _driver(connection)
+        parts = [part for span in spans for part in _parts_of(span, _EVENTS_AT_ONCE)]
+        try:
+            found = await driver.rows_in_turn(sql.SELECT_SPAN, parts)
+        except sqlite3.DataError:  # so large that SQLite does not give some of them as one value
+            parts = [part for span in spans for part in _parts_of(span, 1)]
+            found = await driver.rows_in_turn(sql.SELECT_SPAN, parts)
         return [event for part, row in zip(parts, found, strict=True) for event in _events(part.number, *row)]
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
@@ -242,10 +247,9 @@ def _inserts(table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
     return ((into + _placeholders(part), _flat(part)) for part in _parts(rows, len(columns)))
 
 
-def _parts_of(span: Span) -> Iterator[Span]:
-    """So few events at once that their payloads fit into what SQLite gives as one value."""
-    for after in range(span.after, span.last, _EVENTS_AT_ONCE):
-        yield Span(span.number, after, min(after + _EVENTS_AT_ONCE, span.last))
+def _parts_of(span: Span, events_max: int) -> Iterator[Span]:
+    for after in range(span.after, span.last, events_max):
+        yield Span(span.number, after, min(after + events_max, span.last))
 
 
 def _events(number: int, heads: str, payloads: bytes | None) -> Iterator[StoredEvent]:
