@@ -7,11 +7,11 @@
 The trees are the same values on both sides. The baseline (`bench/baseline`) has the whole tree in memory, adds an
 object for each row to a session and commits once; ours has it as events in the folder of a recorder that is gone, which
 a daemon finds, appends and folds. The clock runs from there until every row is in every table, without starting
-processes and without making the tables of the baseline; those of ours for the types of nodes are made in that time, and
-finding the folder takes a fifth of a second at most. The sides take turns, each in its own process. Prints one JSON line:
-by size nodes a second, how many times faster ours is (median, least and most over the turns) and how much less of the
-processor it takes (on PostgreSQL without the server's), rows and insert statements a node, and MB of the processes, of
-ours those of both, in which what they share counts twice.
+processes and without making the tables of the baseline; those of ours for the types of nodes are made in that time,
+and finding the folder takes a fifth of a second at most. The sides take turns, each in its own process. Prints one JSON
+line: by size nodes a second, how many times faster ours is (median, least and most over the turns) and how much less of
+the processor it takes (on PostgreSQL without the server's), rows and insert statements a node, and MB of the processes,
+of ours those of both, in which what they share counts twice.
 """
 
 from __future__ import annotations

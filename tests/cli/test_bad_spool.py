@@ -9,23 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.cli.notes import NOTES_PLAN
 from tests.commands import answer, environment, one_line_of, pycrorm
 from tests.databases import ask
 
-PLAN = '''
-from dataclasses import dataclass
-from pycrorm_async.plan import ActionAbstract
-
-@dataclass
-class NoteActionPerformable(ActionAbstract):
-    text: str
-    async def perform(self): ...
-
-async def plan():
-    """Take three notes."""
-    for text in "abc":
-        await NoteActionPerformable(text).perform()
-'''
 NOTES = "SELECT text FROM note_action ORDER BY id"
 EVENTS = 11
 """Of the plan, with the declaration."""
@@ -33,7 +20,7 @@ EVENTS = 11
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "notes.py").write_text(PLAN)
+    (tmp_path / "notes.py").write_text(NOTES_PLAN)
     return tmp_path
 
 

@@ -9,27 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from tests.cli.notes import NOTES_PLAN
 from tests.commands import COMMAND, answer, environment
 from tests.databases import ask, ask_to_change
-
-PLAN = """
-from dataclasses import dataclass
-from pycrorm_async.plan import ActionAbstract
-
-@dataclass
-class NoteActionPerformable(ActionAbstract):
-    text: str
-    async def perform(self): ...
-
-async def plan():
-    for text in "abc":
-        await NoteActionPerformable(text).perform()
-"""
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "notes.py").write_text(PLAN)
+    (tmp_path / "notes.py").write_text(NOTES_PLAN)
     return tmp_path
 
 

@@ -10,29 +10,19 @@ from typing import Any
 
 import pytest
 
+from tests.cli.notes import NOTES_PLAN
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask_to_change
 
-PLAN = '''
+PLAN = f"""
 import asyncio, os
-from dataclasses import dataclass
-from pycrorm_async.plan import ActionAbstract
-
-@dataclass
-class NoteActionPerformable(ActionAbstract):
-    text: str
-    async def perform(self): ...
-
-async def plan():
-    """Take three notes."""
-    for text in "abc":
-        await NoteActionPerformable(text).perform()
+{NOTES_PLAN}
 
 async def waits():
     await NoteActionPerformable("a").perform()
     os.write(1, b"waiting\\n")
     await asyncio.sleep(600)
-'''
+"""
 URL = "sqlite:///pycrorm.db"
 
 
