@@ -4,8 +4,7 @@ import asyncio
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Coroutine, Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Coroutine, Mapping, Sequence
 
 import pytest
 
@@ -16,62 +15,20 @@ from pycrorm_async.errors import (
     EpisodeParked,
     FlushTimeout,
     LogDamaged,
-    SpoolDamaged,
 )
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import park
-from pycrorm_async.writer.ports import Destination, Source
+from pycrorm_async.writer.ports import Destination
 from pycrorm_async.writer.thread import WriterThread
 from tests.databases import ask
 from tests.store.making import declaration, episode, record, run_of
 from tests.writer.ends import KeptSource, LosesReplies, Passing, opener
+from tests.writer.threads import NEVER_IDLE, QUICK, name, nobody, until, until_asked, writer_for, writers_alive
 
 HEADS = "SELECT id, head, folded FROM episode ORDER BY number"
-QUICK = Settings(batch_events_max=1000, idle_ms=1)
-NEVER_IDLE = Settings(batch_events_max=1000, idle_ms=10**9)
-
-
-def name(number: int) -> str:
-    return f"00000000-0000-0000-0000-{number:012x}"
-
-
-def writers_alive() -> list[str]:
-    return [each.name for each in threading.enumerate() if each.name.startswith("pycrorm writer")]
-
-
-def nobody() -> Iterable[Source]:
-    return ()
-
-
-def writer_for(
-    source: Source,
-    address: DatabaseAddress,
-    *,
-    settings: Settings = NEVER_IDLE,
-    adopt: Iterable[Source] = (),
-    busy_timeout_s: float = 5.0,
-) -> WriterThread:
-    return WriterThread(
-        source=source,
-        open_destination=opener(address, busy_timeout_s=busy_timeout_s),
-        adopt=lambda: adopt,
-        settings=settings,
-    )
-
-
-async def until(holds: Callable[[], bool]) -> None:
-    """Returns when that holds; the test's own patience ends after a minute."""
-    async with asyncio.timeout(60):
-        while not holds():  # noqa: ASYNC110 - what is waited for happens in another thread
-            await asyncio.sleep(0.005)
-
-
-async def until_asked(path: Path, statement: str, expected: list[tuple[object, ...]]) -> None:
-    """Returns when the database answers that."""
-    await until(lambda: ask(path, statement) == expected)
 
 
 async def test_what_was_put_before_a_flush_is_stored_and_folded_after_it(address: DatabaseAddress) -> None:
@@ -436,88 +393,3 @@ async def test_the_database_is_closed_in_the_loop_that_opened_it(address: Databa
     source.close()
     await writer.close()
     assert threads == ["pycrorm writer robot"] * 2
-
-
-# --- adopting -------------------------------------------------------------------------------------------------
-
-
-async def test_what_dead_recorders_left_is_stored_and_folded(address: DatabaseAddress) -> None:
-    dead = [KeptSource(run_of(episode(which), 1, 30), closed=True, name=f"dead {which}") for which in (2, 3)]
-    source = KeptSource(run_of(episode(1), 1, 10))
-    writer = writer_for(source, address, settings=QUICK, adopt=dead)
-    await writer.start()
-    folded = "SELECT id, folded FROM episode ORDER BY id"
-    await until_asked(address.path, folded, [(name(1), 10), (name(2), 30), (name(3), 30)])
-    source.close()
-    await writer.close()
-    assert [each.kept for each in dead] == [[], []]
-    assert [each.source for each in writer.state.adopted] == ["dead 2", "dead 3"]
-
-
-async def test_a_damaged_folder_of_somebody_else_is_shown_and_not_raised(address: DatabaseAddress) -> None:
-    class Damaged(KeptSource):
-        async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
-            raise SpoolDamaged(Path("/spool/2/1.seg"), 4096, "a frame does not match its checksum")
-
-    after = KeptSource(run_of(episode(3), 1, 4), closed=True, name="dead 3")
-
-    def found() -> Iterator[Source]:
-        yield Damaged(name="dead 2")
-        yield after
-        raise SpoolDamaged(Path("/spool/4/1.seg"), 0, "no header")
-
-    source = KeptSource(run_of(episode(1), 1, 3))
-    writer = writer_for(source, address, adopt=found())
-    await writer.start()
-    await until(lambda: len(writer.state.adoption_errors) == 2)
-    await writer.flush(3)
-    source.close()
-    await writer.close()
-    assert writer.state.adoption_errors == (
-        "dead 2: /spool/2/1.seg is damaged at byte 4096: a frame does not match its checksum",
-        "/spool/4/1.seg is damaged at byte 0: no header",
-    )
-    assert after.kept == []
-
-
-async def test_what_is_refused_of_many_dead_recorders_is_told_in_one_line(
-    address: DatabaseAddress, caplog: pytest.LogCaptureFixture
-) -> None:
-    dead = [
-        KeptSource([*run_of(episode(n), 1, 3), record(episode(n), 5, position=4)], closed=True, name=f"dead {n}")
-        for n in (2, 3, 4)
-    ]
-    source = KeptSource(run_of(episode(1), 1, 3))
-    writer = writer_for(source, address, adopt=dead)
-    await writer.start()
-    await until(lambda: bool(caplog.records))
-    source.close()
-    with pytest.raises(EpisodeParked):
-        await writer.close()
-    [line] = [each.getMessage() for each in caplog.records if each.levelname == "ERROR"]
-    assert line == (
-        f"recorder dead 2: episode {name(2)} was refused: event 4 did not arrive before event 5;"
-        " its events are kept in the spool (and 2 more: see `pycrorm status`)"
-    )
-    assert [len(each.aside or []) for each in dead] == [4, 4, 4]
-
-
-async def test_closing_does_not_wait_for_somebody_elses_records(address: DatabaseAddress) -> None:
-    let_go: list[str] = []
-
-    def found() -> Iterator[Source]:
-        try:
-            yield KeptSource(run_of(episode(2), 1, 5), name="never closed")
-        finally:
-            let_go.append("never closed")
-
-    folders = found()
-    source = KeptSource(run_of(episode(1), 1, 3))
-    writer = writer_for(source, address, adopt=folders)
-    await writer.start()
-    await until_asked(address.path, "SELECT count(*) FROM event", [(8,)])
-    source.close()
-    await writer.close()
-    assert writers_alive() == []
-    assert let_go == ["never closed"]
-    assert ask(address.path, "SELECT id, folded FROM episode ORDER BY id") == [(name(1), 3), (name(2), 5)]
