@@ -3,9 +3,9 @@
     with folding_process(url, spool=spool, projections=projections) as process:
         asyncio.run(serve(url, ..., folding=process))
 
-It is forked before anything is open, opens the database for itself when it is asked for the first time, and folds a
-batch each time it is asked. It holds nothing: when it dies, whoever asked folds from then on, and when that one dies
-it ends too.
+It is forked before anything is open, opens the database for itself when it is asked for the first time, and when asked
+folds batch after batch until there is no more, with an answer after each: it does not wait for who asks, who is busy
+appending. It holds nothing: when it dies, whoever asked folds from then on, and when that one dies it ends too.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _NOT_FOR_IT = (signal.SIGINT, signal.SIGTERM)
 
 
 class _Answer(msgspec.Struct, omit_defaults=True):
-    """Whether there was something to fold; or why not: the database is away, something else is wrong."""
+    """Whether there was something to fold, and another answer follows; or why not: the database is away, or else."""
 
     more: bool = False
     away: str | None = None
@@ -83,6 +83,7 @@ class FoldedApart(Shown):
     def __init__(self, destination: LogAndTables, streams: _Streams, say: Callable[[str], None]) -> None:
         self._destination = destination
         self._streams: _Streams | None = streams
+        self._is_folding = False
         self._say = say
 
     @classmethod
@@ -101,11 +102,12 @@ class FoldedApart(Shown):
     async def fold_some(self) -> bool:
         if self._streams is None:
             return await self._destination.fold_some()
-        line = await self._ask(self._streams)
+        line = await self._next_answer(self._streams)
         if not line:
             self._say("the process that folds has died: from now on this one does")
             return await self._destination.fold_some()
         answer = msgspec.json.decode(line, type=_Answer)
+        self._is_folding = answer.more
         if answer.away is not None:
             raise DatabaseUnavailable(answer.away)
         if answer.fault is not None:
@@ -124,13 +126,14 @@ class FoldedApart(Shown):
             self._streams.writer.close()
             self._streams = None
 
-    async def _ask(self, streams: _Streams) -> bytes:
-        """The answer; empty if nobody is there any more."""
+    async def _next_answer(self, streams: _Streams) -> bytes:
+        """Empty if nobody is there any more."""
         line = b""
         try:
             with suppress(ConnectionError):
-                streams.writer.write(b"\n")
-                await streams.writer.drain()
+                if not self._is_folding:
+                    streams.writer.write(b"\n")
+                    await streams.writer.drain()
                 line = await streams.reader.readline()
         finally:
             if not line:  # nobody is there, or an answer is on its way that nobody waits for any more
@@ -151,15 +154,17 @@ async def _fold_when_asked(
     async with AsyncExitStack() as stack:
         with suppress(ConnectionError), asked.makefile("rwb") as stream:
             while stream.readline():
-                try:
-                    if destination is None:
-                        destination = await stack.enter_async_context(
-                            open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections)
-                        )
-                    answer = _Answer(more=await destination.fold_some())
-                except DatabaseUnavailable as error:
-                    answer = _Answer(away=str(error))
-                except Exception as error:  # noqa: BLE001 - told to the one that asks
-                    answer = _Answer(fault=str(error) or repr(error))
-                stream.write(msgspec.json.encode(answer) + b"\n")
-                stream.flush()
+                answer = _Answer(more=True)
+                while answer.more:
+                    try:
+                        if destination is None:
+                            destination = await stack.enter_async_context(
+                                open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections)
+                            )
+                        answer = _Answer(more=await destination.fold_some())
+                    except DatabaseUnavailable as error:
+                        answer = _Answer(away=str(error))
+                    except Exception as error:  # noqa: BLE001 - told to the one that asks
+                        answer = _Answer(fault=str(error) or repr(error))
+                    stream.write(msgspec.json.encode(answer) + b"\n")
+                    stream.flush()
