@@ -26,7 +26,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -37,12 +37,11 @@ from rich.table import Table
 
 from bench.breaking.speaking import Speaker
 from bench.daemon import start_daemon, stop
+from bench.material.turns import InTurns, NothingActionPerformable, nothing_action
 from pycrorm_async import Memory, Settings
 from pycrorm_async.config import Writer
 from pycrorm_async.errors import FlushTimeout
-from pycrorm_async.plan import PickUpActionPerformable
-from pycrorm_async.plan.objects import designator_of
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world import BulletWorld
 from tests.crash.walking import say
 from tests.databases import Server, server_in
 
@@ -50,13 +49,6 @@ _LATE_S = 0.02
 _PERFORMS_PER_S = 1_000
 _WRITERS: tuple[Writer, ...] = ("thread", "daemon")
 _PERCENTILES = {"median": 0.5, "p99": 0.99, "p99.9": 0.999}
-
-
-class NothingActionPerformable(PickUpActionPerformable):
-    """The parameters of picking up, and nothing done."""
-
-    async def perform(self) -> None:
-        return
 
 
 class Kind(NamedTuple):
@@ -79,33 +71,26 @@ class Turn(NamedTuple):
     interrupted: list[int]
 
 
-class Plan:
-    """Performs when it is its turn, with a memory or none, in a task and a world of its own."""
+class Plan(InTurns):
+    """With a memory or none; a turn is over when all of it is stored, if the database is there."""
 
     def __init__(self, kind: Kind | None) -> None:
+        super().__init__()
         self.name = "none" if kind is None else f"{kind.writer}, {kind.state}"
         self.turns: list[Turn] = []
         self._kind = kind
-        self._asked: asyncio.Queue[int] = asyncio.Queue()
 
-    async def take_turn(self, performs: int) -> None:
-        """Returns when so many are performed, and stored if the database is there; 0 ends the plan."""
-        self._asked.put_nowait(performs)
-        await self._asked.join()
+    async def begin(self, stack: AsyncExitStack) -> Callable[[int], Awaitable[None]]:
+        memory = None if self._kind is None else await stack.enter_async_context(_remembering(self._kind))
+        stack.enter_context(BulletWorld())
+        action = nothing_action()
 
-    async def run(self) -> None:
-        async with AsyncExitStack() as stack:
-            memory = None if self._kind is None else await stack.enter_async_context(_remembering(self._kind))
-            stack.enter_context(BulletWorld())
-            Object("pr2", ObjectType.ROBOT)
-            milk = designator_of(Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9])))
-            action = NothingActionPerformable(milk, Arms.LEFT, Grasp.FRONT)
-            while performs := await self._asked.get():
-                self.turns.append(await _turn(action, performs))
-                if memory is not None and self._kind is not None:
-                    await (memory.synced() if self._kind.is_down else memory.flush())
-                self._asked.task_done()
-        self._asked.task_done()
+        async def take(performs: int) -> None:
+            self.turns.append(await _turn(action, performs))
+            if memory is not None and self._kind is not None:
+                await (memory.synced() if self._kind.is_down else memory.flush())
+
+        return take
 
 
 @asynccontextmanager

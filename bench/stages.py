@@ -20,14 +20,14 @@ import random
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from bench.hook import NothingActionPerformable
+from bench.material.turns import InTurns, NothingActionPerformable, nothing_action
 from bench.reporting.figures import console, percentiles, spread
 from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
@@ -39,11 +39,10 @@ from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.recorder import current_episode
 from pycrorm_async.hooks.values import written
 from pycrorm_async.plan import BaseMotion
-from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.plan.ports import recorder
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world import BulletWorld
 
 _TASKS = 100
 _SAMPLED = Settings(sample_interval_ms=50)
@@ -75,31 +74,26 @@ KINDS = {
 }
 
 
-class Plan:
-    """Performs when it is its turn, in a task, a world and an episode of its own."""
+class Plan(InTurns):
+    """In an episode of its own; a turn is over when all of it is stored."""
 
     def __init__(self, kind: Kind, url: str) -> None:
+        super().__init__()
         self.took_us: list[list[float]] = []
         self._kind = kind
         self._url = url
-        self._asked: asyncio.Queue[int] = asyncio.Queue()
 
-    async def take_turn(self, performs: int) -> None:
-        """Returns when so many are performed and stored; 0 ends the plan."""
-        self._asked.put_nowait(performs)
-        await self._asked.join()
+    async def begin(self, stack: AsyncExitStack) -> Callable[[int], Awaitable[None]]:
+        memory = await _remembering(stack, self._url, self._kind) if self._kind.remembered else None
+        stack.enter_context(BulletWorld())
+        action = NothingMotion() if self._kind.motion else nothing_action()
 
-    async def run(self) -> None:
-        async with AsyncExitStack() as stack:
-            memory = await _remembering(stack, self._url, self._kind) if self._kind.remembered else None
-            stack.enter_context(BulletWorld())
-            action = NothingMotion() if self._kind.motion else _action()
-            while performs := await self._asked.get():
-                self.took_us.append(await self._turn(action, performs))
-                if memory is not None:
-                    await memory.flush()
-                self._asked.task_done()
-        self._asked.task_done()
+        async def take(performs: int) -> None:
+            self.took_us.append(await self._turn(action, performs))
+            if memory is not None:
+                await memory.flush()
+
+        return take
 
     async def _turn(self, action: NothingActionPerformable | NothingMotion, performs: int) -> list[float]:
         if self._kind.tasks > 1:
@@ -130,12 +124,6 @@ async def _remembering(stack: AsyncExitStack, url: str, kind: Kind) -> Memory:
     return memory
 
 
-def _action() -> NothingActionPerformable:
-    Object("pr2", ObjectType.ROBOT)
-    milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))
-    return NothingActionPerformable(designator_of(milk), Arms.LEFT, Grasp.FRONT)
-
-
 # --- stages ---------------------------------------------------------------------------------------------------------
 
 
@@ -148,7 +136,7 @@ async def stages(folder: Path, *, turns: int, performs: int) -> dict[str, dict[s
             folder / "queue", settings=Settings(), clock=SYSTEM_CLOCK, recorder=_identity(b"recorder..")
         )
         stack.callback(queue.release)
-        parts = _parts(_action(), queue)
+        parts = _parts(nothing_action(), queue)
         took: dict[str, list[float]] = {name: [] for name in parts}
         for _ in range(turns):
             for name, part in parts.items():
