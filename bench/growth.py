@@ -144,11 +144,11 @@ class NoteActionPerformable(ActionAbstract):
     async def perform(self) -> None: ...
 
 
-async def record_and_weigh(url: str, counts: tuple[int, ...]) -> dict[str, dict[str, float]]:
+async def record_and_weigh(url: str, spool: Path, counts: tuple[int, ...]) -> dict[str, dict[str, float]]:
     """MB of this process when so many nodes are recorded and in the tables: all, and what is no file's."""
     found: dict[str, dict[str, float]] = {}
     recorded = 0
-    async with Memory.open(url) as memory:
+    async with Memory.open(url, spool=spool) as memory:
         for count in counts:
             while recorded < count:
                 async with memory.episode(description="bench"):
@@ -162,8 +162,9 @@ async def record_and_weigh(url: str, counts: tuple[int, ...]) -> dict[str, dict[
 
 def recording(place: Place, sizes: Sizes) -> dict[str, Any]:
     """In a process of its own."""
-    url, _ = place.new()
-    command = [sys.executable, "-m", "bench.growth", "--record", url, "--counts", *map(str, sizes.recorded)]
+    url, spool = place.new()
+    command = [sys.executable, "-m", "bench.growth", "--record", url, str(spool)]
+    command += ["--counts", *map(str, sizes.recorded)]
     found = dict(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout))
     first, last = (found[str(count)] for count in (sizes.recorded[0], sizes.recorded[-1]))
     nodes = sizes.recorded[-1] - sizes.recorded[0]
@@ -212,11 +213,12 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a few hundred nodes, one turn")
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
-    parser.add_argument("--record", help=argparse.SUPPRESS)
+    parser.add_argument("--record", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--counts", type=int, nargs="+", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.record:
-        print(json.dumps(asyncio.run(record_and_weigh(asked.record, tuple(asked.counts)))))
+        url, spool = asked.record
+        print(json.dumps(asyncio.run(record_and_weigh(url, Path(spool), tuple(asked.counts)))))
         return
     sizes, turns = (QUICK, 1) if asked.quick else (LONG, asked.turns)
     answer: dict[str, Any] = {"bench": "growth", "sizes": sizes._asdict(), "turns": turns, "seed": _SEED}
