@@ -1,4 +1,4 @@
-"""A plan that suspends once in 200,000 actions: all of them stored, and the process does not grow."""
+"""A plan that suspends once in 400,000 actions: all of them stored, and the process does not grow."""
 
 import json
 import subprocess
@@ -51,7 +51,7 @@ asyncio.run(main(sys.argv[1], int(sys.argv[2])))
 """
 
 
-@pytest.mark.parametrize("total", [200_000])
+@pytest.mark.parametrize("total", [400_000])
 def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path, total: int) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, f"sqlite:///{tmp_path}/long.db", str(total)],
@@ -65,6 +65,8 @@ def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path,
     found = json.loads(done.stdout)
     assert found["rows"] == [total, 0, total - 1, total]
     assert found["done"] == total + 1  # the root of the episode as well
-    # In KiB, over the second half: with the flush before it the largest batch of the writer has come, which on a busy
-    # machine may come late. 32 kB a node, as in the reference system, would be 3.2 GB.
-    assert found["sizes"][-1] - found["sizes"][4] < 12_000, found["sizes"]
+    # KiB, over the second half: with the flush before it the largest batches of the writer have come, though not yet
+    # the moment when one is appended and one folded, which on a busy machine may come late. 32 kB a node it would be in
+    # the reference system.
+    bytes_a_node = (found["sizes"][-1] - found["sizes"][4]) * 1024 / (total / 2)
+    assert bytes_a_node < 120, found["sizes"]
