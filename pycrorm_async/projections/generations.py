@@ -12,7 +12,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import msgspec
@@ -147,17 +146,12 @@ def projections_in(there: Mapping[str, Generation]) -> dict[str, Generation]:
 
 
 def _generation(row: Any) -> Generation:
-    return Generation(row.generation, row.revision, *_contents(row.layout, row.views), row.version)
-
-
-@lru_cache(maxsize=8)
-def _contents(layout: str, views: str) -> tuple[Layout, dict[str, str]]:
-    """Looked at with every batch and seldom changed; to decode them takes as long as folding a hundred events."""
     try:
-        decoded = msgspec.json.decode(layout, type=Layout)
+        layout = msgspec.json.decode(row.layout, type=Layout)
     except msgspec.DecodeError:  # another version's, of which the number is enough
-        decoded = Layout()
-    return decoded, msgspec.json.decode(views, type=dict[str, str])
+        layout = Layout()
+    views = msgspec.json.decode(row.views, type=dict[str, str])
+    return Generation(row.generation, row.revision, layout, views, row.version)
 
 
 async def note(connection: AsyncConnection, name: str, generation: Generation) -> None:
