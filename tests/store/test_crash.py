@@ -127,16 +127,19 @@ def test_an_append_cancelled_at_each_of_its_awaits_leaves_a_whole_batch_or_nothi
     gc.disable()
     try:
         known, at = 0, 0
+        stored_though_cancelled: set[bool] = set()
         while True:
             at += 1
             cancelled = asyncio.run(append_and_cancel(known, at))
             heads = ask(address.path, "SELECT head FROM episode ORDER BY number")
             assert heads in ([(known * PER_BATCH,)] * 2 if known else [], [((known + 1) * PER_BATCH,)] * 2)
-            known = heads[0][0] // PER_BATCH if heads else 0
+            before, known = known, heads[0][0] // PER_BATCH if heads else 0
             if not cancelled:
                 break
+            stored_though_cancelled.add(known > before)
     finally:
         gc.enable()
-    assert at > 5  # an append has more awaits than that
+    assert at > 6  # an append has more awaits than that
+    assert stored_though_cancelled == {False, True}  # it was cancelled before the commit, and in it
     asyncio.run(append_all(address, range(known + 1)))
     assert ask(address.path, "SELECT count(*) FROM event") == [((known + 1) * PER_BATCH * 2,)]
