@@ -18,6 +18,7 @@ Migrations: TypeAlias = Sequence[Sequence[str]]
 
 RowsByTable: TypeAlias = Mapping[tuple[str, tuple[str, ...]], Sequence[tuple[Any, ...]]]
 """Rows to insert, by table and its columns."""
+
 Progress: TypeAlias = tuple[int, int, int]
 """An episode's number, how far it was folded, how far it is now."""
 

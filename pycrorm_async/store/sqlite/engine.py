@@ -174,8 +174,8 @@ async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
 
 
 def _wait_for_turn(connection: sqlite3.Connection, patience_s: float) -> None:
-    """Begins a transaction that writes. SQLite itself would wait too, but sleep longer with every time it looks: two
-    processes that both write all the time used to sleep a third of theirs."""
+    """Begins a transaction that writes. SQLite itself would wait too, but sleep longer with every time it looks: beside
+    a process that folds all the time appending took 10.5 µs an event that way, and 8.6 this way."""
     connection.execute("PRAGMA busy_timeout = 0")
     until_s = time.monotonic() + patience_s
     try:
