@@ -65,8 +65,6 @@ def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path,
     found = json.loads(done.stdout)
     assert found["rows"] == [total, 0, total - 1, total]
     assert found["done"] == total + 1  # the root of the episode as well
-    # KiB, over the second half: with the flush before it the largest batches of the writer have come, though not yet
-    # the moment when one is appended and one folded, which on a busy machine may come late. 32 kB a node it would be in
-    # the reference system.
-    bytes_a_node = (found["sizes"][-1] - found["sizes"][4]) * 1024 / (total / 2)
-    assert bytes_a_node < 120, found["sizes"]
+    # In KiB, over the second half: with the flush before it the largest batch of the writer has come, which on a busy
+    # machine may come late. 32 kB a node, as in the reference system, would be 6.4 GB.
+    assert found["sizes"][-1] - found["sizes"][4] < 12_000, found["sizes"]
