@@ -3,6 +3,7 @@ from __future__ import annotations
 import sqlite3
 
 import pytest
+from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.dialects import dialect_of
@@ -135,3 +136,16 @@ async def test_a_log_opened_for_reading_takes_nothing(file_log: EventLog) -> Non
         await reading.append(run_of(episode(1), 1, 1))
     await reading.close()
     assert ask(file_log.address.path, "SELECT count(*) FROM episode") == [(0,)]
+
+
+async def test_rows_come_whole_and_in_order_also_when_they_are_streamed(file_log: EventLog) -> None:
+    await file_log.append(run_of(episode(1), 1, 200))
+    asked = text("SELECT sequence FROM event ORDER BY sequence")
+    async with file_log.reading() as connection:
+        assert list((await connection.execute(asked)).scalars()) == list(range(1, 201))
+        streamed = await connection.stream(asked)
+        assert [row.sequence async for row in streamed] == list(range(1, 201))
+        streamed = await connection.stream(asked)
+        assert [row[0] for row in await streamed.fetchmany(70)] == list(range(1, 71))
+        assert (await streamed.fetchone()) == (71,)
+        await streamed.close()
