@@ -19,6 +19,7 @@ from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Prog
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
+from pycrorm_async.store.sqlite.binding import bound, inserts
 from pycrorm_async.store.sqlite.claim import claim
 from pycrorm_async.store.sqlite.engine import BEGIN, Connection
 
@@ -77,7 +78,7 @@ class SQLite:
 
     async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None:
         rows = [(*each[:6], each.payload.decode()) for each in events]
-        await (await _driver(connection)).execute_in_turn(_inserts("event", sql.EVENT_COLUMNS, rows))
+        await (await _driver(connection)).execute_in_turn(inserts("event", sql.EVENT_COLUMNS, rows))
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(each) for each in episodes]),))
@@ -194,7 +195,7 @@ class SQLite:
 
     async def insert_rows(self, connection: AsyncConnection, rows: RowsByTable) -> None:
         quote = connection.dialect.identifier_preparer.quote
-        statements = (_inserts(quote(table), [*map(quote, columns)], some) for (table, columns), some in rows.items())
+        statements = (inserts(quote(table), [*map(quote, columns)], some) for (table, columns), some in rows.items())
         with _rows_refused():
             await (await _driver(connection)).execute_in_turn(chain.from_iterable(statements))
 
@@ -205,7 +206,7 @@ class SQLite:
         changes = ", ".join(f"{column} = change.column{place}" for place, column in enumerate(names, 2))
         update = f"UPDATE {table} SET {changes} FROM (VALUES "  # noqa: S608
         of = f") AS change WHERE {table}.id = change.column1"
-        statements = ((update + _placeholders(part) + of, _flat(part)) for part in _parts(rows, len(columns)))
+        statements = ((update + values + of, given) for values, given in bound(rows, len(columns)))
         with _rows_refused():
             await (await _driver(connection)).execute_in_turn(statements)
 
@@ -217,34 +218,6 @@ class SQLite:
 
 _EVENTS_AT_ONCE = 250
 _HEADS = msgspec.json.Decoder(list[tuple[int, str, int, int, int, int]])
-_PARAMETERS_MAX = 8_000
-"""In one statement. SQLite takes 32,766, but is a third slower with so many; with fewer, a busy plan is waited for more
-often."""
-
-
-def _parts(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[Sequence[tuple[Any, ...]]]:
-    """Powers of two, so that few different statements are ever made: to compile one takes longer than to run it."""
-    size, start = 1 << (_PARAMETERS_MAX // columns).bit_length() - 1, 0
-    while start < len(rows):
-        while size > len(rows) - start:
-            size //= 2
-        yield rows[start : start + size]
-        start += size
-
-
-def _placeholders(rows: Sequence[tuple[Any, ...]]) -> str:
-    one = f"({', '.join('?' * len(rows[0]))})"
-    return ", ".join([one] * len(rows))
-
-
-def _flat(rows: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
-    return tuple(chain.from_iterable(rows))
-
-
-def _inserts(table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, Any]]:
-    """The statements that insert these rows, with their parameters."""
-    into = f"INSERT INTO {table} ({', '.join(columns)}) VALUES "  # noqa: S608
-    return ((into + _placeholders(part), _flat(part)) for part in _parts(rows, len(columns)))
 
 
 def _parts_of(span: Span, events_max: int) -> Iterator[Span]:
