@@ -138,7 +138,7 @@ def dead_queues(
             try:
                 yield recovered
             finally:
-                if recovered.stored == recovered.last:
+                if recovered.all_stored:
                     recovered.remove()
                 else:
                     recovered.release()

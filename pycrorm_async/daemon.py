@@ -73,6 +73,7 @@ class _Folders:
         self._log_id = log_id
         self._file = address.path if address.is_sqlite else None
         self._opened = _identity(self._file)
+        self._taken: set[str] = set()
 
     def __call__(self, but: Collection[str]) -> Found:
         # A file that is only gone may be put back. Into another one this process, which has the old one open, would
@@ -81,17 +82,20 @@ class _Folders:
             raise DatabaseForeign(f"{self._file} was replaced while it was open: start `pycrorm writer` again")
         held: list[Held] = []
         failed: dict[str, Exception] = {}
-        folders = [each for each in self._spool.recorders() if each.name not in but]
+        present = self._spool.recorders()
+        self._taken &= {each.name for each in present}
+        folders = [each for each in present if each.name not in but]
         if folders:  # with a folder in it the spool cannot be bound to another log any more
             self._spool.bind(self._log_id)
         for folder in folders:
             try:
-                taken = _take(folder)
+                taken = _take(folder, again=folder.name in self._taken)
             except PycrormError as error:
                 failed[folder.name] = error
             else:
                 if taken is not None:
                     held.append(taken)
+                    self._taken.add(folder.name)
         return Found(held, failed)
 
 
@@ -104,14 +108,15 @@ def _identity(file: Path | None) -> tuple[int, int] | None:
     return None if status is None else (status.st_dev, status.st_ino)
 
 
-def _take(folder: RecorderFolder) -> Held | None:
+def _take(folder: RecorderFolder, *, again: bool) -> Held | None:
     if folder.alive:
         return _Living.take(folder.path)
     dead = open_dead(folder.path)
     if dead is None:
         return None
     try:
-        dead.seal()
+        if again:  # it may be damaged further on, and what comes before that is not to be stored again and again
+            dead.seal()
     except BaseException:
         dead.release()
         raise
@@ -160,7 +165,7 @@ class _Dead(Held):
     def note_away(self, reason: str | None) -> None: ...
 
     def let_go(self) -> LetGo:
-        if self._queue.stored < self._queue.last:
+        if not self._queue.all_stored:
             self._queue.release()
             return LetGo("is kept", whole=False, again=not self._queue.holds_refused)
         self._queue.remove()

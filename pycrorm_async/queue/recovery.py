@@ -1,22 +1,28 @@
 """A dead recorder's folder, recovered: a source of everything that is whole in it, and its deletion afterwards.
 
+It is looked at segment by segment, while what was found is given away already: nothing before a commit frame says that
+it was safe, or all was looked at. So a folder that is damaged further on gives what was safe before the damage, and
+then raises; what a repair keeps of it begins with the same records.
+
 Each episode left open gets an end of status LOST behind the last record, computed from that episode's last record and
 never written: recovering again, also after being killed in between, gives the same records.
 """
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from pathlib import Path
 
+from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by, remove_folder
 from pycrorm_async.queue.frame import Buffer
 from pycrorm_async.queue.locks import FileLock
-from pycrorm_async.queue.reader import Reader
+from pycrorm_async.queue.reader import Batch, Reader
 from pycrorm_async.queue.refused import RefusedRecords
-from pycrorm_async.queue.scan import Kept, scan
+from pycrorm_async.queue.scan import Kept, Walk
 from pycrorm_async.queue.sealing import make_safe, seal, tails
 from pycrorm_async.queue.segment import CLOSES, segment_path
 
@@ -28,9 +34,8 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
 
     None also for what was refused of a recorder whose own folder is still there: whoever drains that may put more in.
 
-    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Reads every byte, some 500,000
-    records a second, and has the disk keep what is given away. Raises `SpoolDamaged`, `SpoolForeign` and
-    `SpoolUnavailable`, holding nothing.
+    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Looks at as much of it as it takes
+    to give something. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`, holding nothing.
     """
     with available(folder):
         own = folder.with_name(folder.name.partition(".")[0])
@@ -46,9 +51,7 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
                 return None
             try:
                 recorder = held_by(folder.name).recorder
-                kept = scan(folder, recorder)
-                make_safe(folder, kept)
-                return RecoveredQueue(folder, recorder, kept, (drain, alive))
+                return RecoveredQueue(folder, recorder, (drain, alive))
             except BaseException:
                 drain.release()
                 raise
@@ -58,26 +61,30 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
 
 
 class RecoveredQueue:
-    """The records of a dead recorder, in order, then the computed ends. Made by `open_dead`; nothing waits.
+    """The records of a dead recorder, in order, then the computed ends. Made by `open_dead`.
 
-    `lost` are these ends, one for each episode left open; `stored` is the position acknowledged last.
+    `lost` are these ends, one for each episode left open, and empty until all of the folder was looked at; `stored` is
+    the position acknowledged last.
     """
 
-    def __init__(self, folder: Path, recorder: EpisodeId, kept: Kept, locks: tuple[FileLock, ...]) -> None:
+    def __init__(self, folder: Path, recorder: EpisodeId, locks: tuple[FileLock, ...]) -> None:
         self.folder = folder
         self.name = folder.name
-        self.lost = _ends(kept)
-        self._kept = kept
+        self.lost: tuple[Record, ...] = ()
+        self._settled = 0
+        self._walk = Walk(folder, recorder)
+        while self._look_further() and self._settled == self._walk.kept.start.position:
+            pass
+        start = self._walk.kept.start
         self._locks = locks
         self._refused = RefusedRecords(folder)
-        self._reader = Reader(recorder=recorder, start=kept.start, load=self._load)
-        self._given = kept.start.position
-        self.stored = kept.start.position
+        self._reader = Reader(recorder=recorder, start=start, load=self._load)
+        self._given = self.stored = start.position
 
     @property
-    def last(self) -> int:
-        """Position of the last record, computed ends included."""
-        return self._kept.cut.position + len(self.lost)
+    def all_stored(self) -> bool:
+        """Whether everything that is in it was looked at, given and acknowledged, with the computed ends."""
+        return self._walk.over and self.stored == self._settled + len(self.lost)
 
     @property
     def holds_refused(self) -> bool:
@@ -87,13 +94,24 @@ class RecoveredQueue:
     @property
     def tail_bytes(self) -> int:
         """How much of the files lies behind the cut and is not zero: written, never synced, and torn."""
+        self._look_at_all()
         with available(self.folder):
-            return sum(len(tail) for _, tail in tails(self.folder, self._kept))
+            return sum(len(tail) for _, tail in tails(self.folder, self._walk.kept))
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
-        """The next records in order, at least one, at most the limits; empty when all are given."""
-        with available(self.folder):
-            batch = self._reader.read(last=self._kept.cut.position, events_max=events_max, bytes_max=bytes_max)
+        """The next records in order, at least one, at most the limits; empty when all are given.
+
+        Raises `SpoolDamaged` where that begins which may not be kept, and `SpoolUnavailable`.
+        """
+        batch = self._read(events_max, bytes_max)
+        while not (batch.complete or self._walk.over):
+            try:
+                await asyncio.to_thread(self._look_further)
+            except SpoolDamaged:
+                if not batch.records:
+                    raise
+                break  # the next call raises
+            batch = self._read(events_max, bytes_max, begun=batch)
         self._reader.cursor = batch.after
         records, total = batch.records, batch.payload_bytes
         for end in self.lost:
@@ -109,13 +127,17 @@ class RecoveredQueue:
     async def acknowledge(self, position: int) -> None:
         """Everything up to this position is stored for good: segments that hold no more are deleted, oldest first.
 
-        The last one stays, because the ends are computed from it. Raises `SpoolUnavailable`.
+        The last one stays, because the ends are computed from it; and all, while any was not looked at: the next one's
+        header may be damaged, and then only this one knows which episodes are open. Raises `SpoolUnavailable`.
         """
         assert position <= self._given, "only what was given can be acknowledged"
         self.stored = max(self.stored, position)
+        if not self._walk.over:
+            return
+        bases = self._walk.kept.bases
         with available(self.folder):
-            for number in sorted(self._kept.bases):
-                following = self._kept.bases.get(number + 1)
+            for number in sorted(bases):
+                following = bases.get(number + 1)
                 if following is None or following - 1 > position:
                     break
                 segment_path(self.folder, number).unlink(missing_ok=True)
@@ -131,16 +153,18 @@ class RecoveredQueue:
         """Nobody puts into it, so nobody waits for room."""
 
     def seal(self) -> None:
-        """Cuts the files where the records end; what is cut off is copied aside first, to `<segment>.tail`.
+        """Looks at all of it, and cuts the files where the records end; what is cut off is copied aside first, to
+        `<segment>.tail`.
 
-        Twice is once, and killed at any point it can be done again. Raises `SpoolUnavailable`.
+        Twice is once, and killed at any point it can be done again. Raises `SpoolDamaged` and `SpoolUnavailable`.
         """
+        self._look_at_all()
         with available(self.folder):
-            seal(self.folder, self._kept)
+            seal(self.folder, self._walk.kept)
 
     def remove(self) -> None:
         """Deletes the folder, all of which is stored, and gives up the locks. Raises `SpoolUnavailable`."""
-        assert self.stored == self.last, "what is not acknowledged is not deleted"
+        assert self.all_stored, "what is not acknowledged is not deleted"
         self._reader.close()
         try:
             with available(self.folder):
@@ -154,6 +178,27 @@ class RecoveredQueue:
         self._refused.release()
         for lock in self._locks:
             lock.release()
+
+    def _look_at_all(self) -> None:
+        while self._look_further():
+            pass
+
+    def _look_further(self) -> bool:
+        """At the next segment, which is on the disk then; False if there is no more."""
+        with available(self.folder):
+            if self._walk.over:
+                return False
+            more = self._walk.step()
+            if more:
+                make_safe(self.folder, [self._walk.kept.cut.number])
+        self._settled = self._walk.settled
+        if not more:
+            self.lost = _ends(self._walk.kept)
+        return more
+
+    def _read(self, events_max: int, bytes_max: int, begun: Batch | None = None) -> Batch:
+        with available(self.folder):
+            return self._reader.read(last=self._settled, events_max=events_max, bytes_max=bytes_max, begun=begun)
 
     def _load(self, number: int) -> tuple[Path, Buffer]:
         path = segment_path(self.folder, number)

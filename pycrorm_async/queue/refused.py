@@ -118,7 +118,7 @@ class _RefusedEpisode:
         if damage is not None:
             raise damage
         seal(self.folder, kept)
-        make_safe(self.folder, kept)
+        make_safe(self.folder, kept.bases)
         sync_folder(self.folder.parent)
         self._number, self._position = kept.cut.number, kept.cut.position
         self._bytes = _SEGMENT_BYTES  # what is sealed is not continued

@@ -38,7 +38,7 @@ from pycrorm_async.queue.segment import (
     segment_path,
 )
 
-__all__ = ["Kept", "Survey", "scan", "survey", "whole_frames", "checked_header"]
+__all__ = ["Kept", "Survey", "Walk", "scan", "survey", "whole_frames", "checked_header"]
 
 _SALT_OFFSET = HEADER_BYTES - 8
 _CLOSES = CLOSES.encode()
@@ -90,40 +90,68 @@ def scan(folder: Path, recorder: bytes) -> Kept:
 
 def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] | None = None) -> Survey:
     """What `scan` looks at, with damage as an answer. `seen` is told of each kept frame and its segment's number."""
-    numbers = segment_numbers(folder)
-    walk = _Walk(folder, recorder, seen)
+    walk = Walk(folder, recorder, seen)
     damage: SpoolDamaged | None = None
     try:
-        for number in numbers:
-            if not walk.enter(number):
-                break
-        _refuse_damage(folder, recorder, walk.kept(numbers))
+        while walk.step():
+            pass
     except SpoolDamaged as found:
         damage = found
-    return Survey(walk.kept(numbers), damage, walk.unsaid)
+    return Survey(walk.kept, damage, walk.unsaid)
 
 
-class _Walk:
-    """Goes from the oldest segment to the first hole."""
+class Walk:
+    """Goes from the oldest segment to the first hole, a segment at each step."""
 
-    def __init__(self, folder: Path, recorder: bytes, seen: Callable[[int, Frame], None] | None) -> None:
+    def __init__(self, folder: Path, recorder: bytes, seen: Callable[[int, Frame], None] | None = None) -> None:
         self._folder = folder
         self._recorder = recorder
         self._seen = seen
+        self._numbers = segment_numbers(folder)
+        self._steps = 0
         self._start = self._cut = Cursor(0, 0, 0)
         self._bases: dict[int, int] = {}
         self._open: dict[bytes, tuple[int, int, int]] = {}
         self._unsaid: list[int] = []  # checksums of the records that no commit frame has covered yet
+        self._damage: SpoolDamaged | None = None
+        self.over = False
 
-    def kept(self, numbers: list[int]) -> Kept:
+    def step(self) -> bool:
+        """Looks at one more segment; False when there is no more to look at: then nothing that was safe is missing.
+
+        Raises as `scan` does.
+        """
+        if self._damage is not None:
+            raise self._damage
+        if self.over:
+            return False
+        try:
+            if self._steps < len(self._numbers) and self._enter(self._numbers[self._steps]):
+                self._steps += 1
+                return True
+            _refuse_damage(self._folder, self._recorder, self.kept)
+        except SpoolDamaged as damage:
+            self._damage = damage
+            raise
+        self.over = True
+        return False
+
+    @property
+    def kept(self) -> Kept:
+        """All before the cut, as far as it has gone."""
         opened = {EpisodeId(episode): Last(*last) for episode, last in self._open.items()}
-        return Kept(self._start, self._cut, self._bases, opened, numbers)
+        return Kept(self._start, self._cut, self._bases, opened, self._numbers)
+
+    @property
+    def settled(self) -> int:
+        """The position up to which all is kept whatever is found further on: a commit frame says that it was safe."""
+        return self._cut.position - (0 if self.over else len(self._unsaid))
 
     @property
     def unsaid(self) -> tuple[int, ...]:
         return tuple(self._unsaid)
 
-    def enter(self, number: int) -> bool:
+    def _enter(self, number: int) -> bool:
         """Goes through one segment; False if it does not go on where the one before ended."""
         path = segment_path(self._folder, number)
         buffer = path.read_bytes()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from pycrorm_async.queue.folder import TAIL, write_safely
@@ -31,19 +32,18 @@ def seal(folder: Path, kept: Kept) -> None:
     sync_folder(folder)
 
 
-def make_safe(folder: Path, kept: Kept) -> None:
-    """What is kept is on the disk, the lowest number first. Raises `OSError`.
+def make_safe(folder: Path, numbers: Iterable[int]) -> None:
+    """These segments are on the disk, the first of them first. Raises `OSError`.
 
     A killed process' last records are there for all who read, and yet may be nowhere but in the page cache. If they
     were given away like this and lost in a power cut, the log would hold events that the next computed ends replace.
     """
-    for number in kept.numbers:
-        if number <= kept.cut.number:
-            descriptor = os.open(segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
-            try:
-                os.fdatasync(descriptor)
-            finally:
-                os.close(descriptor)
+    for number in numbers:
+        descriptor = os.open(segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
     sync_folder(folder)
 
 

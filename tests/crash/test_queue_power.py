@@ -209,7 +209,7 @@ async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(
         if first <= synced and rng.random() < 0.2:
             spoil(folder, synced)
             with pytest.raises(SpoolDamaged):
-                open_dead(folder)
+                await recover(folder)
 
 
 @pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(8, 200))])

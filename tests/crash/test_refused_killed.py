@@ -55,7 +55,7 @@ def recover(url: str, spool: Path, _say: object) -> None:
         if recovered is not None:
             recovered.seal()
             asyncio.run(drained(url, recovered))
-            if recovered.stored == recovered.last:
+            if recovered.all_stored:
                 recovered.remove()
             else:
                 recovered.release()

@@ -28,10 +28,12 @@ from pycrorm_async.errors import (
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.living import LiveQueue
+from pycrorm_async.queue.repair import repair_folder
 from pycrorm_async.queue.spool import RecorderFolder
 from pycrorm_async.writer.ports import Held
 from tests.databases import ask, ask_to_change
 from tests.memory.notes import NoteActionPerformable, texts
+from tests.queue.writing import Author, node, overwrite, started
 
 QUICK = Settings(sync_interval_ms=5, flush_timeout_s=60)
 
@@ -313,10 +315,10 @@ async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folder
 ) -> None:
     looking, cancelled = threading.Event(), threading.Event()
 
-    def take(folder: RecorderFolder) -> Held | None:
+    def take(folder: RecorderFolder, *, again: bool) -> Held | None:
         looking.set()
         assert cancelled.wait(60)
-        return _take(folder)
+        return _take(folder, again=again)
 
     async with memory_at(database_url, spool) as memory:
         await NoteActionPerformable("a").perform()
@@ -405,3 +407,26 @@ async def test_a_locked_database_is_away_for_the_daemon_and_closing_does_not_wai
     await started.task
     async with Reading.open(url) as reading:
         assert await texts(reading) == ["a", "b"]
+
+
+async def test_a_folder_that_is_damaged_further_on_is_told_once_and_what_was_safe_before_is_stored_once(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    author = Author(spool)
+    author.put(started())
+    for number in range(2, 21):
+        author.put(node(), b'"%d %s"' % (number, b"x" * 600))
+        author.sync()
+    path, offset, _ = author.places[12]
+    overwrite(path, offset + 68, b"#")
+    async with daemon() as running:
+        await running.says("is dead: recovering")
+        await running.says("position 13 is missing, and .* tried again now and then$")
+        assert ask(database_url, "SELECT max(sequence), count(*) FROM event") == [(12, 12)]
+    assert len([line for line in running.said if "position 13" in line and "tried again" in line]) == 1
+    assert len(author.segments) == len(list(author.folder.glob("*.segment")))
+    assert repair_folder(author.folder) is not None
+    async with daemon() as running:
+        await running.says(r"is recovered \(1 episode LOST\); 13 events stored")
+    assert ask(database_url, "SELECT max(sequence), count(*) FROM event") == [(13, 13)]
+    assert Spool(spool).recorders() == []

@@ -54,7 +54,7 @@ async def test_a_recorder_that_lived_without_a_record_leaves_nothing(author: Aut
     recovered = open_dead(author.folder)
     assert recovered is not None
     assert await drain(recovered) == []
-    assert recovered.last == recovered.stored == 0
+    assert recovered.all_stored
     recovered.remove()
     assert not author.folder.exists()
 

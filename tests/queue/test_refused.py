@@ -163,8 +163,8 @@ async def test_a_dead_recorders_refused_events_and_computed_end_go_aside_and_its
         recovered.release()
     recovered = open_dead(author.folder)
     assert recovered is not None
-    await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0)
-    await recovered.acknowledge(recovered.last)
+    batch = await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0)
+    await recovered.acknowledge(batch[-1].position)
     recovered.remove()
     assert await recover(kept_in(author.folder)) == [*placed(author.records[1:]), lost(4, 1, 4)]
 
