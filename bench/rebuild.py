@@ -32,6 +32,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.rebuild_beside import Company
+from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.projections.projector import Projector
@@ -80,6 +81,7 @@ def rebuilt(url: str, workers: int) -> Figures:
 
 
 def rebuild_and_say(url: str, workers: int) -> None:
+    collect_seldom()  # as the command does
     began = _cpu_s()
     done = asyncio.run(rebuild_memory(url, workers=workers))
     mb = max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) / 1024

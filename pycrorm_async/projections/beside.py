@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign, InternalError, LogDamaged
 from pycrorm_async.projections import progress
-from pycrorm_async.projections.folding import TABLES, Folding, Meaning
+from pycrorm_async.projections.folding import TABLES, Folding, Meaning, Prepared
 from pycrorm_async.projections.generations import Generation, Hold, grow_tables, note, noted
 from pycrorm_async.projections.layout import Layout
 from pycrorm_async.store.dialect import Progress
@@ -96,13 +97,34 @@ class CatchUp:
         self._batch_events = batch_events
         self.folding = Folding(log, goal, generation, meaning)
         self._after = 0
+        self._ready: Prepared | None = None
 
     async def fold_some(self) -> int | None:
         """Folds a batch; the number of events, None when none is left of this share. Raises `LogDamaged`."""
+        batch, self._ready = self._ready or await self._prepared({}), None
+        if batch is None:
+            return None
+        if self._log.address.is_sqlite:
+            return await self.folding.write(batch)
+        # While a server writes, the next batch is read and folded. Where this process writes, that gains nothing.
+        following = asyncio.create_task(self._prepared(batch.reached))
+        try:
+            count = await self.folding.write(batch)
+            ready = await following
+        except BaseException:
+            following.cancel()
+            await asyncio.gather(following, return_exceptions=True)
+            raise
+        if count == batch.count and not batch.done.parked:
+            self._ready = ready
+        return count
+
+    async def _prepared(self, reached: Mapping[int, int]) -> Prepared | None:
+        """The next batch. `reached` is how far episodes are once the one before it is written."""
         while True:
             async with self._log.reading() as connection:
                 await self._goal.generation(connection, "share")  # it is not dropped meanwhile
-                behind = await progress.behind(
+                found = await progress.behind(
                     connection,
                     self._goal.place,
                     after=self._after,
@@ -110,6 +132,11 @@ class CatchUp:
                     share=self._share,
                     after_tables=self._after_tables,
                 )
+            behind = [
+                each._replace(folded=max(each.folded, reached.get(each.number, 0)))
+                for each in found
+                if each.head > reached.get(each.number, 0)
+            ]
             if behind:
                 break
             if self._after == 0:
@@ -120,7 +147,7 @@ class CatchUp:
         if len(events) < sum(each.last - each.after for each in spans):
             raise _damage(self._log, spans, events, {each.number: each.id for each in behind})
         self._after = spans[-1].number
-        return await self.folding.batch(spans, events)
+        return await self.folding.prepare(spans, events)
 
 
 def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredEvent], ids: dict[int, str]) -> LogDamaged:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import random
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -193,6 +195,61 @@ async def test_interrupted_it_is_taken_up_where_it_was(database_url: str, monkey
     assert told[0] > 150
     assert done.generation == 2
     assert differences(before, tables_of(database_url)) == []
+    assert traces(database_url) == []
+
+
+async def test_however_small_its_batches_are_it_makes_the_same(
+    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await some_of_everything(database_url, tmp_path / "spool")
+    before, stopped = tables_of(database_url), ask(database_url, STOPPED)
+    monkeypatch.setattr(steps, "_BATCH_EVENTS", 7)
+    done = await rebuild_memory(database_url)
+    assert differences(before, tables_of(database_url)) == []
+    assert ask(database_url, STOPPED) == stopped
+    assert (list(done.parked), traces(database_url)) == ([str_of(10)], [])
+
+
+async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an episode that is longer than a batch the next one begins where that ends which is being written."""
+    monkeypatch.setattr(steps, "_BATCH_EVENTS", 10)
+    await store(database_url, [*TYPES, *picking(1, nodes=100).records, *picking(2).records])
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    async with claimed(log):
+        rebuild = await Rebuild.begin(log)
+        total, counts = await rebuild.left(), []
+        while (count := await rebuild.fold_some()) is not None:
+            counts.append(count)
+        assert (sum(counts), min(counts) > 0) == (total, True)
+        await rebuild.show()
+    await log.close()
+
+
+async def test_cancelled_at_any_moment_it_is_taken_up_where_it_was(
+    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(steps, "_BATCH_EVENTS", 9)
+    await some_of_everything(database_url, tmp_path / "spool")
+    before, stopped = tables_of(database_url), ask(database_url, STOPPED)
+    moments = random.Random(1)
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+
+    async def fold(rebuild: Rebuild) -> None:
+        while await rebuild.fold_some() is not None:
+            pass
+
+    async with claimed(log):
+        for _ in range(12):
+            task = asyncio.create_task(fold(await Rebuild.begin(log)))
+            await asyncio.wait([task], timeout=moments.uniform(0.001, 0.1))
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+            assert not any("_prepared" in repr(each) for each in asyncio.all_tasks())
+    await log.close()
+    await rebuild_memory(database_url)
+    assert differences(before, tables_of(database_url)) == []
+    assert ask(database_url, STOPPED) == stopped
     assert traces(database_url) == []
 
 

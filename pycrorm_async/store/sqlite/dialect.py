@@ -230,10 +230,13 @@ def _events(number: int, heads: str, payloads: bytes | None) -> Iterator[StoredE
         found = _HEADS.decode(heads)
     except msgspec.DecodeError as error:
         raise DamageError(f"events of episode {number} are damaged: {error}") from None
-    at = 0
-    for *head, length in found:
-        yield make(StoredEvent, (number, *head, payloads[at : at + length] if payloads else b""))
-        at += length
+    start = 0
+    payloads = payloads or b""  # None of no events, and of nothing but empty ones
+    for sequence, type_name, version, wall_ns, monotonic_ns, length in found:
+        end = start + length
+        values = (number, sequence, type_name, version, wall_ns, monotonic_ns, payloads[start:end])
+        yield make(StoredEvent, values)
+        start = end
 
 
 async def _driver(connection: AsyncConnection) -> Connection:
