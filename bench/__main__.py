@@ -59,6 +59,8 @@ RUNS = (
     Run("questions, large", ("--pick-ups", "500000"), quick=False),
     Run("rebuild", ("--workers", "1", "2")),
     Run("rebuild postgresql", ("--postgresql", "--workers", "1", "2")),
+    Run("rebuild, large", ("--no-company", "--events", "100000", "10000000"), quick=False),
+    Run("rebuild postgresql, large", ("--postgresql", "--no-company", "--events", "100000", "10000000"), quick=False),
     Run("growth", ("--turns", "2")),
     Run("thesis, 488,043 nodes", ("--nodes", "488043", "--repeat", "1"), quick=False),
     Run("thesis postgresql, 488,043 nodes", ("--postgresql", "--nodes", "488043", "--repeat", "1"), quick=False),
