@@ -127,13 +127,11 @@ class RecoveredQueue:
     async def acknowledge(self, position: int) -> None:
         """Everything up to this position is stored for good: segments that hold no more are deleted, oldest first.
 
-        The last one stays, because the ends are computed from it; and all, while any was not looked at: the next one's
-        header may be damaged, and then only this one knows which episodes are open. Raises `SpoolUnavailable`.
+        The last one that was looked at stays: the ends are computed from it, and the header of the next one, which says
+        what is open there too, may be damaged. Raises `SpoolUnavailable`.
         """
         assert position <= self._given, "only what was given can be acknowledged"
         self.stored = max(self.stored, position)
-        if not self._walk.over:
-            return
         bases = self._walk.kept.bases
         with available(self.folder):
             for number in sorted(bases):

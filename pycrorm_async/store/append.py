@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.bulk import make
 from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
@@ -36,12 +36,20 @@ async def append_batch(
     changed = [each.after for identity, each in steps.items() if each.after != known[identity]]
     if changed:
         await dialect.upsert_episodes(connection, changed)
-    fresh = [make(StoredEvent, (each.after.number, *record[2:])) for each in steps.values() for record in each.fresh]
+    fresh = [row for each in steps.values() for row in _rows(each)]
     if fresh:
         await dialect.insert_events(connection, fresh)
     await _compare(dialect, connection, [each for each in steps.values() if each.again])
     stopped = {each: done.after.refused for each, done in steps.items() if _left_out(batch, each, done)}
     return refusals | {each: reason for each, reason in stopped.items() if reason is not None}
+
+
+def _rows(done: Step) -> list[tuple[Any, ...]]:
+    number = done.after.number
+    return [
+        (number, sequence, type_name, version, wall_ns, monotonic_ns, payload.decode())
+        for _, _, sequence, type_name, version, wall_ns, monotonic_ns, payload in done.fresh
+    ]
 
 
 def _left_out(batch: Sorted, episode: EpisodeId, done: Step) -> bool:

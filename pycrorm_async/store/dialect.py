@@ -90,7 +90,9 @@ class Dialect(Protocol):
         """Numbers that no episode has or will have had."""
         ...
 
-    async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None: ...
+    async def insert_events(self, connection: AsyncConnection, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Each row is a `StoredEvent`'s fields, but the payload is text."""
+        ...
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         """`folded` and `parked` stay as they are."""

@@ -424,9 +424,9 @@ async def test_a_folder_that_is_damaged_further_on_is_told_once_and_what_was_saf
         await running.says("position 13 is missing, and .* tried again now and then$")
         assert ask(database_url, "SELECT max(sequence), count(*) FROM event") == [(12, 12)]
     assert len([line for line in running.said if "position 13" in line and "tried again" in line]) == 1
-    assert len(author.segments) == len(list(author.folder.glob("*.segment")))
+    assert len(author.segments) > len(list(author.folder.glob("*.segment"))) > 1
     assert repair_folder(author.folder) is not None
     async with daemon() as running:
-        await running.says(r"is recovered \(1 episode LOST\); 13 events stored")
+        await running.says(r"is recovered \(1 episode LOST\)")
     assert ask(database_url, "SELECT max(sequence), count(*) FROM event") == [(13, 13)]
     assert Spool(spool).recorders() == []

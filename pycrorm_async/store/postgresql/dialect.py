@@ -68,8 +68,7 @@ class PostgreSQL:
     async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
         return list((await connection.exec_driver_sql(sql.NEW_NUMBERS, (count,))).scalars())
 
-    async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None:
-        rows = [(*each[:6], each.payload.decode()) for each in events]
+    async def insert_events(self, connection: AsyncConnection, rows: Sequence[tuple[Any, ...]]) -> None:
         await _copy(connection, LOG_SCHEMA, "event", sql.EVENT_COLUMNS, rows)
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:

@@ -76,8 +76,7 @@ class SQLite:
         taken = (await connection.exec_driver_sql(sql.SELECT_NUMBER_MAX)).scalar_one()
         return list(range(taken + 1, taken + 1 + count))
 
-    async def insert_events(self, connection: AsyncConnection, events: Sequence[StoredEvent]) -> None:
-        rows = [(*each[:6], each.payload.decode()) for each in events]
+    async def insert_events(self, connection: AsyncConnection, rows: Sequence[tuple[Any, ...]]) -> None:
         await (await _driver(connection)).execute_in_turn(inserts("event", sql.EVENT_COLUMNS, rows))
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
