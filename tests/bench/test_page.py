@@ -47,6 +47,30 @@ def test_the_largest_number_of_nodes_that_was_measured_is_judged() -> None:
     assert found == Verdict("49.9 times at 488,043 nodes", held=False)
 
 
+def test_of_all_logs_that_were_rebuilt_the_largest_is_judged() -> None:
+    def of(database: str, events: int, times: float, mb: float) -> dict[str, Any]:
+        sizes = [{"events": 100}, {"events": events}]
+        return {**ABOUT, "database": database, "by_workers": {"1": sizes}, "growth": {"1": _grown(times, mb)}}
+
+    lines = {
+        "rebuild": of("sqlite", 1_000, 1.2, 0),
+        "rebuild, large": of("sqlite", 10_000, 1.1, 16.0),
+        "rebuild postgresql": of("postgresql", 1_000, 0.9, -1.0),
+    }
+    found = verdict("rebuild, the largest log", lines)
+    assert found == Verdict(
+        "sqlite 1.10 times, +16 MB (100 to 10,000 events), postgresql 0.90 times, -1 MB (100 to 1,000 events)",
+        held=True,
+    )
+    for worse in (_grown(1.11, 0), _grown(1.0, 16.1)):
+        lines["rebuild, large"]["growth"] = {"1": worse}
+        assert verdict("rebuild, the largest log", lines).held is False
+
+
+def _grown(times: float, mb: float) -> dict[str, float]:
+    return {"us_per_event": times, "mb": mb}
+
+
 def test_a_library_that_is_missing_leaves_its_budget_unmeasured_and_is_on_the_page() -> None:
     words = "missing: pip install '.[bench]'"
     lines = {"others": {"bench": "others", **ABOUT, "postgresql": {"eventsource-py": words}}}
