@@ -54,7 +54,7 @@ async def test_a_recorder_that_lived_without_a_record_leaves_nothing(author: Aut
     recovered = open_dead(author.folder)
     assert recovered is not None
     assert await drain(recovered) == []
-    assert recovered.all_stored
+    assert (recovered.all_stored, recovered.stored, recovered.lost) == (True, 0, ())
     recovered.remove()
     assert not author.folder.exists()
 
