@@ -236,12 +236,14 @@ async def _folded(spans: Sequence[Span], events: Sequence[StoredEvent], rows: Ba
     """The events of these spans, in their order, added to `rows`."""
     steps: list[Progress] = []
     parked: dict[int, str] = {}
+    seen = 0
     for span, some in _by_span(spans, events):
         last = span.after
         for event in some:
             if event.sequence != last + 1:
                 break
-            if not event.sequence % _SLICE_EVENTS:
+            seen += 1
+            if seen % _SLICE_EVENTS == 0:
                 await asyncio.sleep(0)
             try:
                 rows.fold(event)

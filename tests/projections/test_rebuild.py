@@ -10,18 +10,21 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import func, select
+from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
+from pycrorm_async.projections.folding import _folded
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.rebuilding import rebuild_memory
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.rows import Span, StoredEvent
 from tests.databases import Server, ask, ask_to_change
 from tests.projections.remade import TYPES, folded_elsewhere, lost, parking, picking, store, str_of, traces, whispering
 from tests.promises.test_random_plans import play
@@ -354,3 +357,25 @@ async def test_a_table_of_somebody_in_the_schema_of_the_views_is_one_line_and_st
     ask_to_change(url, "DROP TABLE memory.mine")
     assert (await rebuild_memory(url)).left == []
     assert traces(url) == []
+
+
+async def test_a_batch_gives_way_to_others_also_when_all_its_episodes_are_short() -> None:
+    class Nothing:
+        def fold(self, event: StoredEvent) -> None: ...
+
+        async def write(self, connection: AsyncConnection, generation: int) -> None: ...
+
+    events = [StoredEvent(number, turn, "", 1, 1, 1, b"") for number in range(1, 101) for turn in range(1, 21)]
+    turns = 0
+
+    async def other() -> None:
+        nonlocal turns
+        while True:
+            turns += 1
+            await asyncio.sleep(0)
+
+    task = asyncio.create_task(other())
+    done = await _folded([Span(number, 0, 20) for number in range(1, 101)], events, Nothing())
+    task.cancel()
+    assert done.steps == [(number, 0, 20) for number in range(1, 101)]
+    assert turns >= 10
