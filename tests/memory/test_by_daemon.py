@@ -6,6 +6,7 @@ import re
 import shutil
 import sqlite3
 import threading
+import uuid
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
@@ -15,7 +16,7 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, UserView, recover
-from pycrorm_async.daemon import _take, serve
+from pycrorm_async.daemon import _Folders, _take, serve
 from pycrorm_async.errors import (
     CallerError,
     DatabaseForeign,
@@ -30,6 +31,7 @@ from pycrorm_async.queue import Spool
 from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.repair import repair_folder
 from pycrorm_async.queue.spool import RecorderFolder
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.writer.ports import Held
 from tests.databases import ask, ask_to_change
 from tests.memory.notes import NoteActionPerformable, texts
@@ -430,3 +432,23 @@ async def test_a_folder_that_is_damaged_further_on_is_told_once_and_what_was_saf
         await running.says(r"is recovered \(1 episode LOST\)")
     assert ask(database_url, "SELECT max(sequence), count(*) FROM event") == [(13, 13)]
     assert Spool(spool).recorders() == []
+
+
+def test_a_folder_in_which_damage_was_met_is_looked_at_whole_before_any_of_it_is_given_again(
+    tmp_path: Path, spool: Path
+) -> None:
+    author = Author(spool)
+    author.put(started())
+    for number in range(2, 21):
+        author.put(node(), b'"%d %s"' % (number, b"x" * 600))
+        author.sync()
+    path, offset, _ = author.places[12]
+    overwrite(path, offset + 68, b"#")
+    look = _Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))
+    first = look(())
+    assert (len(first.held), first.failed) == (1, {})
+    assert not first.held[0].let_go().whole
+    for _ in range(2):
+        again = look(())
+        assert again.held == []
+        assert "position 13 is missing" in str(again.failed[author.folder.name])
