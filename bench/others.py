@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import gc
 import importlib
 import itertools
 import json
@@ -49,6 +48,7 @@ from bench.material.rollouts import tree
 from bench.material.spooled import Recording, spool_tree
 from bench.reporting.figures import MISSING, console, spread
 from pycrorm_async.adoption import open_destination
+from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
 from pycrorm_async.events.codec import decode, encode
@@ -105,7 +105,6 @@ async def _drained(spool: Path, url: str) -> float:
         began = time.perf_counter()
         queue = open_dead(folder.path)
         assert queue is not None
-        queue.seal()
         await Drain(queue, destination, settings=settings).run()
         took = time.perf_counter() - began
         queue.release()
@@ -380,7 +379,6 @@ async def _read(spool: Path) -> list[Record]:
     [folder] = Spool(spool).recorders()
     queue = open_dead(folder.path)
     assert queue is not None
-    queue.seal()
     records: list[Record] = []
     while batch := await queue.get_batch(events_max=10_000, bytes_max=2**22, age_s_max=0.0):
         records += batch
@@ -403,7 +401,7 @@ def main() -> None:
     asked = parser.parse_args()
     events, queued, turns = (1_000, 1_000, 1) if asked.quick else (asked.events, asked.queued, asked.turns)
     packages = ("eventsource-py", "eventsourcing", "persist-queue", "asyncpg", "psycopg")
-    gc.set_threshold(10_000)  # as `pycrorm writer` has it; for all of them
+    collect_seldom()  # as `pycrorm writer` does; for all of them
     signal.signal(signal.SIGALRM, _give_up)
     answer: dict[str, Any] = {
         "bench": "others",

@@ -132,16 +132,17 @@ def dead_queues(
             recovered = open_dead(folder.path)
             if recovered is None:
                 continue
-            recovered.seal()
-            if lost is not None:
-                lost += [episode_text(end.episode) for end in recovered.lost if end.episode is not None]
             try:
                 yield recovered
             finally:
+                if lost is not None:
+                    lost += [episode_text(end.episode) for end in recovered.lost if end.episode is not None]
                 if recovered.all_stored:
                     recovered.remove()
                 else:
                     recovered.release()
+            if recovered.damage is not None:
+                raise recovered.damage
         except PycrormError as error:
             failures[folder.name] = error
             _log.warning("%s", error)

@@ -116,7 +116,7 @@ def _take(folder: RecorderFolder, *, again: bool) -> Held | None:
         return None
     try:
         if again:  # it may be damaged further on, and what comes before that is not to be stored again and again
-            dead.seal()
+            dead.check()
     except BaseException:
         dead.release()
         raise

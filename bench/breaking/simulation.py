@@ -145,7 +145,7 @@ async def _drained(folder: Path, log: EventLog, rng: random.Random) -> None:
         recovered = open_dead(folder)
         assert recovered is not None
         if rng.random() < 0.5:
-            recovered.seal()
+            recovered.check()
         settings = Settings(batch_events_max=rng.choice((1, 5, 100)))
         drain = Drain(recovered, _Faulty(log, rng), settings=settings, backoff=_AT_ONCE)
         running = asyncio.create_task(drain.run())

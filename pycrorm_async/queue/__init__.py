@@ -9,7 +9,7 @@
         progress               how far it is drained, if that is another process (`progress.py`)
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
         00000002.segment       the last one may be made ahead: all zero
-        00000001.segment.tail  what sealing cut off, to be looked at until the folder is removed
+        00000001.segment.tail  what was torn at the end of a refused folder that is written on
       <recorder>.<episode>.refused/   what the database refused of this episode (`refused.py`), in the same format
       <recorder>.damaged/      a damaged folder as it was, when `repair` put another in its place
 

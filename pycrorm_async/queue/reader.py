@@ -1,4 +1,4 @@
-"""Reads records back from segments, in order, payloads untouched: the same way live and after a crash.
+"""Reads records back from the segments of a recorder that lives, in order, payloads untouched.
 
 A hole is an error here: whoever calls knows up to which position the records are there.
 """

@@ -13,17 +13,16 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by, remove_folder
-from pycrorm_async.queue.frame import Buffer
 from pycrorm_async.queue.locks import FileLock
-from pycrorm_async.queue.reader import Batch, Reader
 from pycrorm_async.queue.refused import RefusedRecords
-from pycrorm_async.queue.scan import Kept, Walk
-from pycrorm_async.queue.sealing import make_safe, seal, tails
+from pycrorm_async.queue.scan import Kept, Walk, scan
+from pycrorm_async.queue.sealing import make_safe
 from pycrorm_async.queue.segment import CLOSES, segment_path
 
 __all__ = ["RecoveredQueue", "open_dead"]
@@ -71,20 +70,21 @@ class RecoveredQueue:
         self.folder = folder
         self.name = folder.name
         self.lost: tuple[Record, ...] = ()
+        self._recorder = recorder
+        self._ready: list[Record] = []
+        """What was found and not given yet. Given is what `_settled` covers."""
         self._settled = 0
-        self._walk = Walk(folder, recorder)
+        self._walk = Walk(folder, recorder, found=self._ready.append)
         while self._look_further() and self._settled == self._walk.kept.start.position:
             pass
-        start = self._walk.kept.start
         self._locks = locks
         self._refused = RefusedRecords(folder)
-        self._reader = Reader(recorder=recorder, start=start, load=self._load)
-        self._given = self.stored = start.position
+        self._given = self.stored = self._walk.kept.start.position
 
     @property
     def all_stored(self) -> bool:
         """Whether everything that is in it was looked at, given and acknowledged, with the computed ends."""
-        return self._walk.over and self.stored == self._settled + len(self.lost)
+        return self._walk.over and self.stored == self._settled
 
     @property
     def holds_refused(self) -> bool:
@@ -92,18 +92,21 @@ class RecoveredQueue:
         return held_by(self.name).episode is not None
 
     @property
-    def tail_bytes(self) -> int:
-        """How much of the files lies behind the cut and is not zero: written, never synced, and torn."""
-        self._look_at_all()
+    def damage(self) -> SpoolDamaged | None:
+        """What was met; nothing is given that may stand behind it."""
+        return self._walk.damage
+
+    def check(self) -> None:
+        """Looks at all of it, and gives nothing. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`."""
         with available(self.folder):
-            return sum(len(tail) for _, tail in tails(self.folder, self._walk.kept))
+            scan(self.folder, self._recorder)
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
         """The next records in order, at least one, at most the limits; empty when all are given.
 
         Raises `SpoolDamaged` where that begins which may not be kept, and `SpoolUnavailable`.
         """
-        batch = self._read(events_max, bytes_max)
+        batch = self._next(events_max, bytes_max)
         while not (batch.complete or self._walk.over):
             try:
                 await asyncio.to_thread(self._look_further)
@@ -111,18 +114,10 @@ class RecoveredQueue:
                 if not batch.records:
                     raise
                 break  # the next call raises
-            batch = self._read(events_max, bytes_max, begun=batch)
-        self._reader.cursor = batch.after
-        records, total = batch.records, batch.payload_bytes
-        for end in self.lost:
-            if end.position == (records[-1].position if records else self._given) + 1:
-                total += len(end.payload)
-                if records and (len(records) >= events_max or total > bytes_max):
-                    break
-                records.append(end)
-        if records:
-            self._given = records[-1].position
-        return records
+            batch = self._next(events_max, bytes_max)
+        del self._ready[: len(batch.records)]
+        self._given += len(batch.records)
+        return batch.records
 
     async def acknowledge(self, position: int) -> None:
         """Everything up to this position is stored for good: segments that hold no more are deleted, oldest first.
@@ -150,20 +145,9 @@ class RecoveredQueue:
     def give_up(self, reason: str) -> None:
         """Nobody puts into it, so nobody waits for room."""
 
-    def seal(self) -> None:
-        """Looks at all of it, and cuts the files where the records end; what is cut off is copied aside first, to
-        `<segment>.tail`.
-
-        Twice is once, and killed at any point it can be done again. Raises `SpoolDamaged` and `SpoolUnavailable`.
-        """
-        self._look_at_all()
-        with available(self.folder):
-            seal(self.folder, self._walk.kept)
-
     def remove(self) -> None:
         """Deletes the folder, all of which is stored, and gives up the locks. Raises `SpoolUnavailable`."""
         assert self.all_stored, "what is not acknowledged is not deleted"
-        self._reader.close()
         try:
             with available(self.folder):
                 remove_folder(self.folder)
@@ -172,14 +156,9 @@ class RecoveredQueue:
 
     def release(self) -> None:
         """Gives up the locks; what was not acknowledged is given again by whoever recovers next. Twice is once."""
-        self._reader.close()
         self._refused.release()
         for lock in self._locks:
             lock.release()
-
-    def _look_at_all(self) -> None:
-        while self._look_further():
-            pass
 
     def _look_further(self) -> bool:
         """At the next segment, which is on the disk then; False if there is no more."""
@@ -189,18 +168,27 @@ class RecoveredQueue:
             more = self._walk.step()
             if more:
                 make_safe(self.folder, [self._walk.kept.cut.number])
-        self._settled = self._walk.settled
         if not more:
             self.lost = _ends(self._walk.kept)
+            self._ready += self.lost
+        self._settled = self._walk.settled + len(self.lost)
         return more
 
-    def _read(self, events_max: int, bytes_max: int, begun: Batch | None = None) -> Batch:
-        with available(self.folder):
-            return self._reader.read(last=self._settled, events_max=events_max, bytes_max=bytes_max, begun=begun)
+    def _next(self, events_max: int, bytes_max: int) -> _Batch:
+        records = self._ready[: min(events_max, self._settled - self._given)]
+        total = 0
+        for count, record in enumerate(records):
+            total += len(record.payload)
+            if total > bytes_max and count:
+                return _Batch(records[:count], complete=True)
+        return _Batch(records, complete=len(records) == events_max or total >= bytes_max)
 
-    def _load(self, number: int) -> tuple[Path, Buffer]:
-        path = segment_path(self.folder, number)
-        return path, path.read_bytes()
+
+class _Batch(NamedTuple):
+    """`complete`: one more would pass a limit."""
+
+    records: list[Record]
+    complete: bool
 
 
 def _ends(kept: Kept) -> tuple[Record, ...]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from pycrorm_async.bulk import make
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign
+from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.frame import (
     CHECKSUM,
@@ -90,7 +91,7 @@ def scan(folder: Path, recorder: bytes) -> Kept:
 
 def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] | None = None) -> Survey:
     """What `scan` looks at, with damage as an answer. `seen` is told of each kept frame and its segment's number."""
-    walk = Walk(folder, recorder, seen)
+    walk = Walk(folder, recorder, seen=seen)
     damage: SpoolDamaged | None = None
     try:
         while walk.step():
@@ -101,19 +102,31 @@ def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] 
 
 
 class Walk:
-    """Goes from the oldest segment to the first hole, a segment at each step."""
+    """Goes from the oldest segment to the first hole, a segment at each step.
 
-    def __init__(self, folder: Path, recorder: bytes, seen: Callable[[int, Frame], None] | None = None) -> None:
+    `seen` is told of each kept frame and its segment's number, `found` is given each kept record.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        recorder: bytes,
+        *,
+        seen: Callable[[int, Frame], None] | None = None,
+        found: Callable[[Record], None] | None = None,
+    ) -> None:
         self._folder = folder
         self._recorder = recorder
         self._seen = seen
+        self._found = found
+        self._types: dict[bytes, str] = {}
         self._numbers = segment_numbers(folder)
         self._steps = 0
         self._start = self._cut = Cursor(0, 0, 0)
         self._bases: dict[int, int] = {}
         self._open: dict[bytes, tuple[int, int, int]] = {}
         self._unsaid: list[int] = []  # checksums of the records that no commit frame has covered yet
-        self._damage: SpoolDamaged | None = None
+        self.damage: SpoolDamaged | None = None
         self.over = False
 
     def step(self) -> bool:
@@ -121,8 +134,8 @@ class Walk:
 
         Raises as `scan` does.
         """
-        if self._damage is not None:
-            raise self._damage
+        if self.damage is not None:
+            raise self.damage
         if self.over:
             return False
         try:
@@ -131,7 +144,7 @@ class Walk:
                 return True
             _refuse_damage(self._folder, self._recorder, self.kept)
         except SpoolDamaged as damage:
-            self._damage = damage
+            self.damage = damage
             raise
         self.over = True
         return False
@@ -174,11 +187,11 @@ class Walk:
 
     def _go_through(self, path: Path, buffer: Buffer, number: int) -> None:
         """Keeps a segment's records from the cut on, up to the first hole or damage; there is the cut then."""
-        opened, unsaid, seen = self._open, self._unsaid, self._seen
+        opened, unsaid, seen, found, types = self._open, self._unsaid, self._seen, self._found, self._types
         _, offset, position = self._cut
         try:
             for frame in decode_each(buffer, offset, salt_of(self._recorder, number)):
-                kind, _, at, sequence, wall_ns, monotonic_ns, episode, type_name, _, checksum, size = frame
+                kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, checksum, size = frame
                 if kind == COMMIT:
                     self._cut = Cursor(number, offset, position)
                     self._check_commit(path, make(Frame, frame))
@@ -188,10 +201,17 @@ class Walk:
                         if sequence != (before[0] if before else 0) + 1:
                             raise _not_next(path, offset, episode, sequence, before)
                         opened[episode] = (sequence, wall_ns, monotonic_ns)
-                        if type_name == _CLOSES:
+                        if name == _CLOSES:
                             del opened[episode]
                     unsaid.append(checksum)
                     position = at
+                    if found is not None:
+                        type_name = types.get(name)
+                        if type_name is None:
+                            type_name = types[name] = name.decode()
+                        owner = episode if kind == EVENT else None
+                        values = (at, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
+                        found(make(Record, values))
                 else:
                     break
                 offset += size

@@ -1,4 +1,4 @@
-"""What is done to a folder that nobody writes any more, before anything of it is given away: cut, and on the disk."""
+"""What is done to what another process wrote: on the disk before it is given away, and cut before it is written on."""
 
 from __future__ import annotations
 

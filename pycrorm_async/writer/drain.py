@@ -91,6 +91,7 @@ class Drain:
         """Drains until the source is closed and empty.
 
         Raises what makes going on useless: `LogDamaged`, a damaged source, a database away after the last attempt.
+        The source is told; the user is told by whoever this is raised to.
         """
         settings = self._settings
         try:
@@ -106,7 +107,7 @@ class Drain:
                 self._on_append()
                 await self._tell()
         except Exception as error:
-            self._give_up(f"the writer stopped: {error}")
+            self._source.give_up(_stopped(error))
             raise
         finally:
             self._over = True
@@ -114,7 +115,7 @@ class Drain:
 
     async def abandon(self, error: Exception) -> None:
         """Instead of `run`, when it cannot be: who waits is told."""
-        self._give_up(f"the writer stopped: {error}")
+        self._source.give_up(_stopped(error))
         self._over = True
         await self._tell()
 
@@ -173,7 +174,9 @@ class Drain:
         except (FilesError, DamageError) as error:
             self._ceiling = records[0].position - 1
             episode, reason = next(iter(refused.items()))
-            self._give_up(f"episode {episode} was refused: {reason}; its events cannot be set aside: {error}")
+            refusal = f"episode {episode} was refused: {reason}; its events cannot be set aside: {error}"
+            self._say(f"nothing more is acknowledged to recorder {self._source.name}: {refusal}")
+            self._source.give_up(refusal)
             return
         if not aside:
             self._ceiling = records[0].position - 1
@@ -187,13 +190,13 @@ class Drain:
             await self._source.acknowledge(position)
             self._acknowledged = position
 
-    def _give_up(self, reason: str) -> None:
-        self._say(f"nothing more is acknowledged to recorder {self._source.name}: {reason}")
-        self._source.give_up(reason)
-
     async def _tell(self) -> None:
         async with self._moved:
             self._moved.notify_all()
+
+
+def _stopped(error: Exception) -> str:
+    return f"the writer stopped: {error}"
 
 
 async def to_the_end(work: Coroutine[Any, Any, _T]) -> _T:

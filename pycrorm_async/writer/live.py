@@ -76,7 +76,7 @@ class LiveWriter:
         try:
             self._stopped_before = await self._patiently(self._destination.stopped)
         except Exception as error:
-            self._failure = error
+            self._stop(error)
             await self._drain.abandon(error)
             raise
         async with asyncio.TaskGroup() as tasks:
@@ -87,7 +87,7 @@ class LiveWriter:
             try:
                 await self._drain.run()
             except Exception as error:  # noqa: BLE001 - kept, and raised below and at every flush
-                self._failure = error
+                self._stop(error)
             finally:
                 for each in others:
                     each.cancel()
@@ -126,6 +126,11 @@ class LiveWriter:
     def _not_in_time(self, timeout_s: float) -> str:
         reason = self._drain.state.away or self._fold_error or "there was too much to store and fold"
         return f"not finished after {timeout_s:g} s ({reason}); everything recorded is safe in the spool"
+
+    def _stop(self, error: Exception) -> None:
+        """For good. Said at once: the next flush may be far away."""
+        self._failure = error
+        _log.error("the writer stopped, and what is recorded is kept in the spool: %s", error)
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

@@ -108,7 +108,6 @@ def recover_all(url: str, spool: Path) -> None:
     for folder in Spool(spool).recorders():
         recovered = open_dead(folder.path)
         if recovered is not None:
-            recovered.seal()
             asyncio.run(drained(url, recovered))
             recovered.remove()
 

@@ -53,7 +53,6 @@ def recover(url: str, spool: Path, _say: object) -> None:
     for folder in Spool(spool).recorders():
         recovered = open_dead(folder.path)
         if recovered is not None:
-            recovered.seal()
             asyncio.run(drained(url, recovered))
             if recovered.all_stored:
                 recovered.remove()

@@ -2,11 +2,9 @@
 
 import asyncio
 import logging
-import re
 import shutil
 import sqlite3
 import threading
-import uuid
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import replace
@@ -16,7 +14,7 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, UserView, recover
-from pycrorm_async.daemon import _Folders, _take, serve
+from pycrorm_async.daemon import _take, serve
 from pycrorm_async.errors import (
     CallerError,
     DatabaseForeign,
@@ -29,29 +27,11 @@ from pycrorm_async.errors import (
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.living import LiveQueue
-from pycrorm_async.queue.repair import repair_folder
 from pycrorm_async.queue.spool import RecorderFolder
-from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.writer.ports import Held
 from tests.databases import ask, ask_to_change
+from tests.memory.daemons import QUICK, Daemon
 from tests.memory.notes import NoteActionPerformable, texts
-from tests.queue.writing import Author, node, overwrite, started
-
-QUICK = Settings(sync_interval_ms=5, flush_timeout_s=60)
-
-
-class Daemon:
-    """A daemon in this loop, and what it said."""
-
-    def __init__(self, url: str, spool: Path) -> None:
-        self.said: list[str] = []
-        self.leave = asyncio.Event()
-        self.task = asyncio.create_task(serve(url, spool=spool, leave=self.leave, say=self.said.append, settings=QUICK))
-
-    async def says(self, pattern: str) -> None:
-        async with asyncio.timeout(60):
-            while not any(re.search(pattern, line) for line in self.said):  # noqa: ASYNC110
-                await asyncio.sleep(0.01)
 
 
 @pytest.fixture
@@ -409,46 +389,3 @@ async def test_a_locked_database_is_away_for_the_daemon_and_closing_does_not_wai
     await started.task
     async with Reading.open(url) as reading:
         assert await texts(reading) == ["a", "b"]
-
-
-async def test_a_folder_that_is_damaged_further_on_is_told_once_and_what_was_safe_before_is_stored_once(
-    database_url: str, spool: Path, daemon: Start
-) -> None:
-    author = Author(spool)
-    author.put(started())
-    for number in range(2, 21):
-        author.put(node(), b'"%d %s"' % (number, b"x" * 600))
-        author.sync()
-    path, offset, _ = author.places[12]
-    overwrite(path, offset + 68, b"#")
-    async with daemon() as running:
-        await running.says("is dead: recovering")
-        await running.says("position 13 is missing, and .* tried again now and then$")
-        assert ask(database_url, "SELECT max(sequence), count(*) FROM event") == [(12, 12)]
-    assert len([line for line in running.said if "position 13" in line and "tried again" in line]) == 1
-    assert len(author.segments) > len(list(author.folder.glob("*.segment"))) > 1
-    assert repair_folder(author.folder) is not None
-    async with daemon() as running:
-        await running.says(r"is recovered \(1 episode LOST\)")
-    assert ask(database_url, "SELECT max(sequence), count(*) FROM event") == [(13, 13)]
-    assert Spool(spool).recorders() == []
-
-
-def test_a_folder_in_which_damage_was_met_is_looked_at_whole_before_any_of_it_is_given_again(
-    tmp_path: Path, spool: Path
-) -> None:
-    author = Author(spool)
-    author.put(started())
-    for number in range(2, 21):
-        author.put(node(), b'"%d %s"' % (number, b"x" * 600))
-        author.sync()
-    path, offset, _ = author.places[12]
-    overwrite(path, offset + 68, b"#")
-    look = _Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))
-    first = look(())
-    assert (len(first.held), first.failed) == (1, {})
-    assert not first.held[0].let_go().whole
-    for _ in range(2):
-        again = look(())
-        assert again.held == []
-        assert "position 13 is missing" in str(again.failed[author.folder.name])

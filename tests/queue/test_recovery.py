@@ -9,9 +9,11 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.queue.folder import held_by
 from pycrorm_async.queue.frame import CHECKSUM, EVENT, encode
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.scan import scan
+from pycrorm_async.queue.sealing import seal, tails
 from pycrorm_async.queue.segment import salt_of
 from tests.queue.writing import (
     DECLARED,
@@ -139,8 +141,9 @@ async def test_a_record_that_reached_the_disk_before_an_earlier_one_is_a_legal_t
     recovered = open_dead(author.folder)
     assert recovered is not None
     assert await drain(recovered) == [author.records[0], lost(2, 1, 2)]
-    assert recovered.tail_bytes > 0
     recovered.release()
+    [(_, tail)] = tails(author.folder, scan(author.folder, RECORDER))
+    assert tail
 
 
 async def test_a_later_segment_that_reached_the_disk_before_the_end_of_the_one_before_is_a_legal_tail(
@@ -457,11 +460,8 @@ async def test_sealing_copies_the_tail_aside_cuts_it_and_gives_the_same_records_
     first, second = author.segments
     tails = [first.read_bytes()[offset:].rstrip(b"\0"), second.read_bytes().rstrip(b"\0")]
     for _ in range(2):
-        recovered = open_dead(author.folder)
-        assert recovered is not None
-        recovered.seal()
-        assert await drain(recovered) == [*author.records[:2], lost(3, 1, 3)]
-        recovered.release()
+        seal(author.folder, scan(author.folder, RECORDER))
+        assert await recover(author.folder) == [*author.records[:2], lost(3, 1, 3)]
         assert first.stat().st_size == offset
         assert not second.exists()
         assert [path.with_name(f"{path.name}.tail").read_bytes() for path in (first, second)] == tails
@@ -475,10 +475,7 @@ async def test_a_sealing_that_was_killed_anywhere_can_be_done_again(author: Auth
     tail = path.read_bytes()[offset:].rstrip(b"\0")
     copy = path.with_name(f"{path.name}.tail")
     copy.with_name(f"{copy.name}.making").write_bytes(tail[:10])
-    recovered = open_dead(author.folder)
-    assert recovered is not None
-    recovered.seal()
-    recovered.release()
+    seal(author.folder, scan(author.folder, RECORDER))
     assert copy.read_bytes() == tail
     assert path.stat().st_size == offset
     assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
@@ -490,8 +487,8 @@ async def test_a_live_queue_that_was_let_go_has_no_tail(spool: Path) -> None:
     queue.release()
     recovered = open_dead(queue.folder)
     assert recovered is not None
-    assert recovered.tail_bytes == 0
-    recovered.seal()
+    recovered.check()
     assert len(await drain(recovered)) == 2
     recovered.release()
-    assert sorted(path.name for path in queue.folder.iterdir()) == ["00000001.segment", "alive", "drain"]
+    kept = scan(queue.folder, held_by(queue.name).recorder)
+    assert [tail for _, tail in tails(queue.folder, kept) if tail] == []

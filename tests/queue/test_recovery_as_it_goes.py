@@ -49,7 +49,7 @@ async def given_before_damage(folder: Path, *, events_max: int = 10_000) -> list
         with pytest.raises(SpoolDamaged):  # and it stays so
             await recovered.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0)
         with pytest.raises(SpoolDamaged):
-            recovered.seal()
+            recovered.check()
         assert not recovered.lost
     finally:
         recovered.release()

@@ -184,8 +184,8 @@ async def test_an_episode_parked_by_someone_before_is_not_raised_again(address: 
     assert ask(address.path, HEADS) == [(name(1), 3, 0), (name(2), 3, 3)]
 
 
-async def test_damage_is_raised_at_every_flush_and_at_close_while_the_plan_goes_on(
-    address: DatabaseAddress,
+async def test_damage_is_told_once_and_raised_at_every_flush_and_at_close_while_the_plan_goes_on(
+    address: DatabaseAddress, caplog: pytest.LogCaptureFixture
 ) -> None:
     log = await EventLog.open(address, create=True)
     await log.append([record(episode(1), 1, payload=b"{}")])
@@ -204,6 +204,9 @@ async def test_damage_is_raised_at_every_flush_and_at_close_while_the_plan_goes_
         await writer.close()
     assert source.kept == [1, 2, 3, 4, 5, 6, 4, 5, 6]
     assert writers_alive() == []
+    assert [each.getMessage() for each in caplog.records] == [
+        f"the writer stopped, and what is recorded is kept in the spool: {writer.state.failure}"
+    ]
 
 
 async def test_a_flush_that_takes_too_long_says_why_and_loses_nothing(address: DatabaseAddress) -> None:

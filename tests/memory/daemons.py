@@ -1,0 +1,28 @@
+"""A daemon in the test's own loop, and what it says."""
+
+import asyncio
+import re
+from pathlib import Path
+
+from pycrorm_async import Settings
+from pycrorm_async.daemon import serve
+
+QUICK = Settings(sync_interval_ms=5, flush_timeout_s=60)
+
+
+class Daemon:
+    """A daemon in this loop, and what it said."""
+
+    def __init__(self, url: str, spool: Path) -> None:
+        self.said: list[str] = []
+        self.leave = asyncio.Event()
+        self.task = asyncio.create_task(serve(url, spool=spool, leave=self.leave, say=self.said.append, settings=QUICK))
+
+    async def says(self, pattern: str) -> None:
+        async with asyncio.timeout(60):
+            while not any(re.search(pattern, line) for line in self.said):  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+
+    async def leaves(self) -> None:
+        self.leave.set()
+        await self.task
