@@ -27,7 +27,7 @@ from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.materialised import refresh_some
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_tables import OwnTables
-from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, with_user_views
+from pycrorm_async.projections.views import UserView, with_user_views
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -60,7 +60,7 @@ class Projector:
         batch_events: int = 10_000,
     ) -> None:
         self._log = log
-        self._views = (*BUILT_IN_VIEWS, *views)
+        self._views = views
         self._batch_events = batch_events
         self._own = OwnTables(log, projections, found, batch_events=batch_events)
         self._has_news = True

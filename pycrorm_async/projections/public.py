@@ -35,6 +35,7 @@ from sqlalchemy.sql.selectable import CompoundSelect
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.layout import Layout
+from pycrorm_async.projections.pick_ups import pick_ups_with_context
 from pycrorm_async.projections.tables import CORE, OWN, column_type, make_table
 
 __all__ = ["public_views", "own_views", "View"]
@@ -44,6 +45,8 @@ _Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
 
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
 """So many bits of a row's id are below the episode's number."""
+
+_PICKED = "pick_up_action"
 
 _event = table("event", column("episode"), column("sequence"), column("payload"))
 _episode = table("episode", column("number"), column("id"))
@@ -118,6 +121,10 @@ def public_views(layout: Layout, generation: int, *, simulated: bool = False) ->
     views: dict[str, View] = {name: shown(select(each), each) for name, each in core.items()}
     views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
     views |= {name: _leaf(name, layout, generation, shown) for name in layout.leaves}
+    if _PICKED in layout.leaves:
+        node, thing, pose = (core[name] for name in ("task_tree_node", "object", "pose"))
+        picked = _leaf(_PICKED, layout, generation, lambda view, _: view).subquery("picked")
+        views["PickUpWithContextView"] = shown(pick_ups_with_context(picked, node, thing, pose), node)
     views["designator_type"] = _designator_type()
     return views
 

@@ -51,7 +51,7 @@ from pycrorm_async.projections.public import public_views
 from pycrorm_async.projections.shadowing import with_views
 from pycrorm_async.projections.tables import CORE, physical_name
 from pycrorm_async.projections.union import unite
-from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_text, with_user_views
+from pycrorm_async.projections.views import UserView, view_text, with_user_views
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -150,7 +150,7 @@ class Rebuild:
                 layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
                 if shown is not None:
                     layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
-                layout = with_user_views(layout, (*BUILT_IN_VIEWS, *views), connection.dialect)
+                layout = with_user_views(layout, views, connection.dialect)
                 making = await grow_tables(connection, making, layout)
                 await note(connection, MAKING, making)
         return cls(log, making)

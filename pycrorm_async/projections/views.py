@@ -7,21 +7,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from sqlalchemy import ColumnElement, Dialect, Select, TableClause, column, select, table
+from sqlalchemy import Dialect, Select, TableClause, column, table
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
-from pycrorm_async.orm import Object, PickUpAction, Pose, TaskTreeNode
 from pycrorm_async.projections.classes import storage_of
 from pycrorm_async.projections.layout import Kept, Layout
 from pycrorm_async.projections.materialised import EPISODE
 
-__all__ = ["UserView", "BUILT_IN_VIEWS", "with_user_views", "view_texts", "view_text"]
+__all__ = ["UserView", "with_user_views", "view_texts", "view_text"]
 
 
 @dataclass(frozen=True)
@@ -71,58 +70,8 @@ def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> d
     texts: dict[str, str] = {}
     for view in views:
         lowered = view.name.lower()
-        if lowered in taken or (is_reserved(view.name) and view not in BUILT_IN_VIEWS):
+        if lowered in taken or is_reserved(view.name):
             raise CallerError(f"a view cannot be called {view.name!r}: the name is taken (choose another)")
         taken.add(lowered)
         texts[view.name] = view_text(view.meaning, dialect)
     return texts
-
-
-def _pick_up_with_context() -> Select[*tuple[Any, ...]]:
-    # Joined at the ids themselves: a node, its designator and its leaf row have the same one. Of tables and not of
-    # classes, which would all be configured when this is imported (0.2 s).
-    picked, node, thing = PickUpAction.__table__, TaskTreeNode.__table__, Object.__table__
-    robot, there = Pose.__table__.alias("robot"), Pose.__table__.alias("there")
-    return (
-        select(
-            picked.c.id,
-            picked.c.arm,
-            picked.c.grasp,
-            node.c.torso_height,
-            (robot.c.x - there.c.x).label("relative_x"),
-            (robot.c.y - there.c.y).label("relative_y"),
-            robot.c.qx.label("quaternion_x"),
-            robot.c.qy.label("quaternion_y"),
-            robot.c.qz.label("quaternion_z"),
-            robot.c.qw.label("quaternion_w"),
-            thing.c.obj_type,
-            node.c.status,
-            node.c.process_metadata_id,
-            node.c.id.label("node_id"),
-            *_seen_from(there.c, robot.c),
-            (there.c.z - robot.c.z - node.c.torso_height).label("height_over_torso"),
-        )
-        .select_from(picked)
-        .join(node, node.c.id == picked.c.id)
-        .join(robot, robot.c.id == node.c.robot_pose_id)
-        .join(thing, thing.c.id == picked.c.object_designator_id)
-        .join(there, there.c.id == thing.c.pose_id)
-    )
-
-
-def _seen_from(thing: Any, robot: Any) -> Iterator[ColumnElement[Any]]:
-    """Position (m) and orientation of the robot in the thing's own frame; plain arithmetic, for every database."""
-    dx, dy, dz = robot.x - thing.x, robot.y - thing.y, robot.z - thing.z
-    x, y, z, w = thing.qx, thing.qy, thing.qz, thing.qw
-    # The rows of the transposed rotation matrix.
-    yield ((1 - 2 * (y * y + z * z)) * dx + 2 * (x * y + z * w) * dy + 2 * (x * z - y * w) * dz).label("object_x")
-    yield (2 * (x * y - z * w) * dx + (1 - 2 * (x * x + z * z)) * dy + 2 * (y * z + x * w) * dz).label("object_y")
-    yield (2 * (x * z + y * w) * dx + 2 * (y * z - x * w) * dy + (1 - 2 * (x * x + y * y)) * dz).label("object_z")
-    # The conjugate of the thing's quaternion times the robot's.
-    yield (w * robot.qx - x * robot.qw - y * robot.qz + z * robot.qy).label("object_qx")
-    yield (w * robot.qy + x * robot.qz - y * robot.qw - z * robot.qx).label("object_qy")
-    yield (w * robot.qz - x * robot.qy + y * robot.qx - z * robot.qw).label("object_qz")
-    yield (w * robot.qw + x * robot.qx + y * robot.qy + z * robot.qz).label("object_qw")
-
-
-BUILT_IN_VIEWS = (UserView("PickUpWithContextView", _pick_up_with_context()),)

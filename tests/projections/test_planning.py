@@ -1,4 +1,4 @@
-"""Which table SQLite begins a question with: what it is told of new tables, for it never counts by itself."""
+"""How the databases go about a question, and what SQLite is told of new tables, for it never counts by itself."""
 
 import sqlite3
 from contextlib import closing
@@ -8,6 +8,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.rebuilding import rebuild_memory
+from tests.databases import ask
 
 VIEW = 'SELECT arm, relative_x FROM "PickUpWithContextView" WHERE {}'
 
@@ -28,6 +29,17 @@ async def test_a_question_begins_with_what_is_fewest(tmp_path: Path, question: s
     with closing(sqlite3.connect(tmp_path / "memory.db")) as file:
         first, *_ = [row[3] for row in file.execute(f"EXPLAIN QUERY PLAN {question}")]
     assert first.startswith(begins)
+
+
+async def test_of_a_pick_up_with_context_it_is_asked_once_whether_it_happened(
+    database_url: str, tmp_path: Path
+) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool"):
+        pass
+    explain = "EXPLAIN QUERY PLAN" if database_url.startswith("sqlite") else "EXPLAIN"
+    plan = "\n".join(str(row) for row in ask(database_url, f"{explain} {VIEW.format('true')}"))
+    assert "pick_up_action__1" in plan
+    assert "simulated_episode" not in plan
 
 
 async def test_what_is_expected_of_a_table_goes_with_it_when_it_is_made_anew(tmp_path: Path) -> None:

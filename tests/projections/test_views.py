@@ -27,7 +27,7 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.layout import Contradictory
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.views import BUILT_IN_VIEWS, UserView, view_texts
+from pycrorm_async.projections.views import UserView, view_texts
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.projections.asking import ask, names, stored_and_folded
@@ -187,4 +187,4 @@ async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_vie
         with pytest.raises(Contradictory):
             layout.with_declaration(declared("NobodysAction", name))
         with pytest.raises(CallerError):
-            view_texts([*BUILT_IN_VIEWS, UserView(name, select(ParkArmsAction.arm))], layout, sqlite.dialect())
+            view_texts([UserView(name, select(ParkArmsAction.arm))], layout, sqlite.dialect())
