@@ -88,8 +88,10 @@ def _thesis(database: str, wanted: float) -> Callable[[Lines], Verdict]:
 def _rebuild_rate(lines: Lines) -> Verdict:
     rates = {database: _rebuilt(lines, database)[-1]["events_per_s"] for database in ("sqlite", "postgresql")}
     by_two = {database: _rebuilt(lines, database, workers="2")[-1]["events_per_s"] for database in rates}
-    text = ", ".join(f"{database} {rate:,} events/s, {by_two[database]:,} by two" for database, rate in rates.items())
-    return Verdict(text, all(rate >= 100_000 for rate in rates.values()))
+    text = ", ".join(f"{database} {by_two[database]:,} events/s ({rate:,} by one)" for database, rate in rates.items())
+    return Verdict(
+        f"by two processes, as the command does it: {text}", all(rate >= 100_000 for rate in by_two.values())
+    )
 
 
 def _rebuild_growth(lines: Lines) -> Verdict:

@@ -28,15 +28,16 @@ def rebuild(
     ] = None,
     url: UrlOption = DEFAULT_URL,
     workers: Annotated[
-        int,
+        int | None,
         typer.Option(
             "--workers",
             min=1,
             max=64,
-            help="Processes that fold the tables at once; more than one pays from a million events on, with a free"
-            " core for each.",
+            help="Processes that fold the tables at once. Default: two for more than half a million events, if there"
+            " are two cores; a core that plans need is kept for them with 1.",
+            show_default=False,
         ),
-    ] = 1,
+    ] = None,
     projection: ProjectionOption = None,
     as_json: JsonOption = False,
 ) -> int:
@@ -86,7 +87,7 @@ async def _chosen(url: str, names: list[str], known: Mapping[str, Projection]) -
     return [each for each in (_TABLES, *known) if not names or each in names]
 
 
-async def _rebuild(url: str, workers: int, projection: Projection | None) -> Rebuilt:
+async def _rebuild(url: str, workers: int | None, projection: Projection | None) -> Rebuilt:
     with watched("rebuilding") as watch:
 
         def tell(what: str, done: int, total: int) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import random
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +14,7 @@ import pytest
 from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async import Memory, Reading
+from pycrorm_async import Memory, Reading, rebuilding
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
@@ -72,6 +74,29 @@ async def test_tables_made_anew_hold_row_for_row_what_was_kept_up_to_date(databa
 
 
 FAILED = 'SELECT * FROM "Failed" ORDER BY id'
+
+
+@pytest.mark.parametrize(
+    ("events", "cores", "begun"), [(500_000, {0, 1}, []), (100, {0, 1}, [2]), (100, {0}, [])], ids=str
+)
+async def test_large_logs_are_remade_by_two_processes_where_there_are_two_cores(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: int, cores: set[int], begun: list[int]
+) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await store(url, [*TYPES, *(record for number in range(1, 8) for record in picking(number).records)])
+    before, real, shared_out = tables_of(url), rebuilding._share_out, list[int]()
+
+    async def share_out(address: DatabaseAddress, rebuild: Rebuild, workers: int, look: Callable[[int], None]) -> None:
+        shared_out.append(workers)
+        await real(address, rebuild, workers, look)
+        assert await rebuild.left() == 0
+
+    monkeypatch.setattr(rebuilding, "_share_out", share_out)
+    monkeypatch.setattr(rebuilding, "_ALONE_EVENTS_MAX", events)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores)
+    assert (await rebuild_memory(url, workers=None)).events > 100
+    assert shared_out == begun
+    assert differences(before, tables_of(url)) == []
 
 
 async def test_tables_that_nobody_ever_made_are_made(database_url: str) -> None:
