@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
@@ -176,12 +177,12 @@ class RecoveredQueue:
 
     def _next(self, events_max: int, bytes_max: int) -> _Batch:
         records = self._ready[: min(events_max, self._settled - self._given)]
-        total = 0
-        for count, record in enumerate(records):
-            total += len(record.payload)
-            if total > bytes_max and count:
-                return _Batch(records[:count], complete=True)
-        return _Batch(records, complete=len(records) == events_max or total >= bytes_max)
+        sizes = [len(record.payload) for record in records]
+        total = sum(sizes)
+        if total < bytes_max:
+            return _Batch(records, complete=len(records) == events_max)
+        fitting = sum(size <= bytes_max for size in accumulate(sizes))
+        return _Batch(records[: max(1, fitting)], complete=True)
 
 
 class _Batch(NamedTuple):
