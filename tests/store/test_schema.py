@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import sqlite3
 import subprocess
 import sys
@@ -192,6 +193,28 @@ asyncio.run(main())
     assert [each.returncode for each in openers] == [0] * 6
     assert ids == [ids[0]] * 6
     assert len(ids[0]) == 36
+
+
+@pytest.mark.parametrize("hold", ["BEGIN IMMEDIATE", "BEGIN EXCLUSIVE"])
+async def test_whoever_opens_a_new_log_waits_for_another_who_does(address: DatabaseAddress, hold: str) -> None:
+    address.path.touch()
+    other = sqlite3.connect(address.path, isolation_level=None)
+    other.execute(hold)
+    opening = asyncio.create_task(EventLog.open(address, create=True))
+    await asyncio.sleep(0.3)
+    assert not opening.done()
+    other.execute("COMMIT")
+    other.close()
+    await (await opening).close()
+    assert ask(address.path, "PRAGMA journal_mode") == [("wal",)]
+
+
+async def test_logs_that_four_open_at_once_are_there_for_all_of_them(tmp_path: Path) -> None:
+    for number in range(100):
+        address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/{number}.db")
+        logs = await asyncio.gather(*(EventLog.open(address, create=True) for _ in range(4)))
+        for each in logs:
+            await each.close()
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
 from pycrorm_async.store.sqlite.binding import bound, inserts
 from pycrorm_async.store.sqlite.claim import claim
-from pycrorm_async.store.sqlite.engine import BEGIN, Connection
+from pycrorm_async.store.sqlite.engine import BEGIN, USE_WAL, Connection
 
 __all__ = ["SQLite"]
 
@@ -39,7 +39,7 @@ class SQLite:
             # Not before the database is known to be ours or empty: the journal mode is a lasting change of the file.
             await connection.execution_options(**{BEGIN: None})
             await self.look(connection, name)
-            mode = (await connection.exec_driver_sql(tables.USE_WAL)).scalar_one()
+            mode = (await connection.exec_driver_sql(USE_WAL)).scalar_one()
             if mode != "wal":
                 raise DatabaseUnavailable(f"{name}: SQLite cannot keep a write-ahead log there (a network folder?)")
 

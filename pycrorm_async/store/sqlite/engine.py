@@ -18,7 +18,7 @@ from sqlalchemy import URL, event
 from sqlalchemy import Connection as Begun
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 
-__all__ = ["make_engine", "BEGIN", "Connection"]
+__all__ = ["make_engine", "BEGIN", "USE_WAL", "Connection"]
 
 _T = TypeVar("_T")
 
@@ -26,6 +26,9 @@ BEGIN = "sqlite_begin"
 """Execution option: the statement that begins a transaction, None for none at all."""
 
 _WRITE = "BEGIN IMMEDIATE"
+USE_WAL = "PRAGMA journal_mode = WAL"
+"""Kept in the file, so it is set once; outside a transaction, and never on a database that is not ours."""
+_IN_TURN = (_WRITE, USE_WAL)
 _LOOK_S = 0.001
 """So often who waits for its turn to write looks whether it has come."""
 _ROWS_AT_ONCE = 64
@@ -111,8 +114,8 @@ class Cursor:
 
     async def execute(self, statement: str, parameters: Any = ()) -> Self:
         def execute(connection: sqlite3.Connection) -> None:
-            if statement == _WRITE:
-                _wait_for_turn(connection, self._connection.patience_s)
+            if statement in _IN_TURN:
+                self._keep(_wait_for_turn(connection, statement, self._connection.patience_s))
             else:
                 self._keep(connection.execute(statement, parameters))
 
@@ -173,21 +176,21 @@ async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
         raise
 
 
-def _wait_for_turn(connection: sqlite3.Connection, patience_s: float) -> None:
-    """Begins a transaction that writes. SQLite itself would wait too, but sleep longer with every time it looks: beside
-    a process that folds all the time appending took 10.5 µs an event that way, and 8.6 this way."""
+def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: float) -> sqlite3.Cursor:
+    """Does what others must not be at work for. To begin a transaction that writes SQLite itself would wait too, but
+    sleep longer with every time it looks: beside a process that folds all the time appending took 10.5 µs an event that
+    way, and 8.6 this way. To change the journal mode it does not wait for others who open the new file."""
     connection.execute("PRAGMA busy_timeout = 0")
     until_s = time.monotonic() + patience_s
     try:
         while True:
             try:
-                connection.execute(_WRITE)
+                return connection.execute(statement)
             except sqlite3.OperationalError as error:
-                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY or time.monotonic() >= until_s:
+                busy = error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY  # whatever keeps it busy
+                if not busy or time.monotonic() >= until_s:
                     raise
                 time.sleep(_LOOK_S)
-            else:
-                return
     finally:
         connection.execute(f"PRAGMA busy_timeout = {int(patience_s * 1000)}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 
-__all__ = ["MIGRATIONS", "USE_WAL", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
+__all__ = ["MIGRATIONS", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
 
 
 def _refuse(name: str, change: str, table: str) -> str:
@@ -76,9 +76,6 @@ _FIRST = (
 )
 
 MIGRATIONS: tuple[tuple[str, ...], ...] = (_FIRST,)
-
-USE_WAL = "PRAGMA journal_mode = WAL"
-"""Kept in the file, so it is set once; outside a transaction, and never on a database that is not ours."""
 
 TABLE_NAMES = (
     "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
