@@ -17,7 +17,7 @@ import numpy as np
 from sqlalchemy import Select, select
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import PickUpWithContextView, TaskTreeNode
+from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.experience import PastSuccess
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.task_status import TaskStatus
@@ -72,15 +72,9 @@ class PickUpExperience:
 
 
 def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, ...]]:
-    view, node = PickUpWithContextView, TaskTreeNode
+    view = PickUpWithContextView
     # First which, then what: the columns that are reckoned are reckoned for these only, and nothing wide is sorted.
-    latest = (
-        select(view.id)
-        .join(node, node.id == view.node_id)
-        .where(view.obj_type == object_type, ~node.simulated)
-        .order_by(view.id.desc())
-        .limit(ATTEMPTS_MAX)
-    )
+    latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(ATTEMPTS_MAX)
     if arm is not None:
         latest = latest.where(view.arm == arm)
     return (
