@@ -73,14 +73,14 @@ async def fill(url: str, events: int) -> None:
     await log.close()
 
 
-def rebuilt(url: str, workers: int | None) -> Figures:
-    """What a process of its own says of its rebuild; by as many as the command takes by itself, unless it is said."""
-    command = [sys.executable, "-m", "bench.rebuild", "--of", url, "--workers", str(workers or 0)]
+def rebuilt(url: str, workers: int) -> Figures:
+    """What a process of its own says of its rebuild."""
+    command = [sys.executable, "-m", "bench.rebuild", "--of", url, "--workers", str(workers)]
     said: Figures = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
     return said
 
 
-def rebuild_and_say(url: str, workers: int | None) -> None:
+def rebuild_and_say(url: str, workers: int) -> None:
     collect_seldom()  # as the command does
     began = _cpu_s()
     done = asyncio.run(rebuild_memory(url, workers=workers))
@@ -110,12 +110,12 @@ def growth(smallest: Figures, largest: Figures) -> Figures:
 
 
 def beside_others(url: str, spool: Path, *, calm_s: float) -> dict[str, object]:
-    """What those found who went on while it was rebuilt as the command does it, and how fast that was."""
+    """What those found who went on while it was rebuilt by one process, as the command does it beside busy ones."""
     with ExitStack() as stack:
         company = Company(stack, url, spool, recorders=2, readers=2)
         time.sleep(calm_s)
         company.rebuilding()
-        found = rebuilt(url, None)
+        found = rebuilt(url, 1)
         said = company.end()
     return {"rebuild": figures(found), **said}
 
@@ -141,7 +141,7 @@ def main() -> None:
     parser.add_argument("--of", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.of:
-        rebuild_and_say(asked.of, asked.workers[0] or None)
+        rebuild_and_say(asked.of, *asked.workers)
         return
     sizes = sorted(asked.events or ([2_000, 10_000] if asked.quick else [100_000, 1_000_000]))
     database = "postgresql" if asked.postgresql else "sqlite"

@@ -30,7 +30,9 @@ Tell: TypeAlias = Callable[[str, int, int], None]
 
 _LOOK_S = 0.5
 _ALONE_EVENTS_MAX = 500_000
-"""More are made anew by two processes, if nobody says by how many: of 400,000 they took 0.8 to 1.0 times as long."""
+"""Of 400,000 two processes took 0.8 times as long as one on SQLite and as long on PostgreSQL."""
+_IDLE_CORES_MIN = 1.5
+"""Beside four busy processes on two cores two were hardly faster than one, and who recorded waited twice as long."""
 _WAIT_S = 20.0
 """For a turn to write on SQLite: what has run for an hour does not give up for a plan that is busy."""
 
@@ -67,8 +69,9 @@ async def rebuild_memory(
     Args:
         url: of a memory that is there; what is recorded meanwhile will be in the tables too.
         workers: processes that fold at once, each its share of the episodes. On SQLite one at a time writes, while
-            another folds. More than one needs a core for each, and a second to begin; None: two where they are the
-            faster way. They are spawned: a script that has more than one does so below `if __name__ == "__main__":`.
+            another folds. More than one needs a core for each, and a second to begin; None: two for a large log, where
+            two cores have nothing to do. They are spawned: a script that has more than one does so below
+            `if __name__ == "__main__":`.
         views: questions with a name to keep beside the tables, with those that were registered before.
         tell: what is done now, how many events are done, and of how many.
         clock: what the time is taken from.
@@ -139,8 +142,8 @@ async def _opened(address: DatabaseAddress) -> EventLog:
 async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, tell: Tell) -> None:
     _, total = await recorded(log)
     if workers is None:
-        pays = await rebuild.left() > _ALONE_EVENTS_MAX and len(os.sched_getaffinity(0)) > 1
-        workers = 2 if pays else 1
+        idle = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
+        workers = 2 if idle >= _IDLE_CORES_MIN and await rebuild.left() > _ALONE_EVENTS_MAX else 1
     if workers > 1:
         await _share_out(log.address, rebuild, workers, lambda left: tell("rebuilding", max(total - left, 0), total))
     # All of it, or what came meanwhile and what a worker that failed has left: then it fails here too, and says why.

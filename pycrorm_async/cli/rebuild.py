@@ -33,8 +33,8 @@ def rebuild(
             "--workers",
             min=1,
             max=64,
-            help="Processes that fold the tables at once. Default: two for more than half a million events, if there"
-            " are two cores; a core that plans need is kept for them with 1.",
+            help="Processes that fold the tables at once. Default: two for more than half a million events where two"
+            " cores have nothing to do.",
             show_default=False,
         ),
     ] = None,

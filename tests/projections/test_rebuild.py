@@ -77,10 +77,17 @@ FAILED = 'SELECT * FROM "Failed" ORDER BY id'
 
 
 @pytest.mark.parametrize(
-    ("events", "cores", "begun"), [(500_000, {0, 1}, []), (100, {0, 1}, [2]), (100, {0}, [])], ids=str
+    ("events", "cores", "load", "begun"),
+    [
+        (500_000, {0, 1}, 0.0, []),
+        (100, {0, 1}, 0.4, [2]),
+        (100, {0, 1}, 1.0, []),
+        (100, {0}, 0.0, []),
+        (100, {0, 1, 2, 3}, 2.4, [2]),
+    ],
 )
-async def test_large_logs_are_remade_by_two_processes_where_there_are_two_cores(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: int, cores: set[int], begun: list[int]
+async def test_large_logs_are_remade_by_two_processes_where_two_cores_are_idle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: int, cores: set[int], load: float, begun: list[int]
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     await store(url, [*TYPES, *(record for number in range(1, 8) for record in picking(number).records)])
@@ -94,6 +101,7 @@ async def test_large_logs_are_remade_by_two_processes_where_there_are_two_cores(
     monkeypatch.setattr(rebuilding, "_share_out", share_out)
     monkeypatch.setattr(rebuilding, "_ALONE_EVENTS_MAX", events)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores)
+    monkeypatch.setattr(os, "getloadavg", lambda: (load, 9.0, 9.0))
     assert (await rebuild_memory(url, workers=None)).events > 100
     assert shared_out == begun
     assert differences(before, tables_of(url)) == []
