@@ -20,7 +20,7 @@ from pycrorm_async.bulk import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
 from pycrorm_async.daemon import serve
-from pycrorm_async.errors import DamageError
+from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import named
 from pycrorm_async.writer.daemon import LEAVE_S, Moved
@@ -90,7 +90,10 @@ def _once(url: str, spool: Path | None, projections: Sequence[Projection], *, as
     else:
         _print(report)
     for name, error in report.failed.items():
-        problem(f"{name}: {error}")
+        mend = ""
+        if isinstance(error, SpoolDamaged):
+            mend = f"; mend it with: pycrorm spool repair {error.path.parent.parent}"
+        problem(f"{name}: {error}{mend}")
     for episode, reason in report.drained.stopped.items():
         problem(f"episode {episode} is stopped: {reason}")
     if any(isinstance(error, DamageError) for error in report.failed.values()):

@@ -84,6 +84,9 @@ def test_a_damaged_spool_is_mended_and_what_is_whole_is_stored(left: Path) -> No
     assert f"mend it with: pycrorm spool repair {left}" in line
     refused = pycrorm("writer", "--once", cwd=left.parent)
     assert refused.returncode == 4
+    line = one_line_of(refused)
+    assert f"{path} is damaged at byte" in line
+    assert line.endswith(f"; mend it with: pycrorm spool repair {left}")
 
     document = answer("spool", "repair", left, cwd=left.parent, code=1)
     [mended] = document["mended"]
