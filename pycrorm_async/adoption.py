@@ -141,8 +141,8 @@ def dead_queues(
                     recovered.remove()
                 else:
                     recovered.release()
-            if recovered.damage is not None:
-                raise recovered.damage
+            if recovered.damage is not None:  # whoever drained it was told, and tells
+                failures[folder.name] = recovered.damage
         except PycrormError as error:
             failures[folder.name] = error
             _log.warning("%s", error)

@@ -199,6 +199,7 @@ class LiveWriter:
             await drain.run()
         except Exception as error:  # noqa: BLE001 - shown in the state; the next folder may be in order
             self._adoption_errors.append(f"{source.name}: {error}")
+            self._not_adopted.append(f"recorder {source.name}: {error}")
 
     def _tell_not_adopted(self) -> None:
         """In one line: what was refused once is offered, and refused, at every start."""

@@ -13,6 +13,7 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.ports import Source
 from tests.databases import ask
 from tests.store.making import episode, record, run_of
@@ -57,6 +58,23 @@ async def test_a_damaged_folder_of_somebody_else_is_shown_and_not_raised(address
         "/spool/4/1.seg is damaged at byte 0: no header",
     )
     assert after.kept == []
+
+
+async def test_what_a_dead_recorder_left_and_the_log_contradicts_is_told_once(
+    address: DatabaseAddress, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = await EventLog.open(address, create=True)
+    await log.append([record(episode(2), 1, payload=b'{"other":1}')])
+    await log.close()
+    source = KeptSource(run_of(episode(1), 1, 3))
+    writer = writer_for(source, address, adopt=[KeptSource(run_of(episode(2), 1, 4), closed=True, name="dead 2")])
+    await writer.start()
+    await until(lambda: bool(writer.state.adoption_errors))
+    await writer.flush(3)
+    source.close()
+    await writer.close()
+    [line] = [each.getMessage() for each in caplog.records]
+    assert line == (f"recorder dead 2: episode {name(2)}, event 1: another event is stored under this number already")
 
 
 async def test_what_is_refused_of_many_dead_recorders_is_told_in_one_line(
