@@ -214,7 +214,10 @@ def view_texts_of(
     """
     layout, number = generation.layout, generation.number
     meanings = public_views(layout, number, simulated=simulated)
-    users = dict(layout.user_views) if simulated else shown_texts(layout, number)
+    texts = dict(layout.user_views) if simulated else shown_texts(layout, number)
+    users = {
+        name: each for name, each in texts.items() if name not in meanings
+    }  # one of ours may have been noted there
     taken = {name.lower() for name in (*meanings, *users)}
     own: dict[str, str] = {}
     for name, each in projections.items():

@@ -10,6 +10,7 @@ from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
+import msgspec
 import pytest
 from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -71,6 +72,21 @@ async def test_tables_made_anew_hold_row_for_row_what_was_kept_up_to_date(databa
     assert ask(database_url, 'SELECT count(*) FROM "All"') == ask(database_url, "SELECT count(*) FROM task_tree_node")
     assert ask(database_url, FAILED) == failed
     assert traces(database_url) == []
+
+
+async def test_a_view_of_ours_that_was_noted_as_a_users_one_is_made_anew_too(database_url: str) -> None:
+    await store(database_url, [*TYPES, *picking(1).records])
+    asked = 'SELECT id, arm, status FROM "PickUpWithContextView" ORDER BY id'
+    before = ask(database_url, asked)
+    assert before
+    notes = "memory_tables.pycrorm_generation" if database_url.startswith("postgresql:") else "pycrorm_generation"
+    [(noted,)] = ask(database_url, f"SELECT layout FROM {notes} WHERE projection = 'tables'")
+    layout = msgspec.json.decode(noted)
+    layout["user_views"] = {"PickUpWithContextView": "SELECT 1 AS id", **layout.get("user_views", {})}
+    changed = msgspec.json.encode(layout).decode()
+    ask_to_change(database_url, f"UPDATE {notes} SET layout = '{changed}' WHERE projection = 'tables'")
+    await rebuild_memory(database_url)
+    assert ask(database_url, asked) == before
 
 
 FAILED = 'SELECT * FROM "Failed" ORDER BY id'
