@@ -7,9 +7,9 @@
 The memories hold the rollouts of the thesis, 9 to 13 nodes each, a hundred in an episode. Each question is asked seven
 times after a first time that is not counted, all in turns, and the collector has been by before each. A server is asked
 when it has counted what it holds, as it does by itself within a minute or two, for before that it guesses how to go
-about a question. The same rows are asked for as a frame and as mapped
-objects, and from the plain view and from one whose rows are kept. Prints one JSON line: ms (median, least, most) and
-how many rows there were, by database, size and question.
+about a question. The same rows are asked for as a frame and as mapped objects, and from the plain view and from one
+whose rows are kept. Prints one JSON line: ms (median, least, most) and how many rows there were, by database, size and
+question.
 """
 
 from __future__ import annotations
