@@ -16,7 +16,7 @@ from pycrorm_async.projections.generations import Generation, Hold, grow_tables,
 from pycrorm_async.projections.layout import Layout
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span, StoredEvent, share_out
+from pycrorm_async.store.rows import Span, StoredEvent, beyond, share_out
 
 __all__ = ["Beside", "CatchUp", "Share", "WHOLE"]
 
@@ -115,7 +115,7 @@ class CatchUp:
             following.cancel()
             await asyncio.gather(following, return_exceptions=True)
             raise
-        if count == batch.count and not batch.done.parked:
+        if count == batch.count and batch.is_whole:
             self._ready = ready
         return count
 
@@ -132,11 +132,7 @@ class CatchUp:
                     share=self._share,
                     after_tables=self._after_tables,
                 )
-            behind = [
-                each._replace(folded=max(each.folded, reached.get(each.number, 0)))
-                for each in found
-                if each.head > reached.get(each.number, 0)
-            ]
+            behind = beyond(found, reached)
             if behind:
                 break
             if self._after == 0:

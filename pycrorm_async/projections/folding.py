@@ -16,7 +16,7 @@ from itertools import groupby
 from operator import attrgetter
 from typing import Protocol
 
-from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.projections.fold import CannotFold, fold
@@ -25,8 +25,8 @@ from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.parameters import Designators
 from pycrorm_async.projections.rows import Rows
 from pycrorm_async.projections.union import unite
-from pycrorm_async.projections.write import write_rows
-from pycrorm_async.store.dialect import Progress, RowRefused
+from pycrorm_async.projections.write import insertion_of, write_rows
+from pycrorm_async.store.dialect import Insertion, Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import Span, StoredEvent
@@ -60,6 +60,10 @@ class Batch(Protocol):
         """Raises `CannotFold`, and then has added nothing."""
         ...
 
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        """All is folded: makes ready what can be before a transaction, to be written into this generation."""
+        ...
+
     async def write(self, connection: AsyncConnection, generation: int) -> None:
         """Raises `RowRefused`."""
         ...
@@ -75,9 +79,11 @@ class Meaning(Protocol):
 
 @dataclass(frozen=True)
 class _Folded:
-    """A batch after the fold: its rows, (episode, folded before, folded now) of each episode, and why some stop."""
+    """A batch after the fold: its rows, ready for the generation of this number, (episode, folded before, folded now)
+    of each episode, and why some stop."""
 
     rows: Batch
+    number: int
     steps: list[Progress]
     parked: dict[int, str]
 
@@ -107,6 +113,11 @@ class Prepared:
         return sum(now - before for _, before, now in self.done.steps)
 
     @property
+    def is_whole(self) -> bool:
+        """Whether nothing of it stays behind: no episode is parked."""
+        return not self.done.parked
+
+    @property
     def reached(self) -> dict[int, int]:
         """By number, how far the episodes are when it is written."""
         return {number: now for number, _, now in self.done.steps}
@@ -118,12 +129,16 @@ class _TableRows:
     def __init__(self, designators: Designators) -> None:
         self._designators = designators
         self._rows = Rows()
+        self._insertion: Insertion = None
 
     def fold(self, event: StoredEvent) -> None:
         fold(event, self._designators, self._rows)
 
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        self._insertion = await insertion_of(engine, self._rows, generation)
+
     async def write(self, connection: AsyncConnection, generation: int) -> None:
-        await write_rows(connection, self._rows, generation)
+        await write_rows(connection, self._rows, self._insertion, generation)
 
 
 class _Tables:
@@ -159,7 +174,7 @@ class Folding:
     async def prepare(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> Prepared:
         """The first half of it: writes nothing, and gives way to others of the loop from time to time."""
         types = await self._types_now()
-        return Prepared(spans, events, types, await _folded(spans, events, types.batch()))
+        return Prepared(spans, events, types, await self._folded(spans, events, types))
 
     async def write(self, batch: Prepared) -> int:
         """The second half."""
@@ -177,7 +192,13 @@ class Folding:
     async def batch_in(self, connection: AsyncConnection, spans: Sequence[Span], events: Sequence[StoredEvent]) -> bool:
         """The same in the caller's transaction, which must not be committed if it says False or raises `RowRefused`."""
         types = await self._types_now()
-        return await self._write(connection, await _folded(spans, events, types.batch()), types) is not None
+        return await self._write(connection, await self._folded(spans, events, types), types) is not None
+
+    async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent], types: _Types) -> _Folded:
+        rows, number = types.batch(), self.generation.number
+        steps, parked = await _fold_all(spans, events, rows)
+        await rows.ready(self._log.engine, number)
+        return _Folded(rows, number, steps, parked)
 
     async def _write(self, connection: AsyncConnection, done: _Folded, types: _Types) -> Generation | None:
         """The generation written to; None if the tables or the progress are not what the fold took them to be."""
@@ -185,7 +206,7 @@ class Folding:
         if growing:
             await dialect_of(connection).alone(connection)
         generation = await self._goal.generation(connection, "change" if growing else "share")
-        if generation.revision != types.revision:
+        if (generation.number, generation.revision) != (done.number, types.revision):
             self.generation = generation
             return None
         if growing:
@@ -232,8 +253,10 @@ class Folding:
         return 0
 
 
-async def _folded(spans: Sequence[Span], events: Sequence[StoredEvent], rows: Batch) -> _Folded:
-    """The events of these spans, in their order, added to `rows`."""
+async def _fold_all(
+    spans: Sequence[Span], events: Sequence[StoredEvent], rows: Batch
+) -> tuple[list[Progress], dict[int, str]]:
+    """The events of these spans, in their order, added to `rows`; how far that is, and why some episodes stop."""
     steps: list[Progress] = []
     parked: dict[int, str] = {}
     seen = 0
@@ -254,7 +277,7 @@ async def _folded(spans: Sequence[Span], events: Sequence[StoredEvent], rows: Ba
         if last < span.last and span.number not in parked:
             parked[span.number] = f"event {last + 1} is missing in the log"
         steps.append((span.number, span.after, last))
-    return _Folded(rows, steps, parked)
+    return steps, parked
 
 
 def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, list[StoredEvent]]]:

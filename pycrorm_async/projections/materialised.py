@@ -81,5 +81,6 @@ async def refresh_some(
             f"DELETE FROM {progress} WHERE id IN ({numbers})",  # noqa: S608
         ):
             await connection.exec_driver_sql(statement)  # a meaning may hold what looks like a parameter
-        await dialect_of(connection).insert_rows(connection, {(progress, tuple(_PROGRESS)): behind})
+        dialect = dialect_of(connection)
+        await dialect.insert(connection, await dialect.insertion({(progress, tuple(_PROGRESS)): behind}))
     return done

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, NodeStarted
@@ -14,6 +14,7 @@ from pycrorm_async.projections.own import OF_EVERY_TABLE, Changes, Event, Projec
 from pycrorm_async.projections.rows import Row
 from pycrorm_async.projections.tables import OWN, Storage, column_type, physical_name
 from pycrorm_async.projections.values import is_missing, json_text, microseconds
+from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.rows import StoredEvent
 
@@ -31,6 +32,7 @@ class OwnRows:
         self._columns = columns_of(projection)
         self._inserts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
+        self._insertion: Insertion = None
 
     def fold(self, event: StoredEvent) -> None:
         """Adds what the projection makes of this event. Raises `CannotFold`, and then has added nothing."""
@@ -67,13 +69,17 @@ class OwnRows:
                 found[f"{OWN}{table}", columns] = [tuple(map(each.get, columns)) for each in rows.values()]
         return found
 
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        """Makes ready what is to be inserted."""
+        inserts = self.to_insert().items()
+        self._insertion = await dialect_of(engine).insertion(
+            {(physical_name(table, generation), columns): rows for (table, columns), rows in inserts}
+        )
+
     async def write(self, connection: AsyncConnection, generation: int) -> None:
         """All of it, in this transaction. Raises `RowRefused`."""
         dialect, quote = dialect_of(connection), connection.dialect.identifier_preparer.quote
-        inserts = self.to_insert().items()
-        await dialect.insert_rows(
-            connection, {(physical_name(table, generation), columns): rows for (table, columns), rows in inserts}
-        )
+        await dialect.insert(connection, self._insertion)
         for table, rows in self._updates.items():
             alike: dict[tuple[str, ...], list[Row]] = {}
             for id_, values in rows.items():

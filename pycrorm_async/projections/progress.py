@@ -129,7 +129,7 @@ async def advance(connection: AsyncConnection, place: str, steps: Sequence[Progr
     grown = [(number, now) for number, _, now in steps if number in there]
     try:
         if new:
-            await dialect.insert_rows(connection, {(place, tuple(COLUMNS)): new})
+            await dialect.insert(connection, await dialect.insertion({(place, tuple(COLUMNS)): new}))
     except RowRefused:
         return False
     if grown:

@@ -8,23 +8,29 @@ plan (measured: 872 against 123,000 a second).
 from __future__ import annotations
 
 from sqlalchemy import text
-from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.projections.rows import EpisodeEnd, NodeEnd, Rows
 from pycrorm_async.projections.tables import CORE, column_type, physical_name
+from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["write_rows"]
+__all__ = ["insertion_of", "write_rows"]
 
 
-async def write_rows(connection: AsyncConnection, rows: Rows, generation: int) -> None:
+async def insertion_of(engine: AsyncEngine, rows: Rows, generation: int) -> Insertion:
+    """What inserts them."""
+    made = {(physical_name(table, generation), columns): some for (table, columns), some in rows.to_insert().items()}
+    return await dialect_of(engine).insertion(made)
+
+
+async def write_rows(connection: AsyncConnection, rows: Rows, insertion: Insertion, generation: int) -> None:
     """Inserts and updates all of it in this transaction, which notes the progress too.
 
     No row may be there already; one that is would be a fault of the fold or of the log, and raises `RowRefused`.
     """
     dialect = dialect_of(connection)
-    made = {(physical_name(table, generation), columns): some for (table, columns), some in rows.to_insert().items()}
-    await dialect.insert_rows(connection, made)
+    await dialect.insert(connection, insertion)
     for table, fields, ends in (
         ("task_tree_node", NodeEnd._fields, rows.node_ends),
         ("process_metadata", EpisodeEnd._fields, rows.episode_ends),

@@ -1,9 +1,17 @@
-"""How a batch gets into the log: a handful of statements in one transaction, however many records it has."""
+"""How a batch gets into the log: a handful of statements in one transaction, however many records it has.
+
+    appending = Appending(dialect, records)
+    await appending.prepare(reading)
+    refusals = await appending.write(writing)
+
+Where one writes at a time everybody waits for a transaction to end. So what can be made before is: it is made for the
+episodes as they are then, and made again if they are not so any more when nobody else can change them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
@@ -12,36 +20,81 @@ from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.store.batch import NoNumber, Sorted, Step, differing, new_episode, sort, step
-from pycrorm_async.store.dialect import Dialect
+from pycrorm_async.store.dialect import Dialect, Insertion
 from pycrorm_async.store.rows import EpisodeRow, StoredEvent
 
-__all__ = ["append_batch"]
+__all__ = ["Appending"]
 
 
-async def append_batch(
-    dialect: Dialect, connection: AsyncConnection, records: Sequence[Record]
-) -> dict[EpisodeId, str]:
-    """Appends within the caller's transaction; the reasons of the episodes that refused records.
+class _Made(NamedTuple):
+    """What the batch does to episodes that are as `known`."""
 
-    Raises `LogDamaged` when something else is stored under a record's key: then nothing of the batch may be committed.
-    """
-    batch = sort(records)
-    if batch.declarations:
-        named = {fingerprint(payload): payload.decode() for payload in batch.declarations}
-        await dialect.insert_declarations(connection, list(named.items()))
-    if not batch.episodes:
-        return {}
-    known, refusals = await _known(dialect, connection, batch)
-    steps = {each: step(batch.episodes[each], row) for each, row in known.items()}
-    changed = [each.after for identity, each in steps.items() if each.after != known[identity]]
-    if changed:
-        await dialect.upsert_episodes(connection, changed)
-    fresh = [row for each in steps.values() for row in _rows(each)]
-    if fresh:
-        await dialect.insert_events(connection, fresh)
-    await _compare(dialect, connection, [each for each in steps.values() if each.again])
-    stopped = {each: done.after.refused for each, done in steps.items() if _left_out(batch, each, done)}
-    return refusals | {each: reason for each, reason in stopped.items() if reason is not None}
+    known: Mapping[EpisodeId, EpisodeRow]
+    steps: Mapping[EpisodeId, Step]
+    insertion: Insertion
+
+
+class Appending:
+    """A batch on its way into the log."""
+
+    def __init__(self, dialect: Dialect, records: Sequence[Record]) -> None:
+        self._dialect = dialect
+        self._batch = sort(records)
+        self._made: _Made | None = None
+
+    async def prepare(self, connection: AsyncConnection) -> None:
+        """Looks how the episodes are, in a transaction that only reads, and makes what is to be written then."""
+        self._made = await self._make(await self._found(connection))
+
+    async def write(self, connection: AsyncConnection) -> dict[EpisodeId, str]:
+        """Appends within the caller's transaction; the reasons of the episodes that refused records.
+
+        Raises `LogDamaged` when something else is stored under a record's key: then nothing of the batch may be
+        committed.
+        """
+        batch, dialect = self._batch, self._dialect
+        if batch.declarations:
+            named = {fingerprint(payload): payload.decode() for payload in batch.declarations}
+            await dialect.insert_declarations(connection, list(named.items()))
+        if not batch.episodes:
+            return {}
+        known, refusals = await self._known(connection)
+        made = self._made
+        if made is None or made.known != known:
+            made = await self._make(known)
+        changed = [each.after for identity, each in made.steps.items() if each.after != known[identity]]
+        if changed:
+            await dialect.upsert_episodes(connection, changed)
+        if any(each.fresh for each in made.steps.values()):
+            await dialect.insert_events(connection, made.insertion)
+        await _compare(dialect, connection, [each for each in made.steps.values() if each.again])
+        stopped = {each: done.after.refused for each, done in made.steps.items() if _left_out(batch, each, done)}
+        return refusals | {each: reason for each, reason in stopped.items() if reason is not None}
+
+    async def _make(self, known: Mapping[EpisodeId, EpisodeRow]) -> _Made:
+        steps = {each: step(self._batch.episodes[each], row) for each, row in known.items()}
+        rows = [row for each in steps.values() for row in _rows(each)]
+        return _Made(known, steps, await self._dialect.event_insertion(rows))
+
+    async def _found(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
+        """The row of every episode in the batch that has one; how far it is in the tables is others' business."""
+        names = {episode_text(each): each for each in self._batch.episodes}
+        found = await self._dialect.episodes_by_id(connection, list(names))
+        return {names[row.id]: row._replace(folded=0, parked=None) for row in found}
+
+    async def _known(self, connection: AsyncConnection) -> tuple[dict[EpisodeId, EpisodeRow], dict[EpisodeId, str]]:
+        """The same, made where there is none yet; and why some cannot have one."""
+        found = await self._found(connection)
+        refusals: dict[EpisodeId, str] = {}
+        missing = [each for each in self._batch.episodes if each not in found]
+        if missing:
+            numbers = await self._dialect.new_numbers(connection, len(missing))
+            for number, each in zip(numbers, missing, strict=True):
+                try:
+                    found[each] = new_episode(each, self._batch.episodes[each][0], number)
+                except NoNumber as refusal:
+                    refusals[each] = str(refusal)
+        return found, refusals
 
 
 def _rows(done: Step) -> list[tuple[Any, ...]]:
@@ -54,24 +107,6 @@ def _rows(done: Step) -> list[tuple[Any, ...]]:
 
 def _left_out(batch: Sorted, episode: EpisodeId, done: Step) -> bool:
     return len(done.fresh) + len(done.again) + done.known_better < len(batch.episodes[episode])
-
-
-async def _known(
-    dialect: Dialect, connection: AsyncConnection, batch: Sorted
-) -> tuple[dict[EpisodeId, EpisodeRow], dict[EpisodeId, str]]:
-    """The row of every episode in the batch, made where there is none yet, and those that cannot have one."""
-    names = {episode_text(each): each for each in batch.episodes}
-    found = {names[row.id]: row for row in await dialect.episodes_by_id(connection, list(names))}
-    refusals: dict[EpisodeId, str] = {}
-    missing = [each for each in batch.episodes if each not in found]
-    if missing:
-        numbers = await dialect.new_numbers(connection, len(missing))
-        for number, each in zip(numbers, missing, strict=True):
-            try:
-                found[each] = new_episode(each, batch.episodes[each][0], number)
-            except NoNumber as refusal:
-                refusals[each] = str(refusal)
-    return found, refusals
 
 
 async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequence[Step]) -> None:

@@ -11,13 +11,16 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 
-__all__ = ["Dialect", "Birth", "Expected", "Found", "Migrations", "Progress", "RowRefused", "RowsByTable"]
+__all__ = ["Dialect", "Birth", "Expected", "Found", "Insertion", "Migrations", "Progress", "RowRefused", "RowsByTable"]
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; format N is what the first N of them make."""
 
 RowsByTable: TypeAlias = Mapping[tuple[str, tuple[str, ...]], Sequence[tuple[Any, ...]]]
 """Rows to insert, by table and its columns."""
+
+Insertion: TypeAlias = Any
+"""Rows to insert as the driver takes them: known to the dialect alone."""
 
 Progress: TypeAlias = tuple[int, int, int]
 """An episode's number, how far it was folded, how far it is now."""
@@ -90,9 +93,11 @@ class Dialect(Protocol):
         """Numbers that no episode has or will have had."""
         ...
 
-    async def insert_events(self, connection: AsyncConnection, rows: Sequence[tuple[Any, ...]]) -> None:
-        """Each row is a `StoredEvent`'s fields, but the payload is text."""
+    async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
+        """What inserts these events, as `insertion`. Each row is a `StoredEvent`'s fields, but the payload is text."""
         ...
+
+    async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None: ...
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         """`folded` and `parked` stay as they are."""
@@ -195,7 +200,11 @@ class Dialect(Protocol):
         """
         ...
 
-    async def insert_rows(self, connection: AsyncConnection, rows: RowsByTable) -> None:
+    async def insertion(self, rows: RowsByTable) -> Insertion:
+        """What inserts these rows: made before the transaction, so that nobody waits for it. Gives way to others."""
+        ...
+
+    async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
         """Raises `RowRefused`."""
         ...
 

@@ -11,9 +11,10 @@ from __future__ import annotations
 import asyncio
 import os
 import uuid
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
+from types import MappingProxyType
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
@@ -22,15 +23,17 @@ from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, PycrormError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
-from pycrorm_async.store.append import append_batch
+from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialect import Dialect
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent, share_out
+from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent, beyond, share_out
 from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
 from pycrorm_async.store.sqlite.engine import BEGIN
 
 __all__ = ["EventLog"]
 
+_MANY_EVENTS = 1_000
+"""So many are worth a look before the transaction that stores them."""
 _PAGE_EVENTS = 250
 """Few enough for a page to be small in memory also when each of them is as large as an event can be."""
 
@@ -106,8 +109,12 @@ class EventLog:
         if not records:
             return {}
         with self.translated():
+            appending = Appending(self._dialect, records)
+            if self._turn is not None and len(records) >= _MANY_EVENTS:
+                async with self.reading() as connection:
+                    await appending.prepare(connection)
             async with self.writing() as connection:
-                refusals = await append_batch(self._dialect, connection, records)
+                refusals = await appending.write(connection)
         # SQLite goes on writing into a file that was removed or replaced, where nobody will find it.
         if self.address.is_sqlite and _identity(self.address.path) != self._file:
             raise DatabaseUnavailable(f"{self.address}: the file was removed or replaced while it was open")
@@ -152,15 +159,18 @@ class EventLog:
         async with self.reading() as connection:
             return await self._dialect.spans(connection, spans)
 
-    async def unfolded(self, limit: int = 10_000, *, after: int = 0) -> list[Span]:
+    async def unfolded(
+        self, limit: int = 10_000, *, after: int = 0, reached: Mapping[int, int] = MappingProxyType({})
+    ) -> list[Span]:
         """What the tables do not show yet, at most `limit` events, some of each episode; nothing of parked episodes.
 
-        Begins with the episodes that follow number `after`, and with the first one when there are none.
+        Begins with the episodes that follow number `after`, and with the first one when there are none. `reached` is
+        how far episodes are, by number, once what is being folded is in the tables.
         """
         async with self.reading() as connection:
-            behind = await self._dialect.behind(connection, after=after, limit=limit)
+            behind = beyond(await self._dialect.behind(connection, after=after, limit=limit), reached)
             if not behind and after:
-                behind = await self._dialect.behind(connection, after=0, limit=limit)
+                behind = beyond(await self._dialect.behind(connection, after=0, limit=limit), reached)
             return share_out(behind, limit)
 
     async def behind(self) -> list[EpisodeRow]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-__all__ = ["StoredEvent", "EpisodeRow", "Span", "share_out"]
+__all__ = ["StoredEvent", "EpisodeRow", "Span", "beyond", "share_out"]
 
 
 class StoredEvent(NamedTuple):
@@ -50,6 +50,19 @@ class Span(NamedTuple):
     number: int
     after: int
     last: int
+
+
+def beyond(behind: Sequence[EpisodeRow], reached: Mapping[int, int]) -> list[EpisodeRow]:
+    """Those that are behind still once what somebody folds now is in the tables: by number, up to where that is.
+
+    >>> beyond([EpisodeRow(1, "", head=9, folded=0, started_wall_ns=0)], {1: 7})[0].folded
+    7
+    """
+    return [
+        each._replace(folded=max(each.folded, reached.get(each.number, 0)))
+        for each in behind
+        if each.head > reached.get(each.number, 0)
+    ]
 
 
 _SHARE_MIN = 1_000

@@ -13,14 +13,14 @@ from pathlib import Path
 import msgspec
 import pytest
 from sqlalchemy import func, select
-from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async import Memory, Reading, rebuilding
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
-from pycrorm_async.projections.folding import _folded
+from pycrorm_async.projections.folding import _fold_all
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.views import UserView
@@ -412,6 +412,8 @@ async def test_a_batch_gives_way_to_others_also_when_all_its_episodes_are_short(
     class Nothing:
         def fold(self, event: StoredEvent) -> None: ...
 
+        async def ready(self, engine: AsyncEngine, generation: int) -> None: ...
+
         async def write(self, connection: AsyncConnection, generation: int) -> None: ...
 
     events = [StoredEvent(number, turn, "", 1, 1, 1, b"") for number in range(1, 101) for turn in range(1, 21)]
@@ -424,7 +426,7 @@ async def test_a_batch_gives_way_to_others_also_when_all_its_episodes_are_short(
             await asyncio.sleep(0)
 
     task = asyncio.create_task(other())
-    done = await _folded([Span(number, 0, 20) for number in range(1, 101)], events, Nothing())
+    far, _ = await _fold_all([Span(number, 0, 20) for number in range(1, 101)], events, Nothing())
     task.cancel()
-    assert done.steps == [(number, 0, 20) for number in range(1, 101)]
+    assert far == [(number, 0, 20) for number in range(1, 101)]
     assert turns >= 10

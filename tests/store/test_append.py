@@ -8,6 +8,8 @@ import pytest
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_text
+from pycrorm_async.store.append import Appending
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
 from tests.store.making import declaration, episode, record, run_of
@@ -307,3 +309,63 @@ async def test_a_log_replaced_by_garbage_is_reported_as_ours_to_mend(file_log: E
     file_log.address.path.write_bytes(content)
     with pytest.raises(DamageError, match="is damaged: database disk image is malformed"):
         await file_log.events(1)
+
+
+@pytest.mark.parametrize("with_new", [True, False])
+@pytest.mark.parametrize("meanwhile", ["nothing", "the same", "a part of it", "folded", "refused", "other"])
+async def test_what_was_made_before_the_transaction_is_made_again_if_the_episode_is_not_as_it_was(
+    log: EventLog, database_url: str, meanwhile: str, with_new: bool
+) -> None:
+    await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 1)])
+    batch = [*run_of(episode(1), 3, 9), *run_of(episode(2), 2, 4), *run_of(episode(3), 1, 2 if with_new else 0)]
+    appending = Appending(dialect_of(log.engine), batch)
+    async with log.reading() as connection:
+        await appending.prepare(connection)
+    match meanwhile:
+        case "the same":
+            await log.append(batch)
+        case "a part of it":
+            await log.append([*run_of(episode(1), 4, 6), *run_of(episode(3), 1, 1 if with_new else 0)])
+        case "folded":
+            ask_to_change(database_url, "UPDATE episode SET folded = 2 WHERE number = 1")
+        case "refused":
+            await log.append(run_of(episode(2), 9, 9))
+        case "other":
+            await log.append([record(episode(4), 1), record(episode(1), 4)])
+    async with log.writing() as connection:
+        assert await appending.write(connection) == {}
+    numbers = {1: 1, 2: 2, 3: 4, 4: 3} if meanwhile == "other" else {1: 1, 2: 2, 3: 3}
+    stored = ask(database_url, "SELECT episode, sequence, payload FROM event ORDER BY episode, sequence")
+    expected = {1: 9, 2: 4} | ({3: 2} if with_new else {}) | ({4: 1} if meanwhile == "other" else {})
+    assert stored == sorted(
+        (numbers[of], sequence, f'{{"kind":"action","parent":{sequence}}}')
+        for of, last in expected.items()
+        for sequence in range(1, last + 1)
+    )
+    assert [row[:1] + row[2:4] + row[6:7] for row in ask(database_url, HEADS)] == sorted(
+        (numbers[of], last, 2 if (meanwhile, of) == ("folded", 1) else 0, None) for of, last in expected.items()
+    )
+
+
+async def test_another_event_under_a_key_that_was_free_before_the_transaction_is_damage(
+    log: EventLog, database_url: str
+) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    appending = Appending(dialect_of(log.engine), run_of(episode(1), 4, 6))
+    async with log.reading() as connection:
+        await appending.prepare(connection)
+    await log.append([record(episode(1), 4, payload=b"{}")])
+    with pytest.raises(LogDamaged):
+        async with log.writing() as connection:
+            await appending.write(connection)
+    assert ask(database_url, "SELECT sequence, payload FROM event WHERE sequence > 3") == [(4, "{}")]
+
+
+async def test_many_are_stored_as_few_are(log: EventLog, database_url: str) -> None:
+    await log.append([*run_of(episode(1), 1, 2_500), *run_of(episode(2), 1, 2)])
+    await log.append([*run_of(episode(1), 2_400, 5_000), *run_of(episode(3), 1, 1_500)])
+    assert ask(database_url, "SELECT episode, count(*), max(sequence) FROM event GROUP BY episode ORDER BY 1") == [
+        (1, 5_000, 5_000),
+        (2, 2, 2),
+        (3, 1_500, 1_500),
+    ]

@@ -50,12 +50,13 @@ async def test_what_is_inserted_and_changed_is_what_was_given(
     rows = any_rows(count, empty_often=empty_often)
     async with file_log.engine.begin() as connection:
         await connection.run_sync(TABLE.create)
-        await dialect_of(connection).insert_rows(connection, {("kept", COLUMNS): rows})
+        dialect = dialect_of(connection)
+        await dialect.insert(connection, await dialect.insertion({("kept", COLUMNS): rows}))
         stored = [tuple(row) for row in await connection.execute(select(TABLE).order_by(TABLE.c.id))]
         assert repr(stored) == repr(rows)
 
         changed = [(row[0], *other[1:]) for row, other in zip(rows, reversed(rows), strict=True)]
         kinds = {name: TABLE.c[name].type.compile(dialect=connection.dialect) for name in COLUMNS}
-        await dialect_of(connection).update_rows(connection, "kept", kinds, changed)
+        await dialect.update_rows(connection, "kept", kinds, changed)
         stored = [tuple(row) for row in await connection.execute(select(TABLE).order_by(TABLE.c.id))]
         assert repr(stored) == repr(changed)

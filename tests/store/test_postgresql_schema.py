@@ -15,7 +15,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.append import append_batch
+from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
@@ -115,7 +115,7 @@ async def test_a_migration_that_fails_leaves_the_log_as_it_was(database_url: str
 OPENER = """
 import asyncio, sys
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.store.append import append_batch
+from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -350,7 +350,7 @@ async def test_nothing_is_skipped_when_an_earlier_number_is_committed_later(data
     await projector.open()
     slow = await log.engine.connect()
     transaction = await slow.begin()
-    assert await append_batch(dialect_of(slow), slow, [started(1)]) == {}  # has its number, and is not committed
+    assert await Appending(dialect_of(slow), [started(1)]).write(slow) == {}  # has its number, and is not committed
     assert await log.append([started(2)]) == {}
     rolled_back = await asyncpg.connect(database_url)
     await rolled_back.execute("SELECT nextval('pycrorm.episode_number')")  # a number that nobody will have

@@ -11,7 +11,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk import make
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused, RowsByTable
+from pycrorm_async.store.dialect import Birth, Expected, Found, Insertion, Migrations, Progress, RowRefused, RowsByTable
 from pycrorm_async.store.postgresql import faults, tables
 from pycrorm_async.store.postgresql import statements as sql
 from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
@@ -68,8 +68,11 @@ class PostgreSQL:
     async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
         return list((await connection.exec_driver_sql(sql.NEW_NUMBERS, (count,))).scalars())
 
-    async def insert_events(self, connection: AsyncConnection, rows: Sequence[tuple[Any, ...]]) -> None:
-        await _copy(connection, LOG_SCHEMA, "event", sql.EVENT_COLUMNS, rows)
+    async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
+        return rows
+
+    async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None:
+        await _copy(connection, LOG_SCHEMA, "event", sql.EVENT_COLUMNS, insertion)
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         rows = [
@@ -210,8 +213,11 @@ class PostgreSQL:
             connection, [f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()]
         )
 
-    async def insert_rows(self, connection: AsyncConnection, rows: RowsByTable) -> None:
-        for (table, columns), some in rows.items():
+    async def insertion(self, rows: RowsByTable) -> Insertion:
+        return rows  # the driver makes a row ready while the server takes those before it
+
+    async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
+        for (table, columns), some in insertion.items():
             await _copy(connection, TABLES_SCHEMA, table, columns, some)
 
     async def update_rows(

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import sqlite3
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import msgspec
+from sqlalchemy.dialects.sqlite import dialect as make_dialect
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk import make
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Expected, Found, Migrations, Progress, RowRefused, RowsByTable
+from pycrorm_async.store.dialect import Birth, Expected, Found, Insertion, Migrations, Progress, RowRefused, RowsByTable
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
@@ -76,8 +77,11 @@ class SQLite:
         taken = (await connection.exec_driver_sql(sql.SELECT_NUMBER_MAX)).scalar_one()
         return list(range(taken + 1, taken + 1 + count))
 
-    async def insert_events(self, connection: AsyncConnection, rows: Sequence[tuple[Any, ...]]) -> None:
-        await (await _driver(connection)).execute_in_turn(inserts("event", sql.EVENT_COLUMNS, rows))
+    async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
+        return await self.insertion({("event", sql.EVENT_COLUMNS): rows})
+
+    async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None:
+        await (await _driver(connection)).execute_in_turn(insertion)
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(each) for each in episodes]),))
@@ -145,15 +149,13 @@ class SQLite:
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
         # To count holds the write lock for as long as that takes, and who never counted takes every table for as large
         # as any other: a question by status began with all nodes there are, and took four times as long.
-        quote = connection.dialect.identifier_preparer.quote
-        await connection.exec_driver_sql(f"ANALYZE {quote(tables[0].table)}")  # makes the planner's table
+        await connection.exec_driver_sql(f"ANALYZE {_quote(tables[0].table)}")  # makes the planner's table
         rows: list[tuple[str, str | None, str]] = [(each.table, None, str(each.rows)) for each in tables]
         rows += [(each.table, index, f"{each.rows} {alike}") for each in tables for index, alike in each.alike.items()]
         await connection.exec_driver_sql(sql.EXPECT, (_json(rows),))
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
-        quote = connection.dialect.identifier_preparer.quote
-        await connection.exec_driver_sql(f"ALTER TABLE {quote(table)} ADD COLUMN {definition}")
+        await connection.exec_driver_sql(f"ALTER TABLE {_quote(table)} ADD COLUMN {definition}")
 
     async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
         """What is somebody else's is in nobody's way."""
@@ -161,26 +163,25 @@ class SQLite:
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
-        quote = connection.dialect.identifier_preparer.quote
         for name, text in before.items():
             if after.get(name) != text:
-                await connection.exec_driver_sql(f"DROP VIEW {quote(name)}")
+                await connection.exec_driver_sql(f"DROP VIEW {_quote(name)}")
         for name, text in after.items():
             if before.get(name) != text:
-                await connection.exec_driver_sql(f"CREATE VIEW {quote(name)} AS {text}")
+                await connection.exec_driver_sql(f"CREATE VIEW {_quote(name)} AS {text}")
 
     async def sweep(self, connection: AsyncConnection) -> None:
         """What was replaced is gone; who reads it has a snapshot."""
 
     async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:
         # To drop a full table would hold the one write lock for seconds.
-        quoted = connection.dialect.identifier_preparer.quote(table)
+        quoted = _quote(table)
         some = f"SELECT rowid FROM {quoted} LIMIT {rows_max}"  # noqa: S608
         deleted = await connection.exec_driver_sql(f"DELETE FROM {quoted} WHERE rowid IN ({some})")  # noqa: S608
         return deleted.rowcount == rows_max
 
     async def drop(self, connection: AsyncConnection, table: str) -> None:
-        await connection.exec_driver_sql(f"DROP TABLE IF EXISTS {connection.dialect.identifier_preparer.quote(table)}")
+        await connection.exec_driver_sql(f"DROP TABLE IF EXISTS {_quote(table)}")
 
     @asynccontextmanager
     async def claim(self, engine: AsyncEngine) -> AsyncIterator[bool]:
@@ -188,15 +189,20 @@ class SQLite:
             yield claimed
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
-        quote = connection.dialect.identifier_preparer.quote
         for name, text in views.items():
-            await connection.exec_driver_sql(f"CREATE TEMP VIEW {quote(name)} AS {text}")
+            await connection.exec_driver_sql(f"CREATE TEMP VIEW {_quote(name)} AS {text}")
 
-    async def insert_rows(self, connection: AsyncConnection, rows: RowsByTable) -> None:
-        quote = connection.dialect.identifier_preparer.quote
-        statements = (inserts(quote(table), [*map(quote, columns)], some) for (table, columns), some in rows.items())
+    async def insertion(self, rows: RowsByTable) -> Insertion:
+        made = []
+        for (table, columns), some in rows.items():
+            for statement in inserts(_quote(table), [*map(_quote, columns)], some):
+                made.append(statement)
+                await asyncio.sleep(0)
+        return made
+
+    async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
         with _rows_refused():
-            await (await _driver(connection)).execute_in_turn(chain.from_iterable(statements))
+            await (await _driver(connection)).execute_in_turn(insertion)
 
     async def update_rows(
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
@@ -215,6 +221,7 @@ class SQLite:
         return faults.ours(error.orig if isinstance(error, DBAPIError) else error, name)
 
 
+_quote = make_dialect().identifier_preparer.quote
 _EVENTS_AT_ONCE = 250
 _HEADS = msgspec.json.Decoder(list[tuple[int, str, int, int, int, int]])
 
