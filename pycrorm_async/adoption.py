@@ -20,7 +20,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import checked, installed_besides
-from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.projector import Helper, Projector
 from pycrorm_async.projections.views import UserView
 from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
@@ -101,15 +101,17 @@ async def open_destination(
     clock: Clock,
     views: Sequence[UserView] = (),
     projections: Sequence[Projection] = (),
+    helper: Helper | None = None,
 ) -> AsyncIterator[LogAndTables]:
     """Opens log and tables for writing, in the running loop, and binds the spool to them. Raises `SpoolForeign`.
 
-    Keeps up to date these projections and those that are installed.
+    Keeps up to date these projections and those that are installed; `helper` folds with it.
     """
     log = await EventLog.open(address, create=True, clock=clock)
     try:
         spool.bind(log.log_id)
-        projector = Projector(log, views=views, projections=projections, found=installed_besides(projections))
+        found = installed_besides(projections)
+        projector = Projector(log, views=views, projections=projections, found=found, helper=helper)
         destination = LogAndTables(log, projector)
         await destination.open_tables()
         yield destination

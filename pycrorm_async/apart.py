@@ -1,11 +1,13 @@
-"""A process that folds, beside the one that appends: so that each has a core.
+"""Processes that fold, beside the one that appends: so that each has a core.
 
     with folding_process(url, spool=spool, projections=projections) as process:
         asyncio.run(serve(url, ..., folding=process))
 
-It is forked before anything is open, opens the database for itself when it is asked for the first time, and when asked
-folds batch after batch until there is no more, with an answer after each: it does not wait for who asks, who is busy
-appending. It holds nothing: when it dies, whoever asked folds from then on, and when that one dies it ends too.
+There are two of them, forked before anything is open; each opens the database for itself when it is asked for the first
+time. The first one folds, when asked, batch after batch until there is no more, with an answer after each: it does not
+wait for who asks, who is busy appending. Of a long way to go it leaves every other batch to the second one, its helper:
+each reads and folds while the other one writes. They hold nothing: when one dies, whoever asked it folds from then on,
+and when that one dies it ends too.
 """
 
 from __future__ import annotations
@@ -15,10 +17,10 @@ import logging
 import os
 import signal
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AsyncExitStack, contextmanager, suppress
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -27,8 +29,12 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError, DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.projections.folding import Prepared
 from pycrorm_async.projections.own import Projection
+from pycrorm_async.projections.projector import Projector
 from pycrorm_async.queue.spool import Spool
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.rows import Span
 from pycrorm_async.writer.ports import Shown
 
 __all__ = ["folding_process", "FoldedApart"]
@@ -45,6 +51,12 @@ class _Answer(msgspec.Struct, omit_defaults=True):
     fault: str | None = None
 
 
+class _Ask(msgspec.Struct, omit_defaults=True):
+    """What the helper is to do: to prepare these, or to write what it has prepared."""
+
+    spans: list[Span] = []
+
+
 class _Streams(NamedTuple):
     reader: asyncio.StreamReader
     writer: asyncio.StreamWriter
@@ -52,27 +64,40 @@ class _Streams(NamedTuple):
 
 @contextmanager
 def folding_process(url: str, *, spool: Path | None, projections: Sequence[Projection] = ()) -> Iterator[socket.socket]:
-    """A process that folds this memory when asked through the socket; it is gone when the context is left.
-
-    To be called while this process has one thread.
+    """A process that folds this memory when asked through the socket, and its helper; both are gone when the context is
+    left. To be called while this process has one thread.
     """
-    ours, theirs = socket.socketpair()
+    with ExitStack() as held:
+        helped, helper = (held.enter_context(each) for each in socket.socketpair())
+        ours, theirs = (held.enter_context(each) for each in socket.socketpair())
+        held.enter_context(_forked(lambda: _help_when_asked(helper, url), but=(ours, theirs, helped)))
+        helper.close()
+        held.enter_context(
+            _forked(lambda: _fold_when_asked(theirs, helped, url, spool, projections), but=(ours, helper))
+        )
+        helped.close()
+        theirs.close()
+        yield ours
+
+
+@contextmanager
+def _forked(work: Callable[[], Coroutine[Any, Any, None]], *, but: Sequence[socket.socket]) -> Iterator[None]:
+    """A process that does this, and closes what is not for it; killed when the context is left."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, _NOT_FOR_IT)
     process = os.fork()
     if process == 0:
         try:
-            ours.close()
-            for each in _NOT_FOR_IT:
-                signal.signal(each, signal.SIG_IGN)
-            asyncio.run(_fold_when_asked(theirs, url, spool, projections))
+            for each in but:
+                each.close()
+            for number in _NOT_FOR_IT:
+                signal.signal(number, signal.SIG_IGN)
+            asyncio.run(work())
         finally:
             os._exit(0)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    theirs.close()
     try:
-        yield ours
+        yield
     finally:
-        ours.close()
         os.kill(process, signal.SIGKILL)  # nothing is lost: what it had not committed is folded again
         os.waitpid(process, 0)
 
@@ -141,8 +166,59 @@ class FoldedApart(Shown):
         return line
 
 
+class _Helped:
+    """The helper as the other one sees it. Implements `Helper`."""
+
+    def __init__(self, streams: _Streams) -> None:
+        self._streams = streams
+
+    def prepare(self, spans: Sequence[Span]) -> None:
+        self._streams.writer.write(msgspec.json.encode(_Ask(list(spans))) + b"\n")
+
+    async def write(self) -> int:
+        with suppress(ConnectionError):
+            self._streams.writer.write(msgspec.json.encode(_Ask()) + b"\n")
+            await self._streams.writer.drain()
+            return int(await self._streams.reader.readline() or 0)
+        return 0
+
+
+async def _help_when_asked(asked: socket.socket, url: str) -> None:
+    """Until nobody is there who could ask. What fails here the one that asked does, who meets it too and tells."""
+    logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)
+    log: EventLog | None = None
+    projector: Projector | None = None
+    batch: Prepared | None = None
+    async with AsyncExitStack() as stack:
+        with suppress(ConnectionError), asked.makefile("rwb") as stream:
+            while line := stream.readline():
+                ask = msgspec.json.decode(line, type=_Ask)
+                count = 0
+                try:
+                    if log is None:
+                        log = await EventLog.open(shared_address(url), create=True)
+                        stack.push_async_callback(log.close)
+                    if projector is None:
+                        opened = Projector(log)
+                        await opened.open()
+                        projector = opened
+                    if ask.spans:
+                        batch = await projector.prepare(ask.spans)
+                    elif batch is not None:
+                        count = await projector.write(batch)
+                except Exception:  # noqa: BLE001 - see above
+                    batch = None
+                if not ask.spans:
+                    stream.write(b"%d\n" % count)
+                    stream.flush()
+
+
 async def _fold_when_asked(
-    asked: socket.socket, url: str, spool: Path | None, projections: Sequence[Projection]
+    asked: socket.socket,
+    helped: socket.socket,
+    url: str,
+    spool: Path | None,
+    projections: Sequence[Projection],
 ) -> None:
     """Until nobody is there who could ask."""
     # What is notable when the memory is opened was told by the one that asks.
@@ -151,6 +227,7 @@ async def _fold_when_asked(
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
     destination: LogAndTables | None = None
+    helper = _Helped(_Streams(*await asyncio.open_connection(sock=helped)))
     async with AsyncExitStack() as stack:
         with suppress(ConnectionError), asked.makefile("rwb") as stream:
             while stream.readline():
@@ -159,7 +236,9 @@ async def _fold_when_asked(
                     try:
                         if destination is None:
                             destination = await stack.enter_async_context(
-                                open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections)
+                                open_destination(
+                                    address, place, clock=SYSTEM_CLOCK, projections=projections, helper=helper
+                                )
                             )
                         answer = _Answer(more=await destination.fold_some())
                     except DatabaseUnavailable as error:

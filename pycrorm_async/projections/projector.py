@@ -7,14 +7,16 @@ await projector.fold_behind()
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import asyncio
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign, InternalError
 from pycrorm_async.projections.classes import mapped_leaves
-from pycrorm_async.projections.folding import Folding
+from pycrorm_async.projections.folding import Folding, Prepared
 from pycrorm_async.projections.generations import (
     Generation,
     Hold,
@@ -34,9 +36,23 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import advance_folded, park
 from pycrorm_async.store.rows import Span
 
-__all__ = ["Projector"]
+__all__ = ["Helper", "Projector"]
 
 _ANYTHING_FOLDED = text("SELECT 1 FROM episode WHERE folded > 0 LIMIT 1")
+_HELP_EVENTS_MIN = 2_000
+"""Fewer are folded sooner than somebody else has begun."""
+
+
+class Helper(Protocol):
+    """Another process that folds into the same tables, whenever it is told to."""
+
+    def prepare(self, spans: Sequence[Span]) -> None:
+        """It reads and folds these, and forgets what it had been told to before."""
+        ...
+
+    async def write(self) -> int:
+        """It writes them; how many events that were. Fewer if it was refused or is gone: then they are still to do."""
+        ...
 
 
 class Projector:
@@ -48,6 +64,7 @@ class Projector:
         projections: of one's own, to be kept up to date too.
         found: the same, but a fault in one of them is told and not raised.
         batch_events: how many events one transaction takes at most.
+        helper: takes every other batch where more than one is behind: one is read and folded while another is written.
     """
 
     def __init__(
@@ -58,14 +75,17 @@ class Projector:
         projections: Sequence[Projection] = (),
         found: Sequence[Projection] = (),
         batch_events: int = 10_000,
+        helper: Helper | None = None,
     ) -> None:
         self._log = log
+        self._helper = helper
         self._views = views
         self._batch_events = batch_events
         self._own = OwnTables(log, projections, found, batch_events=batch_events)
         self._has_news = True
         self._folding: Folding | None = None
         self._last_number = 0
+        self._ready: Prepared | None = None
 
     async def open(self) -> None:
         """Makes tables and views that are missing: those of every memory, of the mapped classes, of the users.
@@ -96,8 +116,8 @@ class Projector:
         """
         count = 0
         with self._log.translated():
-            while spans := await self._log.unfolded(self._batch_events):
-                count += await self._fold(spans)
+            while (some := await self._fold_next()) is not None:
+                count += some
             while await self._refresh():
                 pass
             while await self._own.fold_some(now=True):
@@ -107,23 +127,65 @@ class Projector:
     async def fold_some(self) -> bool:
         """One batch of the same, or some of the views that are kept; False if nothing was behind."""
         with self._log.translated():
-            # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
-            spans = await self._log.unfolded(self._batch_events, after=self._last_number)
-            if not spans:
-                self._has_news = await self._refresh() or await self._own.fold_some(now=self._has_news)
-                return self._has_news
-            self._has_news = True
-            self._last_number = spans[-1].number
-            await self._fold(spans)
-        return True
+            self._has_news = (
+                await self._fold_next() is not None
+                or await self._refresh()
+                or await self._own.fold_some(now=self._has_news)
+            )
+        return self._has_news
 
-    async def _fold(self, spans: Sequence[Span]) -> int:
+    async def prepare(self, spans: Sequence[Span]) -> Prepared:
+        """Reads and folds these, and writes nothing. Raises `DatabaseUnavailable`."""
+        assert self._folding is not None, "opened before anything is folded"
+        with self._log.translated():
+            return await self._folding.prepare(spans, await self._log.spans(spans))
+
+    async def write(self, batch: Prepared) -> int:
+        """How many events of it are in the tables now: none if they are not where they were taken to be."""
         assert self._folding is not None, "opened before anything is folded"
         before = self._folding.generation.revision
-        count = await self._folding.batch(spans, await self._log.spans(spans))
-        if self._folding.generation.revision != before:
-            await self._sweep()
+        with self._log.translated():
+            count = await self._folding.write(batch)
+            if self._folding.generation.revision != before:
+                await self._sweep()
         return count
+
+    async def _fold_next(self) -> int | None:
+        """Folds a batch, or two with the helper; how many events, None if nothing is behind."""
+        batch, self._ready = self._ready or await self._next({}), None
+        if batch is None:
+            return None
+        theirs: Sequence[Span] = ()
+        if self._helper is not None and batch.is_whole:
+            theirs = await self._spans(batch.reached)
+            if _size(theirs) >= _HELP_EVENTS_MIN:
+                self._helper.prepare(theirs)
+            else:
+                theirs = ()
+        count = await self.write(batch)
+        if not theirs or count < batch.count:
+            return count
+        assert self._helper is not None, "it was told to prepare"
+        writing = asyncio.create_task(self._helper.write())
+        try:
+            ready = await self._next({each.number: each.last for each in theirs})
+        finally:
+            written = await writing
+        if written == _size(theirs):
+            self._ready = ready
+        return count + written
+
+    async def _next(self, reached: Mapping[int, int]) -> Prepared | None:
+        """The next batch. `reached` is how far episodes are once the one before it is written."""
+        spans = await self._spans(reached)
+        return await self.prepare(spans) if spans else None
+
+    async def _spans(self, reached: Mapping[int, int]) -> list[Span]:
+        # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
+        spans = await self._log.unfolded(self._batch_events, after=self._last_number, reached=reached)
+        if spans:
+            self._last_number = spans[-1].number
+        return spans
 
     async def _refresh(self) -> bool:
         assert self._folding is not None, "opened before anything is folded"
@@ -137,6 +199,10 @@ class Projector:
     async def _sweep(self) -> None:
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).sweep(connection)
+
+
+def _size(spans: Sequence[Span]) -> int:
+    return sum(each.last - each.after for each in spans)
 
 
 class _Live:

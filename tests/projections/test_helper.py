@@ -1,0 +1,255 @@
+"""Folding by two: every other batch is read, folded and written by a helper, here a projector with a log of its own."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+
+import pytest
+
+from pycrorm_async.events.codec import encode
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.happenings import (
+    EpisodeEnded,
+    EpisodeStarted,
+    FieldDeclared,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+)
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.projections import projector as projecting
+from pycrorm_async.projections.folding import Prepared
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.rows import Span
+from tests.projections.asking import ask
+from tests.projections.script import SAYING, Script, declarations, declared, field, mixed, name_of, row
+
+
+class OtherHand:
+    """Implements `Helper`. `wrote` is how many events each of its batches had."""
+
+    def __init__(self, projector: Projector) -> None:
+        self.projector = projector
+        self.wrote: list[int] = []
+        self._task: asyncio.Task[Prepared] | None = None
+
+    def prepare(self, spans: Sequence[Span]) -> None:
+        if self._task is not None:
+            self._task.cancel()
+        self._task = asyncio.create_task(self.projector.prepare(spans))
+
+    async def write(self) -> int:
+        assert self._task is not None
+        batch, self._task = await self._task, None
+        self.wrote.append(await self.projector.write(batch))
+        return self.wrote[-1]
+
+
+class Unheard(OtherHand):
+    """Writes, and its answers do not arrive."""
+
+    async def write(self) -> int:
+        await super().write()
+        return 0
+
+
+class Gone(OtherHand):
+    """Writes nothing."""
+
+    async def write(self) -> int:
+        return 0
+
+
+class Eager(OtherHand):
+    """Writes before it is told to."""
+
+    def prepare(self, spans: Sequence[Span]) -> None:
+        super().prepare(spans)
+        self._early = asyncio.create_task(self._write_early(self._task))
+
+    async def _write_early(self, task: asyncio.Task[Prepared] | None) -> int:
+        assert task is not None
+        return await self.projector.write(await task)
+
+    async def write(self) -> int:
+        await self._early
+        return await super().write()
+
+
+@pytest.fixture(autouse=True)
+def _helped_with_anything(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(projecting, "_HELP_EVENTS_MIN", 1)
+
+
+@pytest.fixture
+async def other_log(log: EventLog) -> AsyncIterator[EventLog]:
+    opened = await EventLog.open(log.address, create=True)
+    yield opened
+    await opened.close()
+
+
+def talk(episode: int, *, words: int) -> Script:
+    """Nodes in nodes, so that rows are made in one batch and ended in another."""
+    script = Script(episode)
+    script.put(EpisodeStarted("a talk", "me", "host", "1.0", "3.11"))
+    root = script.put(NodeStarted("root"))
+    for word in range(0, words, 2):
+        outer = script.put(NodeStarted("action", root, name_of(SAYING), {"text": f"{episode}.{word}"}))
+        inner = script.put(NodeStarted("action", outer, name_of(SAYING), {"text": f"{episode}.{word + 1}"}))
+        script.put(NodeEnded(inner, "SUCCEEDED"))
+        script.put(NodeEnded(outer, "FAILED" if word % 3 else "SUCCEEDED"))
+    script.put(NodeEnded(root, "SUCCEEDED"))
+    script.put(EpisodeEnded("SUCCEEDED"))
+    return script
+
+
+async def folded_by_two(
+    log: EventLog, other_log: EventLog, records: Sequence[Record], hand: type[OtherHand], batch_events: int
+) -> OtherHand:
+    other = Projector(other_log, batch_events=batch_events)
+    await other.open()
+    helper = hand(other)
+    projector = Projector(log, batch_events=batch_events, helper=helper)
+    await projector.open()
+    await log.append(records)
+    while await projector.fold_some():
+        pass
+    return helper
+
+
+async def told(log: EventLog) -> list[tuple[object, ...]]:
+    """Every word: its row, the node above it, how it ended, and the word."""
+    return await ask(
+        log,
+        "SELECT node.id, node.parent_id, node.status, text FROM saying_action JOIN task_tree_node AS node"
+        " ON node.id = saying_action.id ORDER BY node.id",
+    )
+
+
+def words_of(number: int, words: int, *, episode: int | None = None) -> list[tuple[object, ...]]:
+    """What must be told of a talk that is the episode of this number."""
+    expected: list[tuple[object, ...]] = []
+    for word in range(0, words, 2):
+        outer, status = row(3 + 2 * word, number=number), "FAILED" if word % 3 else "SUCCEEDED"
+        expected += [
+            (outer, row(2, number=number), status, f"{episode or number}.{word}"),
+            (row(4 + 2 * word, number=number), outer, "SUCCEEDED", f"{episode or number}.{word + 1}"),
+        ]
+    return expected
+
+
+@pytest.mark.parametrize("hand", [OtherHand, Unheard, Gone, Eager])
+@pytest.mark.parametrize("batch_events", [1, 2, 3, 7])
+async def test_every_event_is_shown_once_and_in_its_place(
+    log: EventLog, other_log: EventLog, hand: type[OtherHand], batch_events: int
+) -> None:
+    records = [*declarations(SAYING), *mixed(talk(1, words=12), talk(2, words=2)), *talk(3, words=6).records]
+    helper = await folded_by_two(log, other_log, records, hand, batch_events)
+    assert await told(log) == [*words_of(1, 12), *words_of(2, 2), *words_of(3, 6)]
+    assert await ask(log, "SELECT status, count(*) FROM process_metadata GROUP BY status") == [("SUCCEEDED", 3)]
+    assert await ask(log, "SELECT count(*) FROM task_tree_node WHERE parent_id IS NULL AND end_time IS NOT NULL") == [
+        (3,)
+    ]
+    assert await ask(log, "SELECT number, head - folded, parked FROM episode ORDER BY number") == [
+        (1, 0, None),
+        (2, 0, None),
+        (3, 0, None),
+    ]
+    if hand is OtherHand:
+        assert sum(helper.wrote) >= len(records) // 3
+        assert 0 not in helper.wrote[1:]  # nothing is folded in vain; at the first batch the tables grow
+
+
+@pytest.mark.parametrize("hand", [OtherHand, Unheard])
+@pytest.mark.parametrize("bad", ["unknown", "refused by the database", "missing"])
+@pytest.mark.parametrize("place", [3, 4, 5, 6, 7, 8, 9])
+async def test_an_episode_stops_where_it_cannot_be_folded_whoever_meets_that(
+    log: EventLog, other_log: EventLog, hand: type[OtherHand], bad: str, place: int
+) -> None:
+    first = talk(1, words=20)
+    match bad:
+        case "unknown":
+            first.records[place - 1] = first.records[place - 1]._replace(type="RobotDanced")
+        case "refused by the database":
+            payload = encode(LocationResolved("CostmapLocation", considered=2**64 - 1))
+            first.records[place - 1] = first.records[place - 1]._replace(type="LocationResolved", payload=payload)
+        case _:
+            await _forget_when_stored(log, place)
+    records = [*declarations(SAYING), *first.records, *talk(2, words=4).records]
+    await folded_by_two(log, other_log, records, hand, batch_events=2)
+    rows = await ask(log, "SELECT number, folded, parked IS NULL FROM episode ORDER BY number")
+    assert [tuple(map(int, each)) for each in rows] == [(1, place - 1, 0), (2, 12, 1)]
+    ((reason,),) = await ask(log, "SELECT parked FROM episode WHERE number = 1")
+    assert reason.startswith(f"event {place}")
+    begun = [each for each in (3, 4, 7, 8) if each < place]
+    shown = await told(log)
+    assert [each[0] for each in shown if each not in words_of(2, 4)] == [row(each) for each in begun]
+    assert [each for each in shown if each in words_of(2, 4)] == words_of(2, 4)
+
+
+async def test_types_that_come_meanwhile_are_learned_by_both(log: EventLog, other_log: EventLog) -> None:
+    class Interrupted(OtherHand):
+        """Each time it is told what to prepare, a type that nobody has seen is recorded first, and used."""
+
+        count = 0
+
+        def prepare(self, spans: Sequence[Span]) -> None:
+            self._task = asyncio.create_task(self._prepared(spans))
+
+        async def _prepared(self, spans: Sequence[Span]) -> Prepared:
+            self.count += 1
+            if self.count <= 3:
+                louder = declared("SayingAction", "saying_action", field("text", "text", 2), volume(self.count))
+                script = Script(100 + self.count)
+                script.put(NodeStarted("action", None, name_of(louder), {"text": "LOUD", f"volume{self.count}": 0.5}))
+                await other_log.append([*declarations(louder), *script.records])
+            return await self.projector.prepare(spans)
+
+    records = [*declarations(SAYING), *talk(1, words=30).records]
+    await folded_by_two(log, other_log, records, Interrupted, batch_events=4)
+    loud = [(row(1, number=number), None, "RUNNING", "LOUD") for number in (2, 3, 4)]
+    assert await told(log) == [*words_of(1, 30), *loud]
+    assert await ask(log, "SELECT volume1, volume2, volume3 FROM saying_action WHERE text = 'LOUD' ORDER BY id") == [
+        (0.5, None, None),
+        (None, 0.5, None),
+        (None, None, 0.5),
+    ]
+
+
+def volume(number: int) -> FieldDeclared:
+    return field(f"volume{number}", "real", 2 + number)
+
+
+async def test_several_who_are_helped_show_every_event_once(log: EventLog, other_log: EventLog) -> None:
+    projectors = []
+    for each in (log, other_log):
+        other = Projector(log if each is other_log else other_log, batch_events=3)
+        await other.open()
+        projectors.append(Projector(each, batch_events=3, helper=OtherHand(other)))
+        await projectors[-1].open()
+    talks = [talk(number, words=10) for number in range(1, 6)]
+    await log.append([*declarations(SAYING), *mixed(*talks)])
+    counts = await asyncio.gather(*(each.fold_behind() for each in projectors))
+    assert await told(log) == [word for number in range(1, 6) for word in words_of(number, 10)]
+    assert sum(counts) == sum(len(each.records) for each in talks)
+
+
+async def _forget_when_stored(log: EventLog, place: int) -> None:
+    """Event `place` of the first episode is gone as soon as it is stored, as if the file had lost it."""
+    is_server = log.engine.dialect.name == "postgresql"
+    async with log.engine.begin() as connection:
+        if is_server:
+            await connection.exec_driver_sql("DROP TRIGGER event_is_not_changed ON event")
+        else:
+            await connection.exec_driver_sql("DROP TRIGGER event_is_not_deleted")
+    append = log.append
+
+    async def appended(records: Sequence[Record]) -> dict[EpisodeId, str]:
+        refusals = await append(records)
+        async with log.engine.begin() as connection:
+            await connection.exec_driver_sql(f"DELETE FROM event WHERE episode = 1 AND sequence = {place}")
+        return refusals
+
+    log.append = appended  # type: ignore[method-assign]
