@@ -157,6 +157,12 @@ class Layout(msgspec.Struct, frozen=True):
         ]
         return tuple(dict.fromkeys((table, *shown)))
 
+    def dtypes(self, table: str) -> tuple[str, ...]:
+        """What the nodes whose rows the view of `table` shows may be called, former names included."""
+        shown = set(self.members(table))
+        present = [dtype for dtype, each in self.types.items() if shown.intersection(each.tables)]
+        return (*present, *(old for old, new in self.renamed.items() if new in present))
+
     def columns(self, table: str) -> dict[str, Storage]:
         """The columns of the view of `table`: its own, and those of its type's other tables."""
         tables = [table, *(other for each in self.types.values() if table in each.tables for other in each.tables)]

@@ -7,16 +7,47 @@ pick-ups where the latest 2,000 were wanted.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Self
 
-from sqlalchemy import ColumnElement, FromClause, Select, Table, select
+from sqlalchemy import Boolean, ColumnElement, FromClause, Select, Table, select
+from sqlalchemy.ext.compiler import compiles
 
 __all__ = ["pick_ups_with_context"]
 
 
-def pick_ups_with_context(picked: FromClause, node: Table, thing: Table, pose: Table) -> Select[*tuple[Any, ...]]:
-    """Joined at the ids themselves: a node, its designator and its leaf row have the same one."""
+class _Said(ColumnElement[bool]):
+    """What is so anyway, said for PostgreSQL: of what types a node is that has such a row.
+
+    To find the pick-ups that succeeded it read all nodes that did, ten times as many, and now those of the type (282 ms
+    -> 82 ms of 50,000). SQLite begins with the rows of the type by itself, and would look for each into one index more.
+    """
+
+    inherit_cache = False
+    type = Boolean()
+
+    def __init__(self, fact: ColumnElement[bool]) -> None:
+        self.fact = fact
+
+    def self_group(self, against: Any = None) -> Self:  # noqa: ARG002  SQLAlchemy's signature
+        return self
+
+
+@compiles(_Said)
+def _nothing(_element: _Said, _compiler: Any, **_options: Any) -> str:
+    return "1"
+
+
+@compiles(_Said, "postgresql")
+def _fact(element: _Said, compiler: Any, **options: Any) -> str:
+    return str(compiler.process(element.fact, **options))
+
+
+def pick_ups_with_context(
+    picked: FromClause, node: Table, thing: Table, pose: Table, dtypes: Sequence[str]
+) -> Select[*tuple[Any, ...]]:
+    """Joined at the ids themselves: a node, its designator and its leaf row have the same one. `dtypes` are all that a
+    node with a row in `picked` may have."""
     robot, there = pose.alias("robot"), pose.alias("there")
     return (
         select(
@@ -42,6 +73,7 @@ def pick_ups_with_context(picked: FromClause, node: Table, thing: Table, pose: T
         .join(robot, robot.c.id == node.c.robot_pose_id)
         .join(thing, thing.c.id == picked.c.object_designator_id)
         .join(there, there.c.id == thing.c.pose_id)
+        .where(_Said(node.c.dtype.in_(dtypes)))
     )
 
 

@@ -124,7 +124,8 @@ def public_views(layout: Layout, generation: int, *, simulated: bool = False) ->
     if _PICKED in layout.leaves:
         node, thing, pose = (core[name] for name in ("task_tree_node", "object", "pose"))
         picked = _leaf(_PICKED, layout, generation, lambda view, _: view).subquery("picked")
-        views["PickUpWithContextView"] = shown(pick_ups_with_context(picked, node, thing, pose), node)
+        view = pick_ups_with_context(picked, node, thing, pose, layout.dtypes(_PICKED))
+        views["PickUpWithContextView"] = shown(view, node)
     views["designator_type"] = _designator_type()
     return views
 

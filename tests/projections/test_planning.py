@@ -8,7 +8,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.rebuilding import rebuild_memory
-from tests.databases import ask
+from tests.databases import Server, ask
 
 VIEW = 'SELECT arm, relative_x FROM "PickUpWithContextView" WHERE {}'
 
@@ -40,6 +40,17 @@ async def test_of_a_pick_up_with_context_it_is_asked_once_whether_it_happened(
     plan = "\n".join(str(row) for row in ask(database_url, f"{explain} {VIEW.format('true')}"))
     assert "pick_up_action__1" in plan
     assert "simulated_episode" not in plan
+
+
+async def test_a_server_finds_the_pick_ups_that_succeeded_without_reading_all_nodes_that_did(
+    server: Server, tmp_path: Path
+) -> None:
+    url = server.new_database()
+    async with Memory.open(url, spool=tmp_path / "spool"):
+        pass
+    question = VIEW.format("status = 'SUCCEEDED'")
+    plan = "\n".join(str(row) for row in ask(url, f"EXPLAIN {question}"))
+    assert "dtype = 'PickUpAction'" in plan
 
 
 async def test_what_is_expected_of_a_table_goes_with_it_when_it_is_made_anew(tmp_path: Path) -> None:

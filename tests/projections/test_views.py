@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.happenings import (
+    DesignatorTypeDeclared,
     FailureValue,
     NodeEnded,
     NodeStarted,
@@ -64,6 +66,48 @@ async def test_the_view_of_pick_ups_has_the_columns_of_the_thesis_and_the_pose_a
             (row(2), "LEFT", "TOP", 0.3, -0.75, 0.5, 0.0, 0.0, 0.6, 0.8, "MILK", "FAILED", 1, row(2)),
             (row(5), "RIGHT", "FRONT", None, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, "MILK", "SUCCEEDED", 1, row(5)),
         ]
+
+
+CAREFUL = declared(
+    "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5), bases=("PickUpAction",)
+)
+WARY = declared(
+    "WaryPickUpAction", "wary_pick_up_action", *PICK_UP.fields, bases=("CarefulPickUpAction", "PickUpAction")
+)
+GRAB = msgspec.structs.replace(declared("GrabAction", "grab_action", *PICK_UP.fields), aliases=("PickUpAction",))
+LIFT = msgspec.structs.replace(declared("LiftAction", "lift_action", *CAREFUL.fields), aliases=("CarefulPickUpAction",))
+
+
+@pytest.mark.parametrize(
+    "types",
+    [
+        (PICK_UP, CAREFUL, WARY),
+        (WARY, CAREFUL, PICK_UP),
+        (PICK_UP, CAREFUL, GRAB),
+        (GRAB, PICK_UP),
+        (CAREFUL, PICK_UP, WARY, GRAB),
+        (PICK_UP, CAREFUL, msgspec.structs.replace(LIFT, bases=("PickUpAction",)), WARY),
+    ],
+)
+@pytest.mark.parametrize("at_once", [True, False])
+async def test_it_has_those_of_descendants_and_of_former_names_whatever_came_first(
+    log: EventLog, types: tuple[DesignatorTypeDeclared, ...], at_once: bool
+) -> None:
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 0.9)))
+    rows = []
+    projector = Projector(log)
+    await projector.open()
+    for each in types:
+        parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+        robot = RobotValue(pose(0.25, 2.5), "ROBOT", 0.3)
+        rows.append(row(script.put(NodeStarted("action", None, name_of(each), parameters, robot))))
+        if not at_once:
+            await log.append([*declarations(each), *script.records])
+            await projector.fold_behind()
+    await log.append([*declarations(*types), *script.records])
+    await projector.fold_behind()
+    assert await ask(log, 'SELECT id FROM "PickUpWithContextView" ORDER BY id') == [(each,) for each in rows]
 
 
 def turn(axis: tuple[float, float, float], angle: float) -> NDArray[np.float64]:
