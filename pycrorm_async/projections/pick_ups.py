@@ -19,8 +19,9 @@ __all__ = ["pick_ups_with_context"]
 class _Said(ColumnElement[bool]):
     """What is so anyway, said for PostgreSQL: of what types a node is that has such a row.
 
-    To find the pick-ups that succeeded it read all nodes that did, ten times as many, and now those of the type (282 ms
-    -> 82 ms of 50,000). SQLite begins with the rows of the type by itself, and would look for each into one index more.
+    To find the pick-ups that succeeded it read all nodes that did, ten times as many, and now finds them in the index
+    of types (of 50,000 in 64 ms instead of 170). Where all of a type are wanted it takes them for a tenth of what they
+    are, and for the latest 2,000 of 50,000 needs 110 ms instead of 77. SQLite begins with the rows of the type anyway.
     """
 
     inherit_cache = False

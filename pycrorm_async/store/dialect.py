@@ -45,11 +45,12 @@ class RowRefused(ValueError):
 
 
 class Expected(NamedTuple):
-    """How many rows of a table are expected, and by index how many of them have a value in common."""
+    """How many rows of a table are expected, and by index how many of them have a value in common: that of its first
+    column, those of its first two."""
 
     table: str
     rows: int
-    alike: Mapping[str, int]
+    alike: Mapping[str, Sequence[int]]
 
 
 class Dialect(Protocol):

@@ -151,7 +151,10 @@ class SQLite:
         # as any other: a question by status began with all nodes there are, and took four times as long.
         await connection.exec_driver_sql(f"ANALYZE {_quote(tables[0].table)}")  # makes the planner's table
         rows: list[tuple[str, str | None, str]] = [(each.table, None, str(each.rows)) for each in tables]
-        rows += [(each.table, index, f"{each.rows} {alike}") for each in tables for index, alike in each.alike.items()]
+        for each in tables:
+            rows += [
+                (each.table, index, " ".join(map(str, (each.rows, *alike)))) for index, alike in each.alike.items()
+            ]
         await connection.exec_driver_sql(sql.EXPECT, (_json(rows),))
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
