@@ -171,16 +171,19 @@ class _Helped:
 
     def __init__(self, streams: _Streams) -> None:
         self._streams = streams
+        self.is_there = True
 
     def prepare(self, spans: Sequence[Span]) -> None:
         self._streams.writer.write(msgspec.json.encode(_Ask(list(spans))) + b"\n")
 
     async def write(self) -> int:
+        line = b""
         with suppress(ConnectionError):
             self._streams.writer.write(msgspec.json.encode(_Ask()) + b"\n")
             await self._streams.writer.drain()
-            return int(await self._streams.reader.readline() or 0)
-        return 0
+            line = await self._streams.reader.readline()
+        self.is_there = line != b""
+        return int(line or 0)
 
 
 async def _help_when_asked(asked: socket.socket, url: str) -> None:
@@ -205,7 +208,7 @@ async def _help_when_asked(asked: socket.socket, url: str) -> None:
                     if ask.spans:
                         batch = await projector.prepare(ask.spans)
                     elif batch is not None:
-                        count = await projector.write(batch)
+                        count, batch = await projector.write(batch), None
                 except Exception:  # noqa: BLE001 - see above
                     batch = None
                 if not ask.spans:

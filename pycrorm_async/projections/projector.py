@@ -44,7 +44,9 @@ _HELP_EVENTS_MIN = 2_000
 
 
 class Helper(Protocol):
-    """Another process that folds into the same tables, whenever it is told to."""
+    """Another process that folds into the same tables, whenever it is told to, while it `is_there`."""
+
+    is_there: bool
 
     def prepare(self, spans: Sequence[Span]) -> None:
         """It reads and folds these, and forgets what it had been told to before."""
@@ -156,7 +158,7 @@ class Projector:
         if batch is None:
             return None
         theirs: Sequence[Span] = ()
-        if self._helper is not None and batch.is_whole:
+        if self._helper is not None and self._helper.is_there and batch.is_whole:
             theirs = await self._spans(batch.reached)
             if _size(theirs) >= _HELP_EVENTS_MIN:
                 self._helper.prepare(theirs)

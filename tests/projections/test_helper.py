@@ -30,6 +30,8 @@ from tests.projections.script import SAYING, Script, declarations, declared, fie
 class OtherHand:
     """Implements `Helper`. `wrote` is how many events each of its batches had."""
 
+    is_there = True
+
     def __init__(self, projector: Projector) -> None:
         self.projector = projector
         self.wrote: list[int] = []
@@ -55,10 +57,22 @@ class Unheard(OtherHand):
         return 0
 
 
-class Gone(OtherHand):
+class Idle(OtherHand):
     """Writes nothing."""
 
     async def write(self) -> int:
+        return 0
+
+
+class Gone(Idle):
+    """Is gone when it is to write for the first time, and is asked no more."""
+
+    def prepare(self, spans: Sequence[Span]) -> None:
+        assert self.is_there
+        super().prepare(spans)
+
+    async def write(self) -> int:
+        self.is_there = False
         return 0
 
 
@@ -140,7 +154,7 @@ def words_of(number: int, words: int, *, episode: int | None = None) -> list[tup
     return expected
 
 
-@pytest.mark.parametrize("hand", [OtherHand, Unheard, Gone, Eager])
+@pytest.mark.parametrize("hand", [OtherHand, Unheard, Idle, Gone, Eager])
 @pytest.mark.parametrize("batch_events", [1, 2, 3, 7])
 async def test_every_event_is_shown_once_and_in_its_place(
     log: EventLog, other_log: EventLog, hand: type[OtherHand], batch_events: int
