@@ -18,7 +18,7 @@ import os
 import signal
 import socket
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from contextlib import AsyncExitStack, ExitStack, contextmanager, suppress
+from contextlib import AsyncExitStack, ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -185,6 +185,9 @@ class _Helped:
         self.is_there = line != b""
         return int(line or 0)
 
+    def close(self) -> None:
+        self._streams.writer.close()
+
 
 async def _help_when_asked(asked: socket.socket, url: str) -> None:
     """Until nobody is there who could ask. What fails here the one that asked does, who meets it too and tells."""
@@ -230,8 +233,8 @@ async def _fold_when_asked(
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
     destination: LogAndTables | None = None
-    helper = _Helped(_Streams(*await asyncio.open_connection(sock=helped)))
     async with AsyncExitStack() as stack:
+        helper = stack.enter_context(closing(_Helped(_Streams(*await asyncio.open_connection(sock=helped)))))
         with suppress(ConnectionError), asked.makefile("rwb") as stream:
             while stream.readline():
                 answer = _Answer(more=True)
