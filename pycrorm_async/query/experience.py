@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import Select, select
+from sqlalchemy import Select, literal, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import PickUpWithContextView
@@ -74,7 +74,10 @@ class PickUpExperience:
 def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, ...]]:
     view = PickUpWithContextView
     # First which, then what: the columns that are reckoned are reckoned for these only, and nothing wide is sorted.
-    latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(ATTEMPTS_MAX)
+    # How many is asked for as a question, which PostgreSQL takes for a tenth of what there is, and so begins with the
+    # latest: it finds ten times as many as it expects, and would else look for all first and sort them.
+    some = select(literal(ATTEMPTS_MAX)).scalar_subquery()
+    latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(some)
     if arm is not None:
         latest = latest.where(view.arm == arm)
     return (
