@@ -44,9 +44,11 @@ _NOT_FOR_IT = (signal.SIGINT, signal.SIGTERM)
 
 
 class _Answer(msgspec.Struct, omit_defaults=True):
-    """Whether there was something to fold, and another answer follows; or why not: the database is away, or else."""
+    """Whether there was something to fold, and another answer follows; or why not: the database is away, or else.
+    `alone` if the helper has died."""
 
     more: bool = False
+    alone: bool = False
     away: str | None = None
     fault: str | None = None
 
@@ -109,6 +111,7 @@ class FoldedApart(Shown):
         self._destination = destination
         self._streams: _Streams | None = streams
         self._is_folding = False
+        self._told_alone = False
         self._say = say
 
     @classmethod
@@ -133,6 +136,9 @@ class FoldedApart(Shown):
             return await self._destination.fold_some()
         answer = msgspec.json.decode(line, type=_Answer)
         self._is_folding = answer.more
+        if answer.alone and not self._told_alone:
+            self._told_alone = True
+            self._say("the process that helps to fold has died: folding is slower from now on")
         if answer.away is not None:
             raise DatabaseUnavailable(answer.away)
         if answer.fault is not None:
@@ -246,7 +252,7 @@ async def _fold_when_asked(
                                     address, place, clock=SYSTEM_CLOCK, projections=projections, helper=helper
                                 )
                             )
-                        answer = _Answer(more=await destination.fold_some())
+                        answer = _Answer(more=await destination.fold_some(), alone=not helper.is_there)
                     except DatabaseUnavailable as error:
                         answer = _Answer(away=str(error))
                     except Exception as error:  # noqa: BLE001 - told to the one that asks
