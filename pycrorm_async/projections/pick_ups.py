@@ -20,7 +20,7 @@ class _Said(ColumnElement[bool]):
     """What is so anyway, said for PostgreSQL: of what types a node is that has such a row.
 
     To find the pick-ups that succeeded it read all nodes that did, ten times as many, and now finds them in the index
-    of types (of 50,000 in some 100 ms instead of 171). But it takes the pick-ups for a tenth of what they are, which
+    of types (of 50,000 in a good half of the time). But it takes the pick-ups for a tenth of what they are, which
     whoever wants the latest of them must reckon with. SQLite begins with the rows of the type anyway.
     """
 

@@ -8,7 +8,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.rebuilding import rebuild_memory
-from tests.databases import Server, ask
+from tests.databases import Server, ask, ask_to_change
 
 VIEW = 'SELECT arm, relative_x FROM "PickUpWithContextView" WHERE {}'
 
@@ -51,6 +51,20 @@ async def test_a_server_finds_the_pick_ups_that_succeeded_without_reading_all_no
     question = VIEW.format("status = 'SUCCEEDED'")
     plan = "\n".join(str(row) for row in ask(url, f"EXPLAIN {question}"))
     assert "dtype = 'PickUpAction'" in plan
+
+
+async def test_a_server_knows_from_its_index_where_the_robot_was_when_the_pick_ups_ended(
+    server: Server, tmp_path: Path
+) -> None:
+    url = server.new_database()
+    async with Memory.open(url, spool=tmp_path / "spool"):
+        pass
+    database = url.partition("?")[0].rpartition("/")[2]
+    for way in ("seqscan", "bitmapscan"):
+        ask_to_change(url, f'ALTER DATABASE "{database}" SET enable_{way} = off')
+    question = "SELECT id, robot_pose_id, torso_height, status FROM memory_tables.task_tree_node__1 WHERE NOT simulated"
+    plan = "\n".join(str(row) for row in ask(url, f"EXPLAIN {question} AND dtype = 'PickUpAction'"))
+    assert "Index Only Scan" in plan
 
 
 async def test_what_is_expected_of_a_table_goes_with_it_when_it_is_made_anew(tmp_path: Path) -> None:
