@@ -14,12 +14,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from sqlalchemy import Select, literal, select
+from sqlalchemy import Select, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.experience import PastSuccess
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose
@@ -62,6 +63,8 @@ class PickUpExperience:
         if self.over:
             raise CallerError("the memory that was to tell what went well is closed: ask while it is open")
         async with self._reading.session() as session:
+            connection = await session.connection()
+            await dialect_of(connection).in_order(connection)
             rows = (await session.execute(_question(object_type, arm))).all()
         return best_first(
             [
@@ -74,10 +77,7 @@ class PickUpExperience:
 def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, ...]]:
     view = PickUpWithContextView
     # First which, then what: the columns that are reckoned are reckoned for these only, and nothing wide is sorted.
-    # How many is asked for as a question, which PostgreSQL takes for a tenth of what there is, and so begins with the
-    # latest: it finds ten times as many as it expects, and would else look for all first and sort them.
-    some = select(literal(ATTEMPTS_MAX)).scalar_subquery()
-    latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(some)
+    latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(ATTEMPTS_MAX)
     if arm is not None:
         latest = latest.where(view.arm == arm)
     return (

@@ -134,6 +134,11 @@ class Dialect(Protocol):
         """Whatever is read in the transaction that begins now is of one moment."""
         ...
 
+    async def in_order(self, connection: AsyncConnection) -> None:
+        """What is asked for in an order in this transaction is read in it where that can be done, not sorted: for the
+        first few of many."""
+        ...
+
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
         """Until the transaction ends, none of these tables is dropped; False, and the transaction over, if one is."""
         ...

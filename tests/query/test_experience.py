@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
+from sqlalchemy import Connection, event
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.happenings import (
@@ -21,9 +23,11 @@ from pycrorm_async.events.happenings import (
 from pycrorm_async.plan.experience import PastSuccess
 from pycrorm_async.query.experience import ATTEMPTS_MAX, Attempt, PickUpExperience, best_first
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose, yaw_quaternion
+from tests.databases import Server
 from tests.projections.asking import stored_and_folded
 from tests.projections.script import PICK_UP, T0_NS, Script, declarations, name_of
 
@@ -147,6 +151,26 @@ async def test_the_latest_are_looked_at_and_older_ones_are_not(log: EventLog) ->
     for _ in range(ATTEMPTS_MAX - 1):
         picked(script, milk, at=(0.0, 0.0), status="FAILED")
     assert [each.stand.position.x for each in await known(log, script)] == pytest.approx([-0.8])
+
+
+async def test_a_server_reads_the_latest_from_the_end_and_does_not_sort_them_out_of_all(server: Server) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(server.new_database()), create=True)
+    plans: list[str] = []
+
+    def explained(connection: Connection, _cursor: object, statement: str, parameters: Any, *_: object) -> None:
+        if statement.startswith("SELECT") and "PickUpWithContextView" in statement:
+            plans.append(str(connection.exec_driver_sql(f"EXPLAIN {statement}", parameters).all()))
+
+    script = Script()
+    picked(script, added(script, "milk", "MILK", (1.0, 0.0, 0.9)), at=(0.4, 0.0))
+    event.listen(log.engine.sync_engine, "before_cursor_execute", explained)
+    try:
+        assert len(await known(log, script)) == 1
+    finally:
+        await log.close()
+    (plan,) = plans
+    assert "Limit" in plan
+    assert "Sort" not in plan
 
 
 async def test_a_closed_memory_is_not_asked(log: EventLog) -> None:

@@ -122,6 +122,9 @@ class SQLite:
     async def hold_still(self, connection: AsyncConnection) -> None:
         """A transaction is a snapshot."""
 
+    async def in_order(self, connection: AsyncConnection) -> None:
+        """It does so where an index has the order."""
+
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:  # they are of the snapshot
         there = (await connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'")).scalars()
         return set(tables) <= set(there)
