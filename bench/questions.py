@@ -2,7 +2,7 @@
 
     python -m bench.questions                     1,000 and 50,000 pick-ups, SQLite and PostgreSQL
     python -m bench.questions --pick-ups 500000   4.9 million nodes: some minutes to fill, 4 GB
-    python -m bench.questions --quick             100
+    python -m bench.questions --quick             100, once
 
 The memories hold the rollouts of the thesis, 9 to 13 nodes each, a hundred in an episode. Each question is asked seven
 times after a first time that is not counted, all in turns, and the collector has been by before each. A server is asked
@@ -137,13 +137,13 @@ def await_counted(url: str) -> None:
         time.sleep(1)
 
 
-async def asked(url: str, pick_ups: int) -> dict[str, Any]:
-    """All questions in turns, the first time not counted."""
+async def asked(url: str, pick_ups: int, rounds: int) -> dict[str, Any]:
+    """All questions in turns, so many times after a first one that is not counted."""
     took: dict[str, list[float]] = {}
     rows: dict[str, int] = {}
     async with Reading.open(url) as reading:
         questions = questions_of(reading, pick_ups)
-        for number in range(1 + _ROUNDS):
+        for number in range(1 + rounds):
             for name, question in questions.items():
                 gc.collect()
                 began = time.perf_counter()
@@ -155,12 +155,12 @@ async def asked(url: str, pick_ups: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="100 pick-ups")
+    parser.add_argument("--quick", action="store_true", help="100 pick-ups, asked once")
     parser.add_argument("--pick-ups", type=int, nargs="+", default=[1_000, 50_000])
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
     given = parser.parse_args()
-    sizes = [100] if given.quick else given.pick_ups
-    answer: dict[str, Any] = {"bench": "questions", "rounds": _ROUNDS, "seed": _SEED}
+    sizes, rounds = ([100], 1) if given.quick else (given.pick_ups, _ROUNDS)
+    answer: dict[str, Any] = {"bench": "questions", "rounds": rounds, "seed": _SEED}
     with ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
         for database in given.databases:
@@ -173,7 +173,7 @@ def main() -> None:
                 console().print(f"  filled: {filled}")
                 if server and not given.quick:
                     await_counted(url)
-                answer[database][str(size)] = {"filled_s": filled, **asyncio.run(asked(url, size))}
+                answer[database][str(size)] = {"filled_s": filled, **asyncio.run(asked(url, size, rounds))}
     print(json.dumps(answer))
     console().print(_table(answer, given.databases))
 
