@@ -20,8 +20,8 @@ class _Said(ColumnElement[bool]):
     """What is so anyway, said for PostgreSQL: of what types a node is that has such a row.
 
     To find the pick-ups that succeeded it read all nodes that did, ten times as many, and now finds them in the index
-    of types (of 50,000 in a good half of the time). But it takes the pick-ups for a tenth of what they are: who
-    wants the latest of them says so (`Dialect.in_order`). SQLite begins with the rows of the type anyway.
+    of types (of 50,000 in a good half of the time). But it takes the pick-ups for a tenth of what they are: who wants
+    the latest of them says so (`Dialect.in_order`). SQLite begins with the rows of the type anyway.
     """
 
     inherit_cache = False

@@ -42,28 +42,27 @@ async def test_of_a_pick_up_with_context_it_is_asked_once_whether_it_happened(
     assert "simulated_episode" not in plan
 
 
-async def test_a_server_finds_the_pick_ups_that_succeeded_without_reading_all_nodes_that_did(
-    server: Server, tmp_path: Path
-) -> None:
+@pytest.fixture
+async def new_on_a_server(server: Server, tmp_path: Path) -> str:
+    """The URL of a memory in which nothing is yet."""
     url = server.new_database()
     async with Memory.open(url, spool=tmp_path / "spool"):
         pass
+    return url
+
+
+def test_a_server_finds_the_pick_ups_that_succeeded_without_reading_all_nodes_that_did(new_on_a_server: str) -> None:
     question = VIEW.format("status = 'SUCCEEDED'")
-    plan = "\n".join(str(row) for row in ask(url, f"EXPLAIN {question}"))
+    plan = "\n".join(step for (step,) in ask(new_on_a_server, f"EXPLAIN {question}"))
     assert "dtype = 'PickUpAction'" in plan
 
 
-async def test_a_server_knows_from_its_index_where_the_robot_was_when_the_pick_ups_ended(
-    server: Server, tmp_path: Path
-) -> None:
-    url = server.new_database()
-    async with Memory.open(url, spool=tmp_path / "spool"):
-        pass
-    database = url.partition("?")[0].rpartition("/")[2]
+def test_a_server_knows_from_its_index_where_the_robot_was_when_the_pick_ups_ended(new_on_a_server: str) -> None:
+    database = new_on_a_server.partition("?")[0].rpartition("/")[2]
     for way in ("seqscan", "bitmapscan"):
-        ask_to_change(url, f'ALTER DATABASE "{database}" SET enable_{way} = off')
+        ask_to_change(new_on_a_server, f'ALTER DATABASE "{database}" SET enable_{way} = off')
     question = "SELECT id, robot_pose_id, torso_height, status FROM memory_tables.task_tree_node__1 WHERE NOT simulated"
-    plan = "\n".join(str(row) for row in ask(url, f"EXPLAIN {question} AND dtype = 'PickUpAction'"))
+    plan = "\n".join(step for (step,) in ask(new_on_a_server, f"EXPLAIN {question} AND dtype = 'PickUpAction'"))
     assert "Index Only Scan" in plan
 
 
