@@ -13,6 +13,7 @@ import asyncio
 import logging
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, NamedTuple, TypeVar
 
 from pycrorm_async.config import Settings
@@ -200,12 +201,14 @@ def _stopped(error: Exception) -> str:
 
 
 async def to_the_end(work: Coroutine[Any, Any, _T]) -> _T:
-    """Awaits work that is not to be left half done: a cancellation is passed on when the work is finished."""
+    """Awaits work that is not to be left half done: a cancellation, or several, is passed on when it is finished."""
     task = asyncio.create_task(work)
     try:
         return await asyncio.shield(task)
     except asyncio.CancelledError:
-        await asyncio.wait([task])
+        while not task.done():
+            with suppress(asyncio.CancelledError):
+                await asyncio.wait([task])
         if not task.cancelled():
             task.exception()  # seen; the cancellation counts for more
         raise

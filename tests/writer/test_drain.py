@@ -4,6 +4,7 @@ import asyncio
 import os
 import random
 import sqlite3
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.backoff import Backoff
-from pycrorm_async.writer.drain import Drain
+from pycrorm_async.writer.drain import Drain, to_the_end
 from tests.databases import ask
 from tests.store.making import episode, record, run_of
 from tests.writer.ends import CountingFold, KeptSource, LosesReplies, Passing
@@ -319,3 +320,23 @@ async def test_a_drain_cancelled_at_any_moment_loses_nothing(log: EventLog) -> N
     await Drain(source, CountingFold(log), settings=TENS).run()
     assert ask(log.address.path, STORED) == [(1, 400, 1, 400)]
     assert source.kept == []
+
+
+async def test_what_is_not_to_be_left_half_done_is_done_also_when_it_is_cancelled_twice() -> None:
+    may_end, ended = threading.Event(), threading.Event()
+
+    def work() -> None:
+        may_end.wait(30)
+        ended.set()
+
+    task = asyncio.create_task(to_the_end(asyncio.to_thread(work)))
+    for _ in range(3):
+        await asyncio.sleep(0.01)
+        task.cancel()
+        task.cancel()  # as a group that ends cancels who was cancelled by name
+    await asyncio.sleep(0.01)
+    assert not task.done()
+    may_end.set()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert ended.is_set()
