@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import errno
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from gc import disable, enable, isenabled
 from itertools import pairwise
 from pathlib import Path
 from threading import get_ident
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Final, NamedTuple
 from zlib import crc32
 
 from pycrorm_async.clock import Clock
@@ -23,6 +24,7 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.alone import Alone
 from pycrorm_async.queue.capacity import Capacity
+from pycrorm_async.queue.declared import Declarations, Repeated
 from pycrorm_async.queue.frame import (
     CHECKSUM_START,
     COMMIT_BYTES,
@@ -39,7 +41,9 @@ from pycrorm_async.queue.segment import CLOSES, OPENS, Last, Segment, SegmentHea
 
 __all__ = ["Appender", "Span", "Begun"]
 
-_NOT_NOW = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.ENOMEM})
+NOTHING_OPEN: Final[Mapping[EpisodeId, Last]] = MappingProxyType({})
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_NOT_NOW = _FULL | frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
 
 
 class Span(NamedTuple):
@@ -52,15 +56,20 @@ class Span(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """A segment that holds records from position `base` on."""
+    """A segment that holds records from position `base` on; `opened` are the episodes open before them."""
 
     number: int
     base: int
     path: Path
+    opened: Mapping[EpisodeId, Last]
 
 
 class Appender:
-    """Appends from any thread. `wake` is called at the first record of a span, `hurry` when a segment was begun."""
+    """Appends from any thread. `wake` is called at the first record of a span, `hurry` when a segment was begun.
+
+    `make_room` frees so many bytes of a disk that is full; False if there is nothing to free. The first record follows
+    position `after`, where these episodes are `opened`.
+    """
 
     def __init__(
         self,
@@ -71,19 +80,25 @@ class Appender:
         clock: Clock,
         wake: Callable[[], None],
         hurry: Callable[[], None],
+        make_room: Callable[[int], bool],
+        after: int = 0,
+        opened: Mapping[EpisodeId, Last] = NOTHING_OPEN,
     ) -> None:
         self._folder = folder
         self._recorder = recorder
         self._capacity = capacity
+        self._clock = clock
         self._wall_ns, self._monotonic_ns = clock
         self._wake = wake
         self._hurry = hurry
+        self._make_room = make_room
         self._alone = Alone()
         self._making = threading.Lock()
         self._type_names: dict[str, bytes] = {}
 
-        self.position = 0
-        self.open: dict[EpisodeId, tuple[int, int, int]] = {}
+        self.position = after
+        self.declarations = Declarations()
+        self.open: dict[EpisodeId, tuple[int, int, int]] = dict(opened)
         self.begun: list[Begun] = []
         self._refusal: Callable[[], PycrormError] | None = None
         self.stuck: str | None = None  # why nothing will be trimmed any more
@@ -95,7 +110,7 @@ class Appender:
         self._sealed: list[Segment] = []
         self._prepared: Segment | None = None
         self._end = self._ordinary_end = capacity.end
-        self._current = Segment.allocate(folder, number=1, size=capacity.segment_bytes)
+        self._current = self._allocate(1)
         self._buffer, self._offset, self._salt = self._current.buffer, 0, 0
         self._begin(self._current)
 
@@ -121,6 +136,7 @@ class Appender:
                         raise self._refusal()
                     if episode is None:
                         kind = DECLARATION
+                        self._declare(body, len(name), version, len(payload))
                     elif (last := self.open.get(episode)) is not None:
                         sequence = last[0] + 1
                     elif type_name == OPENS:
@@ -177,8 +193,13 @@ class Appender:
 
     def _refuse_one_too_many(self) -> None:
         """Every segment's header names the open episodes: with more, the largest record would not fit beside them."""
-        if len(self.open) >= self._capacity.episodes_max:
+        if not self._capacity.takes_episode(episodes=len(self.open), declared=self.declarations.bytes):
             raise EpisodeRefused(f"{len(self.open):,} episodes are open: no more fit into a segment (segment_bytes)")
+
+    def _declare(self, body: bytes, name_bytes: int, version: int, payload_bytes: int) -> None:
+        """Every segment begins with it from now on."""
+        room = self._capacity.room_to_declare(episodes=len(self.open), declared=self.declarations.bytes)
+        self.declarations.add(body, name_bytes=name_bytes, version=version, payload_bytes=payload_bytes, room=room)
 
     def _encode_type(self, type_name: str) -> bytes:
         name = type_name.encode()
@@ -189,7 +210,7 @@ class Appender:
 
     def _find_room(self, frame_bytes: int, *, reserved: bool) -> None:
         """A frame of this size fits at `_offset` afterwards, in a new segment if need be. Under the lock."""
-        largest = self._capacity.frame_bytes_max(episodes=len(self.open))
+        largest = self._capacity.frame_bytes_max(episodes=len(self.open), declared=self.declarations.bytes)
         if frame_bytes > largest:
             raise InternalError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
         if not self._admits(frame_bytes, reserved=reserved):
@@ -203,7 +224,7 @@ class Appender:
             segment = self._prepared
             if segment is None:
                 try:
-                    segment = self._allocate()
+                    segment = self._allocate(self._current.number + 1)
                 except OSError as error:
                     raise self._allocation_refused(error) from error
                 self._prepared = segment
@@ -216,12 +237,14 @@ class Appender:
         open_before = {episode: Last(*last) for episode, last in self.open.items()}
         offset = segment.begin(SegmentHeader(self._recorder, segment.number, base, open_before))
         salt = salt_of(self._recorder, segment.number)
-        begun = [*self.begun, Begun(segment.number, base, segment.path)]
+        before = Repeated(offset, self.position, self._span_count, self._span_checksum)
+        repeated = self.declarations.write(segment.buffer, before, salt=salt, clock=self._clock)
+        begun = [*self.begun, Begun(segment.number, base, segment.path, open_before)]
         sealed = [*self._sealed, self._current] if self.begun else []
         # As in `put`: nothing is called between these steps.
         self._current = segment
         self._buffer = segment.buffer
-        self._offset = offset
+        self._offset, self.position, self._span_count, self._span_checksum = repeated
         self._salt = salt
         self._sealed = sealed
         self._prepared = None
@@ -290,7 +313,7 @@ class Appender:
         if self._prepared is not None:
             return None
         try:
-            self._prepared = self._allocate()
+            self._prepared = self._allocate(self._current.number + 1)
         except OSError as error:
             if error.errno not in _NOT_NOW:
                 raise
@@ -328,6 +351,11 @@ class Appender:
         return self._alone.run(partial(self._admits, frame_bytes, reserved=reserved))
 
     @property
+    def end(self) -> int:
+        """Where the last record or commit frame ends in its segment."""
+        return self._offset
+
+    @property
     def bytes_held(self) -> int:
         """Bytes of segments with records in them; the last one counts as far as it is written."""
         return self._alone.run(lambda: (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset)
@@ -340,7 +368,12 @@ class Appender:
 
     def _admits(self, frame_bytes: int, *, reserved: bool) -> bool:
         return self._capacity.admits(
-            frame_bytes, offset=self._offset, spare=self._spare(), episodes=len(self.open), reserved=reserved
+            frame_bytes,
+            offset=self._offset,
+            spare=self._spare(),
+            episodes=len(self.open),
+            declared=self.declarations.bytes,
+            reserved=reserved,
         )
 
     def _forget_refused(self) -> None:
@@ -353,10 +386,17 @@ class Appender:
         return self._capacity.segments_max - len(self.begun)
 
     def _set_limits(self) -> None:
-        self._ordinary_end = self._capacity.ordinary_end(spare=self._spare(), episodes=len(self.open))
+        self._ordinary_end = self._capacity.ordinary_end(
+            spare=self._spare(), episodes=len(self.open), declared=self.declarations.bytes
+        )
 
-    def _allocate(self) -> Segment:
-        return Segment.allocate(self._folder, number=self._current.number + 1, size=self._capacity.segment_bytes)
+    def _allocate(self, number: int) -> Segment:
+        while True:
+            try:
+                return Segment.allocate(self._folder, number=number, size=self._capacity.segment_bytes)
+            except OSError as error:
+                if error.errno not in _FULL or not self._make_room(self._capacity.segment_bytes):
+                    raise
 
     def _allocation_refused(self, error: OSError) -> PycrormError:
         reason = error.strerror or str(error)

@@ -12,8 +12,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.config import FileAccess
+from pycrorm_async.errors import PycrormError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
+from pycrorm_async.queue.file_access import create_folder, create_spool, rewrite
+from pycrorm_async.queue.file_system import check_file_system
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.progress import PROGRESS
 from pycrorm_async.queue.segment import segment_numbers, segment_path, sync_folder
@@ -24,12 +27,17 @@ __all__ = [
     "MAKING",
     "MENDED",
     "REFUSED",
+    "STORED",
     "TAIL",
     "Holding",
     "available",
+    "begin_folder",
+    "fault_in",
+    "finish_folder",
     "held_by",
     "make_folder",
     "remove_folder",
+    "remove_made_ahead",
     "write_safely",
 ]
 
@@ -40,6 +48,8 @@ MENDED: Final = f".mended{MAKING}"
 """What `repair` adds to the name of a new folder until it is whole."""
 REFUSED: Final = ".refused"
 TAIL: Final = ".tail"
+STORED: Final = "stored"
+"""Below the spool: segments whose records are all stored (`stored.py`)."""
 
 
 class Holding(NamedTuple):
@@ -69,26 +79,49 @@ def available(path: Path) -> Iterator[None]:
         raise SpoolUnavailable(where, error.strerror or str(error)) from error
 
 
-def make_folder(spool: Path, name: str) -> tuple[Path, FileLock]:
+def fault_in(folder: Path, error: Exception) -> PycrormError:
+    """The error of one folder as an error of this package that names it: the other folders are not concerned."""
+    if isinstance(error, PycrormError):
+        return error
+    return SpoolUnavailable(folder, f"cannot be read: {type(error).__name__}: {error}")
+
+
+def make_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, FileLock]:
     """A new folder below the spool, which is made if need be, and its `alive`. Raises `SpoolUnavailable`."""
-    unfinished, folder = spool / f"{name}{MAKING}", spool / name
+    unfinished, alive = begin_folder(spool, name, access)
+    return finish_folder(unfinished), alive
+
+
+def begin_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, FileLock]:
+    """The same under an unfinished name, which no process that drains looks at. Raises `SpoolUnavailable`."""
+    unfinished = spool / f"{name}{MAKING}"
     with available(spool):
-        spool.mkdir(parents=True, exist_ok=True)
-        unfinished.mkdir()
+        check_file_system(spool)
+        create_spool(spool, access)
+        create_folder(unfinished)
         alive = FileLock.take(unfinished / ALIVE)
         if alive is None:
             raise SpoolUnavailable(unfinished, "was taken away while it was being made")
+    return unfinished, alive
+
+
+def finish_folder(unfinished: Path, *, instead_of: Path | None = None) -> Path:
+    """Give the folder its name; `instead_of` is no recorder's folder any more then. Raises `SpoolUnavailable`."""
+    folder = unfinished.with_name(unfinished.name.removesuffix(MAKING))
+    with available(folder):
         unfinished.rename(folder)
-        sync_folder(spool)
-        sync_folder(spool.parent)
-    return folder, alive
+        if instead_of is not None:  # at once: recovery ends the open episodes of both, and of one they go on
+            (instead_of / ALIVE).unlink(missing_ok=True)
+        sync_folder(folder.parent)
+        sync_folder(folder.parent.parent)
+    return folder
 
 
 def remove_folder(folder: Path) -> None:
     """Deletes what is ours in it, and the folder unless somebody else left something there. Raises `OSError`."""
-    # One made ahead goes first: left alone by a kill it would look like one whose header was lost. Then the oldest.
-    for path in sorted((segment_path(folder, number) for number in segment_numbers(folder)), key=_is_begun):
-        path.unlink()
+    remove_made_ahead(folder)
+    for number in segment_numbers(folder):  # the oldest first
+        segment_path(folder, number).unlink()
     for path in list(folder.iterdir()):
         if path.suffix in {MAKING, TAIL}:
             path.unlink()
@@ -96,6 +129,14 @@ def remove_folder(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
+
+
+def remove_made_ahead(folder: Path) -> None:
+    """Delete the segments that hold nothing yet, before those in use go: one that a kill left alone would look as if
+    its header were lost. Raises `OSError`."""
+    for path in [segment_path(folder, number) for number in segment_numbers(folder)]:
+        if not _is_begun(path):
+            path.unlink()
 
 
 def _is_begun(segment: Path) -> bool:
@@ -106,7 +147,7 @@ def _is_begun(segment: Path) -> bool:
 def write_safely(path: Path, content: bytes) -> None:
     """The file holds this, all of it or what it held before, also after a power cut. Raises `OSError`."""
     unfinished = path.with_name(f"{path.name}{MAKING}")
-    with unfinished.open("wb") as file:
+    with rewrite(unfinished) as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())

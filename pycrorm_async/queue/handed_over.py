@@ -31,36 +31,39 @@ class HandedOver:
         """Returns when everything up to this position is stored and shows in the tables.
 
         Raises `EpisodeParked` for episodes of this queue that stopped, `DatabaseError` when whoever drains it had to
-        stop, and `FlushTimeout` after `flush_timeout_s`, which says whether anybody drains at all.
+        stop, and `FlushTimeout` after `flush_timeout_s` without progress, which says whether anybody drains at all.
         """
-        before = self._said.stored
-        try:
-            async with asyncio.timeout(self._settings.flush_timeout_s):
-                while self._said.folded < position:
-                    self._raise_given_up()
-                    await asyncio.sleep(_LOOK_S)
-        except TimeoutError:
-            raise FlushTimeout(
-                f"not finished after {self._settings.flush_timeout_s:g} s ({self._hindrance(before)});"
-                " everything recorded is safe in the spool"
-            ) from None
+        before, loop = self._said.stored, asyncio.get_running_loop()
+        seen, since_s = self._progress, loop.time()
+        while self._said.folded < position:
+            self._raise_given_up()
+            if self._progress != seen:
+                seen, since_s = self._progress, loop.time()
+            if loop.time() - since_s > self._settings.flush_timeout_s:
+                raise FlushTimeout(
+                    f"not finished after {self._settings.flush_timeout_s:g} s ({self._hindrance(before)});"
+                    " everything recorded is safe in the spool"
+                )
+            await asyncio.sleep(_LOOK_S)
         self._raise_stopped()
 
     async def close(self) -> None:
         """Waits until the queue, which the caller closed, is stored and shows in the tables, as long as that goes on.
 
         Where nobody drains or the database is away it does not wait: what is left is safe in the spool, and is stored
-        by whoever drains that next. So it is after `flush_timeout_s`. Raises `EpisodeParked`.
+        by whoever drains that next. So it is after `flush_timeout_s` without progress. Raises `EpisodeParked`.
         """
         await self._queue.synced_to()
         before, position = self._said.stored, self._queue.written
         loop = asyncio.get_running_loop()
-        began_s = loop.time()
+        seen, since_s = self._progress, loop.time()
         while self._said.folded < position:
             now_s = loop.time()
             if self._is_tended:
                 self._tended_s = now_s
-            if now_s - self._tended_s > _UNTENDED_S or now_s - began_s > self._settings.flush_timeout_s:
+            if self._progress != seen:
+                seen, since_s = self._progress, now_s
+            if now_s - self._tended_s > _UNTENDED_S or now_s - since_s > self._settings.flush_timeout_s:
                 _log.warning("%s (%s)", self._left(position), self._hindrance(before))
                 break
             await asyncio.sleep(_LOOK_S)
@@ -71,6 +74,10 @@ class HandedOver:
         said = self._queue.drained_outside
         assert said is not None, "made for a queue that is offered"
         return said
+
+    @property
+    def _progress(self) -> tuple[int, int]:
+        return self._said.stored, self._said.folded
 
     @property
     def _is_tended(self) -> bool:

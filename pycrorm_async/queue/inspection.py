@@ -6,18 +6,19 @@ counts only if a second look finds it at the same place.
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign, SpoolUnavailable
+from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.queue.folder import ALIVE, DRAIN, MAKING, MENDED, TAIL, available, held_by
+from pycrorm_async.queue.folder import ALIVE, DRAIN, MAKING, MENDED, TAIL, available, fault_in, held_by
 from pycrorm_async.queue.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.locks import is_locked
 from pycrorm_async.queue.scan import Kept, Survey, survey
-from pycrorm_async.queue.segment import segment_numbers, segment_path
+from pycrorm_async.queue.segment import read_segment, segment_numbers, segment_path
 from pycrorm_async.queue.spool import RecorderFolder, Spool
 
 __all__ = [
@@ -149,8 +150,13 @@ def inspect_spool(path: Path) -> SpoolReport:
         tuple(inspect_recorder(each) for each in recorders),
         tuple(each.name for each in aside),
         tuple(each.name for each in unfinished),
-        tuple(each.name for each in others if each not in [*aside, *unfinished]),
+        tuple(_text(each.name) for each in others if each not in [*aside, *unfinished]),
     )
+
+
+def _text(name: str) -> str:
+    """A file's name that can be printed: bytes in it that are not UTF-8 are escaped."""
+    return os.fsencode(name).decode(errors="backslashreplace")
 
 
 def is_set_aside(path: Path) -> bool:
@@ -185,8 +191,10 @@ def inspect_recorder(recorder: RecorderFolder) -> RecorderReport:
                 return _looked_at(recorder, being_drained=draining)
             except SpoolForeign as foreign:
                 return RecorderReport(name, path, recorder.alive, draining, refused=str(foreign))
-    except PycrormError as unavailable:
-        return RecorderReport(name, path, recorder.alive, being_drained=False, refused=str(unavailable))
+    except Exception as error:  # noqa: BLE001 - reported; the other folders are looked at
+        return RecorderReport(
+            name, path, recorder.alive, being_drained=False, refused=str(fault_in(recorder.path, error))
+        )
 
 
 @dataclass
@@ -212,7 +220,7 @@ def _looked_at(recorder: RecorderFolder, *, being_drained: bool) -> RecorderRepo
     folder = recorder.path
     count, (kept, damage, _) = _surveyed(folder, changing=recorder.alive or being_drained)
     ours = {ALIVE, DRAIN, _PROGRESS, *(segment_path(folder, number).name for number in kept.numbers)}
-    others = sorted(each.name for each in folder.iterdir() if each.name not in ours)
+    others = sorted(_text(each.name) for each in folder.iterdir() if each.name not in ours)
     return RecorderReport(
         recorder.name,
         str(folder),
@@ -277,6 +285,6 @@ def _tail_bytes(folder: Path, kept: Kept) -> int:
     size = 0
     for number in kept.numbers:
         if number >= kept.cut.number:
-            content = segment_path(folder, number).read_bytes()
+            content = read_segment(segment_path(folder, number))
             size += len(content[kept.cut.offset if number == kept.cut.number else 0 :].rstrip(b"\0"))
     return size

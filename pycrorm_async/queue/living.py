@@ -15,16 +15,17 @@ from typing import Self
 
 import msgspec
 
+from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.queue.folder import ALIVE, DRAIN, available
 from pycrorm_async.queue.frame import Buffer
 from pycrorm_async.queue.locks import FileLock, is_locked
 from pycrorm_async.queue.progress import Drained, Note, Progress
-from pycrorm_async.queue.reader import Cursor, Reader, map_segment
+from pycrorm_async.queue.reader import Cursor, Reader
 from pycrorm_async.queue.refused import RefusedRecords
 from pycrorm_async.queue.scan import checked_header
-from pycrorm_async.queue.segment import header_bytes, segment_numbers, segment_path
+from pycrorm_async.queue.segment import header_bytes, map_segment, segment_numbers, segment_path
 
 __all__ = ["LiveQueue"]
 
@@ -47,7 +48,7 @@ class LiveQueue:
         before = progress.drained()
         self._said = before._replace(note=Note())  # what a drainer before said in words is not ours to repeat
         self._reader = Reader(recorder=recorder, start=self._segment_of(before.stored), load=self._load)
-        self._skip_to(min(before.stored, progress.recorded().synced))
+        self._reader.skip_to(min(before.stored, progress.recorded().synced))
         self._until: int | None = None
         self._alive_looked_s = 0.0
         progress.tell_drained(self._said)
@@ -102,8 +103,13 @@ class LiveQueue:
             synced = self._progress.recorded().synced
             last = synced if self._until is None else min(synced, self._until)
             if last > self.given:
-                with available(self.folder):
-                    batch = self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
+                try:
+                    with available(self.folder):
+                        batch = self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
+                except (SpoolDamaged, SpoolUnavailable):
+                    if self.is_alive:
+                        raise
+                    return []  # its recorder went on in another folder (`relocation.py`), or it is dead
                 self._reader.cursor = batch.after
                 return batch.records
             await asyncio.sleep(pause_s)
@@ -213,11 +219,6 @@ class LiveQueue:
                 break
             found = Cursor(number, header_bytes(len(header.open)), header.base - 1)
         return found or Cursor(1, header_bytes(0), 0)
-
-    def _skip_to(self, position: int) -> None:
-        while self.given < position:
-            batch = self._reader.read(last=position, events_max=10_000, bytes_max=2**22)
-            self._reader.cursor = batch.after
 
     def _load(self, number: int) -> tuple[Path, Buffer]:
         path = segment_path(self.folder, number)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
+from pycrorm_async.queue.file_access import open_file
 from pycrorm_async.queue.folder import DRAIN
 from pycrorm_async.queue.progress import Drained, Progress, Recorded
 
@@ -13,11 +15,11 @@ __all__ = ["Outside"]
 class Outside:
     """The recorder's side of `progress`. Making one offers the folder to whoever drains this spool."""
 
-    def __init__(self, folder: Path) -> None:
-        """Raises `OSError`."""
+    def __init__(self, folder: Path, *, before: int = 0) -> None:
+        """Nothing up to position `before` is in this folder. Raises `OSError`."""
         # Made here, so that whoever wants to drain need not make it: a folder that is being deleted stays deleted.
-        (folder / DRAIN).touch()
-        self._progress = Progress.make(folder)
+        os.close(open_file(folder / DRAIN, os.O_WRONLY))
+        self._progress = Progress.make(folder, Drained(before, before))
         self._told = Recorded()
 
     def tell(self, *, synced: int, closed: bool) -> bool:

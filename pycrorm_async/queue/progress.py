@@ -32,6 +32,7 @@ from zlib import crc32
 
 import msgspec
 
+from pycrorm_async.queue.file_access import open_file
 from pycrorm_async.queue.locks import in_forked_child
 
 __all__ = ["PROGRESS", "Progress", "Recorded", "Drained", "Note"]
@@ -74,6 +75,9 @@ class Drained(NamedTuple):
     note: Note = Note()
 
 
+_NOTHING: Final = Drained()
+
+
 class Progress:
     """One side's view of the file. Made by the recorder, opened by everybody else."""
 
@@ -84,17 +88,17 @@ class Progress:
         in_forked_child(self.close)
 
     @classmethod
-    def make(cls, folder: Path) -> Progress:
+    def make(cls, folder: Path, drained: Drained = _NOTHING) -> Progress:
         """A new one; it has its name only when it is whole. Raises `OSError`."""
         path = folder / PROGRESS
         unfinished = path.with_suffix(".making")
-        descriptor = os.open(unfinished, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o644)
+        descriptor = open_file(unfinished, os.O_RDWR | os.O_TRUNC)
         try:
             os.posix_fallocate(descriptor, 0, _FILE_BYTES)
             os.pwrite(descriptor, _MAGIC, 0)
             made = cls(descriptor)
             made.tell_recorded(Recorded())
-            made.tell_drained(Drained())
+            made.tell_drained(drained)
             unfinished.rename(path)
         except BaseException:
             os.close(descriptor)
@@ -139,7 +143,7 @@ class Progress:
         if len(note) == length and checksum == crc32(note, crc32(content[: _DRAINER.size - 4])):
             try:
                 self._drained = Drained(stored, folded, msgspec.json.decode(note, type=Note))
-            except msgspec.DecodeError:  # a newer program says it in other words; the numbers are the same
+            except ValueError:  # a newer program says it in other words; the numbers are the same
                 self._drained = Drained(stored, folded)
         return self._drained
 

@@ -16,7 +16,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue.frame import COMMIT, EVENT, Buffer, decode_each
 from pycrorm_async.queue.segment import decode_header, header_bytes, salt_of
 
-__all__ = ["Cursor", "Batch", "Reader", "map_segment"]
+__all__ = ["Cursor", "Batch", "Reader", "checked_type"]
 
 
 class Cursor(NamedTuple):
@@ -36,10 +36,15 @@ class Batch(NamedTuple):
     complete: bool
 
 
-def map_segment(path: Path) -> mmap.mmap:
-    """The file's bytes, shared with whoever writes them. Raises `OSError`."""
-    with path.open("rb") as file:
-        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+def checked_type(path: Path, offset: int, name: bytes) -> str:
+    """The name of an event's type in the frame at this place. Raises `SpoolDamaged` for what no recorder writes."""
+    try:
+        type_name = name.decode()
+    except UnicodeDecodeError:
+        raise SpoolDamaged(path, offset, f"the name of the event's type, {name!r}, is not UTF-8") from None
+    if not type_name or "\0" in type_name:
+        raise SpoolDamaged(path, offset, f"the name of the event's type, {name!r}, is not one")
+    return type_name
 
 
 class Reader:
@@ -80,7 +85,7 @@ class Reader:
                     position = at
                     type_name = types.get(name)
                     if type_name is None:
-                        type_name = types[name] = name.decode()
+                        type_name = types[name] = checked_type(self._path, offset, name)
                     owner = episode if kind == EVENT else None
                     values = (position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
                     records.append(make(Record, values))
@@ -93,6 +98,11 @@ class Reader:
                     self.cursor = Cursor(number, offset, position)
         complete = full or len(records) >= events_max or total >= bytes_max
         return Batch(records, total, Cursor(number, offset, position), complete)
+
+    def skip_to(self, position: int) -> None:
+        """Goes on behind this position, all records up to which are there. Raises as `read` does."""
+        while self.cursor.position < position:
+            self.cursor = self.read(last=position, events_max=10_000, bytes_max=2**22).after
 
     def close(self) -> None:
         """Gives up the segment it looks at."""

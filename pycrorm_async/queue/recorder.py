@@ -7,6 +7,8 @@ nor gives up the interpreter. When it returned the event is *written*: it surviv
 A sync that fails is never tried again on the same files and believed, for the kernel may have dropped what it could not
 write. The queue refuses everything from then on with the disk's reason; what had been synced is still given away.
 Going on in a new file would need a second copy of all that is not synced; a new recorder does not.
+
+Where the files themselves were deleted or replaced, the copy is the mapping: the queue moves (`relocation.py`).
 """
 
 from __future__ import annotations
@@ -15,26 +17,21 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import InternalError, PycrormError, SpoolClosed, SpoolUnavailable
+from pycrorm_async.errors import FilesError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.queue.appender import Appender
 from pycrorm_async.queue.bell import Bell
 from pycrorm_async.queue.capacity import Capacity
-from pycrorm_async.queue.folder import DRAIN, available, make_folder, remove_folder
-from pycrorm_async.queue.frame import Buffer
+from pycrorm_async.queue.consumer import Consumer
+from pycrorm_async.queue.files import LOOK_S, QueueFiles
+from pycrorm_async.queue.folder import DRAIN, available, make_folder, remove_folder, remove_made_ahead
 from pycrorm_async.queue.locks import FileLock, in_forked_child, is_locked
-from pycrorm_async.queue.outside import Outside
-from pycrorm_async.queue.progress import Drained
-from pycrorm_async.queue.reader import Batch, Cursor, Reader, map_segment
-from pycrorm_async.queue.refused import RefusedRecords
-from pycrorm_async.queue.segment import header_bytes, segment_path
-from pycrorm_async.queue.syncer import Syncer
+from pycrorm_async.queue.movable import Relocated
+from pycrorm_async.queue.spool import Spool
 
 __all__ = ["RecorderQueue"]
 
@@ -42,11 +39,9 @@ _LAST_SYNC_S = 30.0
 _log = logging.getLogger("pycrorm_async")
 _SAY_S = 2.0
 """Who waits longer for room is told why."""
-_LOOK_S = 0.05
-"""How often the sync thread looks what another process has drained, while that may make a difference."""
 
 
-class RecorderQueue:
+class RecorderQueue(QueueFiles):
     """An asyncio queue whose items survive the process. Made by `create`; one recorder, one life of a process.
 
     Producers are any threads and tasks. The consumer is one task of one loop, which may be another thread's and takes
@@ -58,34 +53,8 @@ class RecorderQueue:
         self, *, folder: Path, recorder: bytes, settings: Settings, clock: Clock, alive: FileLock, offered: bool
     ) -> None:
         """Used by `create`, which made and locked the folder. Raises `SpoolUnavailable`."""
-        self.folder = folder
-        self.name = folder.name
-        self._clock = clock
-        self._alive = alive
-        self._drain: FileLock | None = None
-        self._bell = Bell()
-        self._room_bell = Bell()
-        self._synced = 0
-        self._stored = 0
-        self._failure: PycrormError | None = None
-        self._closed = False
-        self._gone = False
-        self._safe_number = 0
-        self._sync_interval_s = settings.sync_interval_ms / 1000
-        self._syncer = Syncer(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
-        with available(folder):
-            self._appender = Appender(
-                folder=folder,
-                recorder=recorder,
-                capacity=Capacity.of(settings),
-                clock=clock,
-                wake=self._syncer.wake,
-                hurry=self._syncer.hurry,
-            )
-            self._disk_was_full = self._appender.prepare()
-            self._outside = Outside(folder) if offered else None
-        self._refused = RefusedRecords(folder)
-        self._reader = Reader(recorder=recorder, start=Cursor(1, header_bytes(0), 0), load=self._load)
+        super().__init__(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
+        self._consumer = Consumer(self, self._bell)
         in_forked_child(self._forked)
         self._syncer.start()
 
@@ -100,7 +69,7 @@ class RecorderQueue:
         allocate the first segment.
         """
         Capacity.of(settings)
-        folder, alive = make_folder(spool, episode_text(recorder))
+        folder, alive = make_folder(spool, episode_text(recorder), settings.file_access)
         try:
             return cls(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
         except BaseException:
@@ -116,13 +85,15 @@ class RecorderQueue:
 
         From any thread, but not from a signal handler. Raises `SpoolFull` when less than the reserve would stay free,
         with `reserved` when nothing would, and `SpoolStuck` instead after `give_up`; `SpoolClosed` after `close` and in
-        a forked child; `SpoolUnavailable` after
-        the disk failed; `EpisodeRefused` for a start when so many episodes are open that the largest record would not
-        fit into a segment beside their names. `InternalError` for what our own hooks never put: an event of an episode
+        a forked child; `SpoolUnavailable` after the disk failed; `EpisodeRefused` for a start when no more open
+        episodes fit into a segment's header. `InternalError` for what our own hooks never put: an event of an episode
         that is not between its `EpisodeStarted` and its `EpisodeEnded`, for it could have no sequence, and a record
         above `record_bytes_max` that no segment can hold. What is refused leaves no gap.
         """
-        return self._appender.put(heading, payload, reserved)
+        try:
+            return self._appender.put(heading, payload, reserved)
+        except Relocated:  # while this thread waited for the lock
+            return self.put_nowait(heading, payload, reserved=reserved)
 
     @property
     def full(self) -> bool:
@@ -167,7 +138,7 @@ class RecorderQueue:
         if self._over or self._appender.stuck is not None or self._appender.admits_again(reserved=reserved):
             return True
         if self._outside is not None:
-            self._syncer.call_in(_LOOK_S)
+            self._syncer.call_in(LOOK_S)
         return False
 
     def _refuse_to_wait(self, *, reserved: bool) -> None:
@@ -177,32 +148,15 @@ class RecorderQueue:
     # --- positions ---------------------------------------------------------------------------------------------
 
     @property
-    def written(self) -> int:
-        """Position of the last record: all up to it survive the death of the process."""
-        return self._appender.position
-
-    @property
-    def synced(self) -> int:
-        """All up to this position survive the death of the machine."""
-        return self._synced
-
-    @property
-    def stored(self) -> int:
-        """All up to this position are acknowledged."""
-        if self._outside is None:
-            return self._stored
-        return max(self._stored, self._outside.believed(synced=self._synced).stored)
-
-    @property
-    def drained_outside(self) -> Drained | None:
-        """What the process that drains this queue says, as far as it can be true; None if it is this one."""
-        return None if self._outside is None else self._outside.believed(synced=self._synced)
-
-    @property
     def is_drained(self) -> bool:
         """Whether somebody, here or elsewhere, drains it at this moment."""
         with available(self.folder):
-            return self._drain is not None or is_locked(self.folder / DRAIN)
+            return self._consumer.drains or is_locked(self.folder / DRAIN)
+
+    @property
+    def declarations_unrepeated(self) -> int:
+        """How many declarations later segments do not begin with, because they take too much of a segment."""
+        return self._appender.declarations.unrepeated
 
     @property
     def bytes_spooled(self) -> int:
@@ -212,15 +166,43 @@ class RecorderQueue:
     async def synced_to(self, position: int | None = None) -> None:
         """Done when everything up to this position, by default all that is written, is safe on the disk.
 
-        From any loop; all who wait share one sync. Raises `SpoolUnavailable` if the disk refused, `SpoolClosed` in a
-        forked child.
+        From any loop; all who wait share one sync. Raises `SpoolUnavailable` if the disk refused, and if the files were
+        deleted or replaced meanwhile: when the queue has moved the next call succeeds. Records that were lost by it are
+        raised once by a call that comes later. `SpoolClosed` in a forked child.
         """
         target = self.written if position is None else position
-        if self._synced < target:
+        setbacks, answers = self._setbacks, self._answers
+        if self._synced >= target and not self._closed:  # nothing to sync, so the files are looked at here
+            looking = self._displaced is not None or self._missing(self._appender.segments) is not None
+        else:
+            looking = self._displaced is not None
+        if self._synced < target or looking:
+            self._asked = self._asked or looking
             self._syncer.hurry()
-            await self._bell.until(lambda: self._synced >= target or self._failure is not None)
+            await self._bell.until(
+                lambda: (
+                    self._failure is not None
+                    or self._setbacks != setbacks
+                    or (self._synced >= target and (not looking or self._answers > answers))
+                )
+            )
         if self._synced < target and self._failure is not None:
             raise self._failure
+        if self._setbacks != setbacks and self._setback is not None:
+            raise self._setback
+        if self._unreported is not None:
+            unreported, self._unreported = self._unreported, None
+            raise unreported
+
+    async def look(self) -> None:
+        """Done when the sync thread has compared its files with those in the folder, and moved if they differ."""
+        if self._gone:
+            return
+        answers, self._asked = self._answers, True
+        self._syncer.hurry()
+        await self._bell.until(
+            lambda: self._failure is not None or (self._answers > answers and self._displaced is None)
+        )
 
     # --- the consumer ------------------------------------------------------------------------------------------
 
@@ -232,22 +214,14 @@ class RecorderQueue:
         failed sync gives what had been synced before, then raises `SpoolUnavailable`. Raises it also while another
         process drains this queue.
         """
-        self._take_drain()
-        await self._bell.until(partial(self._further, self._reader.cursor.position))
-        batch = self._read(None, events_max, bytes_max)
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(age_s_max):
-                while not batch.complete and not self._drained(batch.after.position):
-                    await self._bell.until(partial(self._further, batch.after.position))
-                    batch = self._read(batch, events_max, bytes_max)
-        if not batch.records and self._failure is not None:
-            raise self._failure
-        self._reader.cursor = batch.after
-        return batch.records
+        return await self._consumer.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
 
     async def acknowledge(self, position: int) -> None:
-        """Everything up to this position is stored for good: the sync thread deletes segments that hold no more."""
-        assert position <= self._reader.cursor.position, "only what was given can be acknowledged"
+        """Everything up to this position is stored for good: segments that hold no more go (`stored.py`)."""
+        assert position <= self._consumer.reader.cursor.position, "only what was given can be acknowledged"
+        if self._log_id is None:
+            with contextlib.suppress(FilesError):
+                self._log_id = Spool(self._spool).log_id()
         self._stored = max(self._stored, position)
         if self._trimmable():
             self._syncer.hurry()
@@ -257,7 +231,7 @@ class RecorderQueue:
 
         From one thread at a time; blocks. Raises `FilesError` or `SpoolDamaged` when they can only stay here.
         """
-        self._refused.put(records)
+        self._consumer.set_aside(records)
         return True
 
     def give_up(self, reason: str) -> None:
@@ -268,116 +242,20 @@ class RecorderQueue:
         self._appender.stuck = self._appender.stuck or reason
         self._room_bell.ring()
 
-    def _read(self, begun: Batch | None, events_max: int, bytes_max: int) -> Batch:
-        with available(self.folder):
-            return self._reader.read(last=self._synced, events_max=events_max, bytes_max=bytes_max, begun=begun)
-
-    def _further(self, position: int) -> bool:
-        return self._synced > position or self._drained(position)
-
-    def _drained(self, position: int) -> bool:
+    def ends_at(self, position: int) -> bool:
         """Whether nothing will come after this position any more."""
         return self._failure is not None or (self._closed and position == self.written)
 
-    def _take_drain(self) -> None:
-        if self._drain is None and not self._gone:
-            with available(self.folder):
-                self._drain = FileLock.take(self.folder / DRAIN)
-            if self._drain is None:
-                raise SpoolUnavailable(self.folder, "is being drained by another process")
-
-    def _load(self, number: int) -> tuple[Path, Buffer]:
-        path = segment_path(self.folder, number)
-        return path, map_segment(path)
-
-    # --- the sync thread ---------------------------------------------------------------------------------------
-
-    def _turn(self) -> float | None:
-        """Syncs, deletes what is stored, makes the next segment ahead; in how many seconds to come again by itself."""
-        if self._failure is not None:
-            return None
-        try:
-            self._sync()
-            told = self._outside is None or self._exchange(self._outside)
-            self._trim()
-            full = self._prepare()
-        except OSError as error:
-            self._fail(SpoolUnavailable(self.folder, error.strerror or str(error)))
-            return None
-        except BaseException as error:
-            self._fail(InternalError(f"the sync thread of {self.folder} failed: {error!r}"))
-            raise
-        if full:
-            return self._sync_interval_s
-        waiting = self._outside is not None and (self._room_bell.awaited or len(self._appender.begun) > 1)
-        return _LOOK_S if waiting or not told else None
-
-    def _exchange(self, outside: Outside) -> bool:
-        """Tells whoever drains this queue what is synced, hears what is stored; False if it could not be told."""
-        told = self._tell(outside)
-        said = outside.believed(synced=self._synced)
-        self._stored = max(self._stored, said.stored)
-        if said.note.given_up != self._appender.stuck:
-            self._appender.stuck = said.note.given_up
-            self._room_bell.ring()
-        return told
-
-    def _sync(self) -> None:
-        span = self._appender.begin_sync()
-        if span.position == self._synced:
-            return
-        for segment in span.segments:
-            segment.sync()
-        # Only now may a commit frame say so: had it been written before, a power cut in between could leave the frame
-        # on the disk without all that it speaks of, and an ordinary tail would look like damage.
-        self._appender.append_commit(span).sync()
-        self._appender.end_sync(span)
-        self._safe_number = span.segments[-1].number
-        self._synced = span.position
-        if self._outside is not None:
-            self._tell(self._outside)  # first, so that who waited for the disk need not wait for this
-        self._bell.ring()
-
-    def _tell(self, outside: Outside) -> bool:
-        return outside.tell(synced=self._synced, closed=self._closed and self._synced == self.written)
-
-    def _trimmable(self) -> bool:
-        return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))
-
-    def _trim(self) -> None:
-        gone = self._appender.trimmable(stored=self._stored, safe_number=self._safe_number)
-        for segment in gone:
-            segment.path.unlink(missing_ok=True)
-        if gone:
-            self._appender.trimmed(gone)
-            self._room_bell.ring()
-
-    def _prepare(self) -> bool:
-        if self._closed:
-            return False
-        refused = self._appender.prepare()
-        if not refused and self._disk_was_full:
-            self._room_bell.ring()
-        self._disk_was_full = refused
-        return refused
-
-    def _fail(self, error: PycrormError) -> None:
-        self._failure = error
-        self._appender.refuse(lambda: error)
-        self._bell.ring()
-        self._room_bell.ring()
-
     # --- the end -----------------------------------------------------------------------------------------------
-
-    @property
-    def _over(self) -> bool:
-        return self._closed or self._failure is not None
 
     def close(self) -> None:
         """No more puts; a last sync begins at once. What is not given away yet still is, then `get_batch` gives []."""
         if self._closed:
             return
-        self._appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
+        appender = None
+        while appender is not self._appender:  # the sync thread may be about to replace it
+            appender = self._appender
+            appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
         self._closed = True
         self._syncer.hurry()
         self._bell.ring()
@@ -396,18 +274,27 @@ class RecorderQueue:
             raise SpoolUnavailable(self.folder, f"the last sync took more than {_LAST_SYNC_S:.0f} s")
         self._gone = True
         self._appender.close()
-        self._reader.close()
         try:
-            if self._failure is None and self.stored == self.written and not self._appender.open:
+            all_stored = self._failure is None and self.stored == self.written and not self._appender.open
+            if all_stored and self._home.is_in_place:
                 with available(self.folder):
+                    remove_made_ahead(self.folder)
+                    self._keep_rest()
                     remove_folder(self.folder)
         finally:
             if self._outside is not None:
                 self._outside.close()
-            self._refused.release()
-            for lock in (self._drain, self._alive):
-                if lock is not None:
-                    lock.release()
+            self._consumer.release()
+            for lock in (self._home.alive, *self._left):
+                lock.release()
+
+    def _keep_rest(self) -> None:
+        """What is left in the folder, all of it stored. No file is mapped any more."""
+        if self.written:
+            *full, last = self._appender.begun
+            for segment in full:
+                self._kept.keep(segment.path)
+            self._kept.keep(last.path, length=self._appender.end)
 
     def _forked(self) -> None:
         """In a forked child: the queue is the parent's. The locks' copies close by themselves."""
@@ -415,5 +302,5 @@ class RecorderQueue:
         self._failure = SpoolClosed(f"queue {self.name} belongs to the process that forked this one")
         failure = self._failure
         self._appender.abandon(lambda: failure)
-        self._reader.close()
+        self._consumer.reader.close()
         self._bell, self._room_bell = Bell(), Bell()

@@ -19,23 +19,25 @@ from typing import NamedTuple
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by, remove_folder
+from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by, remove_folder, remove_made_ahead
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.refused import RefusedRecords
 from pycrorm_async.queue.scan import Kept, Walk, scan
 from pycrorm_async.queue.sealing import make_safe
 from pycrorm_async.queue.segment import CLOSES, segment_path
+from pycrorm_async.queue.stored import StoredSegments
 
-__all__ = ["RecoveredQueue", "open_dead"]
+__all__ = ["RecoveredQueue", "computed_ends", "open_dead"]
 
 
-def open_dead(folder: Path) -> RecoveredQueue | None:
+def open_dead(folder: Path, *, stored: StoredSegments | None = None) -> RecoveredQueue | None:
     """The folder as a source, or None if its recorder lives, somebody drains it, or it is gone.
 
     None also for what was refused of a recorder whose own folder is still there: whoever drains that may put more in.
 
     Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Looks at as much of it as it takes
-    to give something. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`, holding nothing.
+    to give something. Segments whose records are all stored go to `stored`, if given. Raises `SpoolDamaged`,
+    `SpoolForeign` and `SpoolUnavailable`, holding nothing.
     """
     with available(folder):
         own = folder.with_name(folder.name.partition(".")[0])
@@ -51,7 +53,7 @@ def open_dead(folder: Path) -> RecoveredQueue | None:
                 return None
             try:
                 recorder = held_by(folder.name).recorder
-                return RecoveredQueue(folder, recorder, (drain, alive))
+                return RecoveredQueue(folder, recorder, (drain, alive), stored)
             except BaseException:
                 drain.release()
                 raise
@@ -67,7 +69,9 @@ class RecoveredQueue:
     the position acknowledged last.
     """
 
-    def __init__(self, folder: Path, recorder: EpisodeId, locks: tuple[FileLock, ...]) -> None:
+    def __init__(
+        self, folder: Path, recorder: EpisodeId, locks: tuple[FileLock, ...], stored: StoredSegments | None
+    ) -> None:
         self.folder = folder
         self.name = folder.name
         self.lost: tuple[Record, ...] = ()
@@ -79,6 +83,7 @@ class RecoveredQueue:
         while self._look_further() and self._settled == self._walk.kept.start.position:
             pass
         self._locks = locks
+        self._kept = stored
         self._refused = RefusedRecords(folder)
         self._given = self.stored = self._walk.kept.start.position
 
@@ -121,7 +126,7 @@ class RecoveredQueue:
         return batch.records
 
     async def acknowledge(self, position: int) -> None:
-        """Everything up to this position is stored for good: segments that hold no more are deleted, oldest first.
+        """Everything up to this position is stored for good: segments that hold no more go, oldest first.
 
         The last one that was looked at stays: the ends are computed from it, and the header of the next one, which says
         what is open there too, may be damaged. Raises `SpoolUnavailable`.
@@ -134,7 +139,7 @@ class RecoveredQueue:
                 following = bases.get(number + 1)
                 if following is None or following - 1 > position:
                     break
-                segment_path(self.folder, number).unlink(missing_ok=True)
+                self._forget(segment_path(self.folder, number))
 
     def set_aside(self, records: Sequence[Record]) -> bool:
         """As `RecorderQueue.set_aside`; what was refused before stays where it is."""
@@ -151,6 +156,8 @@ class RecoveredQueue:
         assert self.all_stored, "what is not acknowledged is not deleted"
         try:
             with available(self.folder):
+                remove_made_ahead(self.folder)
+                self._forget_rest()
                 remove_folder(self.folder)
         finally:
             self.release()
@@ -161,6 +168,20 @@ class RecoveredQueue:
         for lock in self._locks:
             lock.release()
 
+    def _forget(self, segment: Path, *, length: int | None = None) -> None:
+        if self._kept is None:
+            segment.unlink(missing_ok=True)
+        else:
+            self._kept.keep(segment, length=length)
+
+    def _forget_rest(self) -> None:
+        """Of the last segment what stands before the cut; one without a record is not kept."""
+        cut = self._walk.kept.cut
+        for number, base in sorted(self._walk.kept.bases.items()):
+            if base <= cut.position:
+                length = cut.offset if number == cut.number else None
+                self._forget(segment_path(self.folder, number), length=length)
+
     def _look_further(self) -> bool:
         """At the next segment, which is on the disk then; False if there is no more."""
         with available(self.folder):
@@ -170,7 +191,7 @@ class RecoveredQueue:
             if more:
                 make_safe(self.folder, [self._walk.kept.cut.number])
         if not more:
-            self.lost = _ends(self._walk.kept)
+            self.lost = computed_ends(self._walk.kept)
             self._ready += self.lost
         self._settled = self._walk.settled + len(self.lost)
         return more
@@ -192,7 +213,8 @@ class _Batch(NamedTuple):
     complete: bool
 
 
-def _ends(kept: Kept) -> tuple[Record, ...]:
+def computed_ends(kept: Kept) -> tuple[Record, ...]:
+    """An end of status LOST for each episode that is open, behind the last record."""
     return tuple(
         Record(
             position=kept.cut.position + 1 + index,

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue.file_access import create_folder
 from pycrorm_async.queue.folder import ALIVE, REFUSED, available, held_by, write_safely
 from pycrorm_async.queue.frame import EVENT, Frame, encode_span
 from pycrorm_async.queue.locks import FileLock
@@ -78,7 +80,8 @@ class _RefusedEpisode:
         self._last: Last | None = None
         self._unsaid: tuple[int, ...] = ()
         with available(self.folder):
-            self.folder.mkdir(exist_ok=True)
+            with suppress(FileExistsError):
+                create_folder(self.folder)
             alive = FileLock.take(self.folder / ALIVE)
             if alive is None:
                 raise SpoolUnavailable(self.folder, "is used by another process")

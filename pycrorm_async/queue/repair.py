@@ -10,12 +10,14 @@ the next repair goes on: what is unfinished is made anew, what is finished gets 
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from pycrorm_async.errors import InternalError, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue.file_access import create_folder, open_file
 from pycrorm_async.queue.folder import ALIVE, DRAIN, MENDED, available, held_by
 from pycrorm_async.queue.inspection import SET_ASIDE, Damage
 from pycrorm_async.queue.locks import FileLock
@@ -127,7 +129,7 @@ def _replace(folder: Path, found: Survey) -> RepairReport:
     mended = folder.with_name(f"{folder.name}{MENDED}")
     if mended.exists():  # of a repair that was killed
         shutil.rmtree(mended)
-    mended.mkdir()
+    create_folder(mended)
     try:
         rescue = _filled(mended, folder, found)
         aside = _free_name(folder)
@@ -159,7 +161,7 @@ def _replace(folder: Path, found: Survey) -> RepairReport:
 
 def _filled(mended: Path, folder: Path, found: Survey) -> Rescue:
     """What was written into the new folder, read again and safe on the disk."""
-    (mended / ALIVE).touch()
+    os.close(open_file(mended / ALIVE, os.O_WRONLY))
     rescue = Rescue(folder, mended, found)
     rescue.run()
     written = scan(mended, held_by(folder.name).recorder).cut.position

@@ -11,10 +11,11 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TypeAlias
 
+from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.folder import held_by, write_safely
 from pycrorm_async.queue.frame import COMMIT, EVENT, Frame, encode_span
-from pycrorm_async.queue.scan import Kept, Survey, whole_frames
+from pycrorm_async.queue.scan import Kept, Survey, check_record, whole_frames
 from pycrorm_async.queue.segment import (
     CLOSES,
     Last,
@@ -22,6 +23,7 @@ from pycrorm_async.queue.segment import (
     decode_header,
     encode_header,
     header_bytes,
+    read_segment,
     salt_of,
     segment_path,
 )
@@ -85,9 +87,15 @@ class Rescue:
     def _frames(self, number: int) -> Iterator[Frame]:
         """The whole frames of a segment that stand behind the damage."""
         kept = self._found.kept
-        content = segment_path(self._damaged, number).read_bytes()
+        content = read_segment(segment_path(self._damaged, number))
         start = kept.cut.offset if number == kept.cut.number and kept.bases else header_bytes(0)
-        for _, frame in whole_frames(content, start, salt_of(self._recorder, number)):
+        path = segment_path(self._damaged, number)
+        for offset, frame in whole_frames(content, start, salt_of(self._recorder, number)):
+            if frame.kind != COMMIT:
+                try:
+                    check_record(path, offset, frame)
+                except SpoolDamaged:  # the gap that it leaves is reported
+                    continue
             yield frame
 
     def _begin_without_header(self) -> None:
@@ -95,7 +103,7 @@ class Rescue:
         numbers = self._found.kept.numbers
         first: dict[EpisodeId, Frame] = {}
         for number in numbers:
-            header = decode_header(segment_path(self._damaged, number).read_bytes())
+            header = decode_header(read_segment(segment_path(self._damaged, number)))
             for episode, last in header.open.items() if header is not None else ():
                 if episode not in first:
                     self._open.setdefault(episode, last)
@@ -136,9 +144,9 @@ class Rescue:
             try:
                 os.link(source, target)
             except OSError:  # a file system without links
-                write_safely(target, source.read_bytes())
+                write_safely(target, read_segment(source))
             return
-        content, unsaid = source.read_bytes()[: cut.offset], self._found.unsaid
+        content, unsaid = read_segment(source)[: cut.offset], self._found.unsaid
         if unsaid:
             content += encode_span([], after=self.position, salt=salt_of(self._recorder, number), unsaid=unsaid)[1]
         write_safely(target, content)

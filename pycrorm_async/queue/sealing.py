@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pycrorm_async.queue.folder import TAIL, write_safely
 from pycrorm_async.queue.scan import Kept
-from pycrorm_async.queue.segment import segment_path, sync_folder
+from pycrorm_async.queue.segment import read_segment, segment_path, sync_folder
 
 __all__ = ["seal", "make_safe", "tails"]
 
@@ -51,7 +51,7 @@ def tails(folder: Path, kept: Kept) -> list[tuple[Path, bytes]]:
     """For each file that reaches behind the cut what is there, without the zeros at its end. Raises `OSError`."""
     cut = kept.cut
     return [
-        (path, path.read_bytes()[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
+        (path, read_segment(path)[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
         for number in kept.numbers
         if number >= cut.number and (path := segment_path(folder, number)).exists()
     ]

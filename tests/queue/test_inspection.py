@@ -40,12 +40,12 @@ def test_a_dead_recorders_folder_is_told_whole_and_left_as_it_is(author: Author)
     assert (report.log_id, report.set_aside, report.strangers) == ("the-log", (), ())
     [one] = report.recorders
     assert (one.name, one.alive, one.being_drained) == (episode_text(RECORDER), False, False)
-    assert (one.first, one.last, one.safe, one.records, one.episodes) == (1, 7, 6, 7, 2)
-    assert one.types == {"DesignatorTypeDeclared": 1, "EpisodeEnded": 1, "EpisodeStarted": 2, "NodeStarted": 3}
+    assert (one.first, one.last, one.safe, one.records, one.episodes) == (1, 8, 6, 8, 2)
+    assert one.types == {"DesignatorTypeDeclared": 2, "EpisodeEnded": 1, "EpisodeStarted": 2, "NodeStarted": 3}
     assert one.open == (OpenEpisode(episode_text(episode(2)), 3, WALL_NS),)
     assert [(each.file, each.bytes, each.base, each.records) for each in one.segments] == [
         ("00000001.segment", 4096, 1, 6),
-        ("00000002.segment", 4096, 7, 1),
+        ("00000002.segment", 4096, 7, 2),
     ]
     assert one.tail_bytes == len(author.segments[1].read_bytes()[offset:].rstrip(b"\0"))
     assert 0 < one.tail_bytes <= size

@@ -12,6 +12,7 @@ from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.queue import LiveQueue, RecorderQueue, RecoveredQueue, open_dead
 from pycrorm_async.queue.appender import Appender
 from pycrorm_async.queue.capacity import Capacity
+from pycrorm_async.queue.folder import MAKING
 
 WALL_NS = 1_700_000_000_123_456_789
 MONOTONIC_NS = 987_654_321
@@ -64,9 +65,12 @@ def make(spool: Path, *, settings: Settings = SMALL, clock: Clock = STILL, offer
 
 def as_left_by_a_kill(queue: RecorderQueue, spool: Path) -> Path:
     """The folder as `kill -9` would leave it now: its files, unlocked, in another spool."""
-    folder = spool / episode_text(RECORDER)
-    shutil.copytree(queue.folder, folder)
-    return folder
+    return copy_beside_recording(queue.folder, spool / episode_text(RECORDER))
+
+
+def copy_beside_recording(source: Path, target: Path) -> Path:
+    """Copy a folder of a queue that is at work, without files that its sync thread is making and may rename."""
+    return Path(shutil.copytree(source, target, ignore=shutil.ignore_patterns(f"*{MAKING}")))
 
 
 async def drain(queue: RecorderQueue | RecoveredQueue | LiveQueue, *, events_max: int = 10_000) -> list[Record]:
@@ -90,29 +94,40 @@ async def recover(folder: Path) -> list[Record]:
 class Author:
     """Writes a folder step by step, with no thread that syncs: each step of a sync is the test's own.
 
-    `records` is what was put; `places` where each stands: (file, offset, size).
+    `records` is what was put, and the declarations that a segment begins with; `places` where each stands: (file,
+    offset, size).
     """
 
-    def __init__(self, spool: Path, *, settings: Settings = SMALL) -> None:
-        self.folder = spool / episode_text(RECORDER)
+    def __init__(self, spool: Path, *, settings: Settings = SMALL, recorder: EpisodeId = RECORDER) -> None:
+        self.folder = spool / episode_text(recorder)
         self.folder.mkdir(parents=True)
         (self.folder / "alive").touch()
         self.appender = Appender(
             folder=self.folder,
-            recorder=RECORDER,
+            recorder=recorder,
             capacity=Capacity.of(settings),
             clock=STILL,
             wake=lambda: None,
             hurry=lambda: None,
+            make_room=lambda _: False,
         )
         self.records: list[Record] = []
         self.places: list[tuple[Path, int, int]] = []
+        self._declared: dict[bytes, Heading] = {}
 
     def put(self, heading: Heading, payload: bytes = b"{}") -> None:
+        if heading.episode is None:
+            self._declared[payload] = heading
         sequence = self.appender.put(heading, payload, True)
-        self.records.append(record(len(self.records) + 1, heading, sequence, payload))
-        size = 64 + -(-(len(heading.type) + len(payload)) // 8) * 8
-        self.places.append((self.appender.begun[-1].path, self.appender._offset - size, size))
+        repeated = self.appender.position - len(self.records) - 1
+        put = [(each, 0, content) for content, each in list(self._declared.items())[:repeated]]
+        put.append((heading, sequence, payload))
+        sizes = [64 + -(-(len(each.type) + len(content)) // 8) * 8 for each, _, content in put]
+        offset = self.appender._offset - sum(sizes)
+        for (each, number, content), size in zip(put, sizes, strict=True):
+            self.records.append(record(len(self.records) + 1, each, number, content))
+            self.places.append((self.appender.begun[-1].path, offset, size))
+            offset += size
 
     def sync(self) -> None:
         span = self.appender.begin_sync()

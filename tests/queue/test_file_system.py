@@ -1,0 +1,72 @@
+"""A spool is refused, in one line and before anything is made, where a full disk would kill the plan."""
+
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory
+from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.queue import file_system
+from pycrorm_async.queue.file_system import check_file_system, file_system_type
+from tests.memory.notes import NoteActionPerformable, texts
+from tests.queue.writing import make
+
+BTRFS = 0x9123683E
+
+
+@pytest.fixture(params=["mounted", "simulated"])
+def btrfs(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A btrfs of its own, and a folder that is said to be one, for machines that cannot make or mount one."""
+    disk, image = tmp_path / "disk", tmp_path / "disk.img"
+    disk.mkdir()
+    if request.param == "mounted" and shutil.which("mkfs.btrfs"):
+        subprocess.run(["truncate", "-s", "128M", image], check=True)
+        subprocess.run(["mkfs.btrfs", "-q", image], check=True, capture_output=True)
+        mount = ["mount", "-o", "loop", str(image), str(disk)]
+        if subprocess.run(mount, capture_output=True, check=False).returncode == 0:
+            yield disk
+            subprocess.run(["umount", "--lazy", str(disk)], check=True)  # also where a failed test left a queue open
+            return
+
+    def said_to_be(path: Path) -> int:
+        return BTRFS if path.is_relative_to(disk) else file_system_type(path)
+
+    monkeypatch.setattr(file_system, "file_system_type", said_to_be)
+    yield disk
+
+
+async def test_a_spool_on_btrfs_is_refused_in_one_line_that_says_where_it_may_lie(btrfs: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{btrfs / 'memory.db'}"
+    for spool in (btrfs / "spool", btrfs / "not" / "there"):
+        with pytest.raises(
+            SpoolUnavailable, match=r"lies on btrfs, .*: name a folder on ext4, XFS or tmpfs"
+        ) as refused:
+            make(spool)
+        assert "\n" not in str(refused.value)
+        assert not spool.exists()
+    with pytest.raises(SpoolUnavailable, match="lies on btrfs"):
+        async with Memory.open(url):
+            pass
+    async with Memory.open(url, spool=tmp_path / "spool") as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.flush()
+        assert await texts(memory) == ["a"]
+
+
+def test_the_file_systems_of_robots_are_not_refused(tmp_path: Path) -> None:
+    for place in (tmp_path, Path("/dev/shm"), Path("/"), tmp_path / "not" / "there"):
+        check_file_system(place)
+    assert file_system_type(Path("/dev/shm")) == 0x01021994  # tmpfs
+    assert file_system_type(tmp_path / "gone") == 0
+
+
+@pytest.mark.parametrize(("kind", "name"), [(0x6969, "NFS"), (0xFF534D42, "CIFS"), (0x2FC12FC1, "ZFS")])
+def test_others_are_refused_by_their_name(
+    tmp_path: Path, kind: int, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(file_system, "file_system_type", lambda _: kind)
+    with pytest.raises(SpoolUnavailable, match=f"lies on {name}, where"):
+        check_file_system(tmp_path / "spool")
