@@ -22,6 +22,7 @@ __all__ = [
     "UnknownShape",
     "Decoder",
     "encode",
+    "encoded_bytes",
     "decode",
     "fingerprint",
     "declaration_of",
@@ -120,6 +121,17 @@ def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
     if len(payload) > bytes_max:
         raise NotEncodable("", f"takes {len(payload):,} bytes, {bytes_max:,} are allowed (record_bytes_max)")
     return payload
+
+
+def encoded_bytes(value: Any) -> int:
+    """How many bytes a part of an event takes. Raises `NotEncodable`."""
+    fault = _first_fault(value)
+    if fault is not None:
+        raise fault
+    try:
+        return len(_encoder.encode(value))
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise NotEncodable("", str(error)) from None
 
 
 def fingerprint(declaration: bytes) -> str:

@@ -178,6 +178,7 @@ class EpisodeStarted(Happening, frozen=True):
         world: described in a line.
         simulated: it is thought through in a copy of the world, and nothing of it happens.
         thought_by: the node that thinks it through.
+        continues: UUID of the episode that reached its last sequence, and of which this one is the rest.
     """
 
     description: str
@@ -190,13 +191,18 @@ class EpisodeStarted(Happening, frozen=True):
     seed: int | None = None
     simulated: bool = False
     thought_by: NodeReference | None = None
+    continues: str | None = None
 
 
 class EpisodeEnded(Happening, frozen=True):
-    """The last event of an episode. Status LOST is written by recovery, never by a plan."""
+    """The last event of an episode. Status LOST is written by recovery, never by a plan.
+
+    `continued_in` is the UUID of the episode that is its rest, if it reached its last sequence.
+    """
 
     status: EpisodeStatus
     failure: FailureValue | None = None
+    continued_in: str | None = None
 
 
 class DesignatorTypeDeclared(Happening, frozen=True):
@@ -283,12 +289,14 @@ class NodeStarted(Happening, frozen=True):
     Attributes:
         kind: root, action, motion, language.
         parent: the parent's sequence; None for the root.
-        designator: fingerprint of the `DesignatorTypeDeclared`; None for the root.
+        designator: fingerprint of the `DesignatorTypeDeclared`; None for the root, and for a node whose class cannot be
+            declared.
         parameters: by `FieldDeclared.name`: scalars; enum members by name; datetimes as RFC 3339 in UTC with µs;
             poses as `PoseValue`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of these; a
-            `MissingValue` where the caller chose to record what cannot be recorded as missing.
+            `MissingValue` for what cannot be recorded, also for fields that the declaration leaves out.
         robot: at this moment; None without a robot.
         simulated: thought through in a copy of the world; so are all nodes of its episode.
+        continues: in an episode that continues another, the sequence there of the node of which this one is the rest.
     """
 
     kind: NodeKind
@@ -297,6 +305,7 @@ class NodeStarted(Happening, frozen=True):
     parameters: dict[str, Any] = {}
     robot: RobotValue | None = None
     simulated: bool = False
+    continues: int | None = None
 
 
 class NodeEnded(Happening, frozen=True):

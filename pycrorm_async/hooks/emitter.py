@@ -12,13 +12,18 @@ from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.happenings import Happening
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.hooks.missing import MissingValues
 from pycrorm_async.hooks.ports import EventSink
+from pycrorm_async.hooks.texts import clean, cut, message_of
 
 __all__ = ["Emitter", "Faults"]
 
 _log = logging.getLogger("pycrorm_async")
 _BLOCK_S = 1.0
 _OUR_THREADS = "pycrorm "
+_REASON_MAX = 2_000
+UNAWAITED_MAX = 100
+"""Designator types that are named; the latest, if there are more."""
 
 
 class Faults(NamedTuple):
@@ -41,6 +46,9 @@ class Emitter:
         self.settings = settings
         self.over = False
         """Whether the memory is closed, or belongs to the process that forked this one: nothing is told any more."""
+        self.missing = MissingValues()
+        self.unawaited: tuple[str, ...] = ()
+        """For each designator type whose perform was called and never awaited: a sentence that says so."""
         self._fault_count = 0
         self._last_fault: str | None = None
 
@@ -71,10 +79,19 @@ class Emitter:
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
         return self.sink.put_nowait(Heading(episode, kind.__name__, kind.version), payload)
 
+    def note_unawaited(self, dtype: str) -> None:
+        """A perform of the plan that never ran: counted among the faults, and named."""
+        text = f"{dtype}.perform() was called and never awaited, so it did not run: write `await`"
+        self._fault_count += 1
+        self._last_fault = text
+        if text not in self.unawaited:
+            self.unawaited = (*self.unawaited[1 - UNAWAITED_MAX :], text)
+            _log.warning("%s", text)
+
     def note_fault(self, where: str, error: BaseException) -> None:
         """A fault of ours: counted, kept, logged once in a while, never raised into the plan."""
         self._fault_count += 1
-        self._last_fault = f"{where}: {type(error).__name__}: {error}"
+        self._last_fault = f"{where}: {type(error).__name__}: {cut(clean(message_of(error)), _REASON_MAX)}"
         if self._fault_count & (self._fault_count - 1) == 0:
             _log.error("not recorded (%d so far): %s", self._fault_count, self._last_fault)
             _log.debug("where it happened", exc_info=error)

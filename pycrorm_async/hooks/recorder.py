@@ -1,14 +1,17 @@
 """The memory as plans and worlds meet it: finds the episode an observation belongs to and hands it on.
 
-Three things may reach a plan, all by the caller's choice or fault: `SpoolFull` (`on_full="fail"`), `Unrecordable` and
-`DeclarationRefused` (before `perform` runs), `EpisodeRefused`. Every fault of ours is counted and stays here.
+A plan that runs without a memory runs with one. What reaches it, before `perform` runs, is the caller's choice alone:
+`SpoolFull` with `on_full="fail"`, `Unrecordable` and `DeclarationRefused` with `on_unrecordable="refuse"`. What cannot
+be recorded otherwise is recorded as missing, and every fault of ours is counted and stays here.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import nullcontext
 from contextvars import ContextVar
 from typing import Literal
 
@@ -20,17 +23,19 @@ from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode, EpisodeOpening, NodeRecord, current_task
+from pycrorm_async.hooks.fitting import EPISODE_TEXT_MAX
 from pycrorm_async.hooks.sampler import Sampler
 from pycrorm_async.plan.ports import Candidate, Seen, Thought, thinking
 from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.plan.unawaited import CalledPerforms
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.watch import current_world
 
 __all__ = ["Recorder", "current_episode"]
 
+_log = logging.getLogger("pycrorm_async")
 RECENT_MAX = 100
-TEXT_MAX = 10_000
 
 current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
 
@@ -50,11 +55,16 @@ class Recorder:
         self._clock = clock
         self._software = software
         self._randomness = randomness
-        self._declarations = Declarations()
+        self._strict = emitter.settings.on_unrecordable == "refuse"
+        self._declarations = Declarations(strict=self._strict)
         self._sampler = _sampler_of(emitter)
+        self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "dtype", "it")))
+        """Performs that were called outside any episode."""
         self._open: dict[EpisodeId, Episode] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
         self.opened_count = 0
+        self.continued_count = 0
+        self._continuing: set[EpisodeId] = set()
 
     @property
     def over(self) -> bool:
@@ -70,7 +80,7 @@ class Recorder:
             raise EpisodeRefused(
                 f"episode {open_here} is open in this task already: end it first, or open the second in its own task"
             )
-        _check_arguments(description=description, plan=plan, seed=seed)
+        _check_arguments(description=description, plan=plan, seed=seed, strict=self._strict)
         return self._begin(description, plan=plan, seed=seed)
 
     def _begin(self, description: str, *, plan: str | None = None, seed: int | None = None) -> Episode:
@@ -88,12 +98,44 @@ class Recorder:
         )
         episode = Episode(self._emitter, name, opening)
         self._open[name] = episode
-        if not episode.simulated:
-            self._recent.append(name)
-            self.opened_count += 1
+        self._note_opened(episode)
         if world is not None:
-            episode.enter_world(world)
+            self._enter(episode, world)
         return episode
+
+    def _enter(self, episode: Episode, world: BulletWorld) -> None:
+        episode.enter_world(world, lambda: self._continue(episode))
+
+    def _continue(self, episode: Episode) -> None:
+        """Go on with an episode that comes near its last sequence in a follow-up. A fault of ours is counted."""
+        if episode.id in self._continuing or self._emitter.over:
+            return
+        former, name = episode.id, episode_id(self._clock.wall_ns(), self._randomness(10))
+        self._continuing.add(former)
+        self._open[name] = episode
+        try:
+            with self._sampler.renumbering(episode) if self._sampler is not None else nullcontext() as renumber:
+                renumbered = episode.continue_as(name, self._declared)
+                if renumber is not None:
+                    renumber(renumbered)
+        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            self._emitter.note_fault("EpisodeStarted", error)
+        finally:
+            self._open.pop(former if episode.id == name else name, None)
+            self._continuing.discard(former)
+        if episode.id == name:
+            self.continued_count += 1
+            self._note_opened(episode)
+            _log.info("episode %s came near its last sequence and goes on in episode %s", episode_text(former), episode)
+
+    def _declared(self, node: TaskTreeNode) -> DeclaredType:
+        assert node.designator is not None
+        return self._declarations.of(type(node.designator), self._declare)
+
+    def _note_opened(self, episode: Episode) -> None:
+        if not episode.simulated:
+            self._recent.append(episode.id)
+            self.opened_count += 1
 
     def close_episode(self, episode: Episode, failure: BaseException | None) -> None:
         """Its last event. A fault of ours is counted, not raised."""
@@ -114,6 +156,7 @@ class Recorder:
 
     def close(self) -> None:
         """The memory is over, and so is the sampling."""
+        self.calls.close()
         if self._sampler is not None:
             self._sampler.close()
 
@@ -153,10 +196,10 @@ class Recorder:
             declared = self._declarations.of(type(node.designator), self._declare)
             episode = self._open_here()
             if episode is None:
-                name = declared.declaration.dtype
+                name = declared.dtype
                 episode = implicit = self.open_episode(description=name, plan=name)
             sequence = episode.start_node(node, declared)
-        except (Unrecordable, DeclarationRefused, EpisodeRefused) as refused:
+        except (Unrecordable, DeclarationRefused) as refused:
             if implicit is not None:
                 self.close_episode(implicit, refused)
             raise
@@ -165,11 +208,15 @@ class Recorder:
             if implicit is not None:
                 self.close_episode(implicit, error)
         else:
-            node.record = NodeRecord(episode, sequence, implicit is not None, before)
+            node.record = NodeRecord(episode, sequence, implicit is not None, before, episode.id)
             if implicit is not None:
                 current_episode.set(implicit)
-            if self._sampler is not None and node.kind == "motion":
+            if declared.fault is not None:
+                self._emitter.missing.note(declared.dtype, "type", declared.fault)
+            if self._sampler is not None and node.kind == "motion" and episode.in_its_world:
                 self._sample(self._sampler.begin, node.record)
+            if sequence >= episode.continue_at:
+                self._continue(episode)
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
@@ -194,9 +241,12 @@ class Recorder:
         if episode is None or self._emitter.over:
             return
         try:
-            episode.locate(location=location, offered=offered, taken=taken, considered=considered, node=node)
+            sequence = episode.locate(location=location, offered=offered, taken=taken, considered=considered, node=node)
         except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
             self._emitter.note_fault("LocationResolved", error)
+        else:
+            if sequence >= episode.continue_at:
+                self._continue(episode)
 
     def object_detected(
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
@@ -206,9 +256,12 @@ class Recorder:
         if episode is None or self._emitter.over:
             return
         try:
-            episode.detect(source=source, object_type=object_type, seen=seen, node=node)
+            sequence = episode.detect(source=source, object_type=object_type, seen=seen, node=node)
         except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
             self._emitter.note_fault("ObjectDetected", error)
+        else:
+            if sequence >= episode.continue_at:
+                self._continue(episode)
 
     def thought_began(self, thought: Thought) -> None:
         if self._emitter.over:
@@ -245,8 +298,12 @@ class Recorder:
 
     def world_entered(self, world: BulletWorld) -> None:
         episode = self._open_here()
-        if episode is not None and not self._emitter.over:
-            episode.enter_world(world)
+        if episode is None or self._emitter.over:
+            return
+        try:
+            self._enter(episode, world)
+        except Exception as error:  # noqa: BLE001  a fault of ours never keeps a world from being entered
+            self._emitter.note_fault("entering a world", error)
 
     def world_left(self, world: BulletWorld) -> None:
         episode = self._open_here()
@@ -283,16 +340,19 @@ def _thinker(thought: Thought | None) -> NodeReference | None:
 
 def _description_of(thought: Thought) -> str:
     if thought.description is not None:
-        return thought.description[:TEXT_MAX]
+        return thought.description[:EPISODE_TEXT_MAX]
     if thought.by is not None and thought.by.designator is not None:
         return f"thinking in {thought.by.designator.dtype}"
     return "thinking"
 
 
-def _check_arguments(*, description: object, plan: object, seed: object) -> None:
-    """What an episode is opened with must fit its columns. Raises `CallerError` naming the argument."""
+def _check_arguments(*, description: object, plan: object, seed: object, strict: bool) -> None:
+    """What an episode is opened with must fit its columns. Raises `CallerError` naming the argument.
+
+    A text that is too long is cut, and in strict mode refused.
+    """
     for name, text in (("plan", plan), ("description", description)):
-        if text is not None and not (isinstance(text, str) and len(text) <= TEXT_MAX):
-            raise CallerError(f"the {name} of an episode must be a str of at most {TEXT_MAX:,} characters")
+        if text is not None and not (isinstance(text, str) and (len(text) <= EPISODE_TEXT_MAX or not strict)):
+            raise CallerError(f"the {name} of an episode must be a str of at most {EPISODE_TEXT_MAX:,} characters")
     if seed is not None and not (isinstance(seed, int) and -(2**63) <= seed < 2**63):
         raise CallerError(f"the seed of an episode must be an int of at most 64 bits, not {seed!r:.100}")

@@ -13,6 +13,8 @@ since the last that was written.
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 from pycrorm_async.errors import SpoolFull, SpoolStuck
 from pycrorm_async.events.happenings import StateSampled
@@ -31,6 +33,8 @@ class _Motion:
         self.node = node
         self.robot: Object | None = None
         self.written: dict[str, float] = {}
+        self.is_full = False
+        """Whether its episode is to be continued first: samples between its first and its last are left out."""
         self.over = False
 
 
@@ -40,7 +44,7 @@ class Sampler:
     `begin` and `end` are called in the thread of the plan. No sample of a motion is written after its `end`.
 
     Attributes:
-        left_out: how many samples the spool had no room for.
+        left_out: how many samples the spool, or the episode, had no room for.
     """
 
     def __init__(self, emitter: Emitter, *, interval_ms: int, change_min: float) -> None:
@@ -85,6 +89,25 @@ class Sampler:
             for key in [key for key in self._running if key[0] is episode]:
                 self._running.pop(key).over = True
 
+    @contextmanager
+    def renumbering(self, episode: Episode) -> Iterator[Callable[[Mapping[int, int]], None]]:
+        """Take no sample while the episode is continued; give a function that takes the new sequences of its nodes.
+
+        The first sample afterwards holds all channels, because samples are told by what their own episode holds.
+        """
+        with self._changed:
+            yield lambda renumbered: self._renumber(episode, renumbered)
+
+    def _renumber(self, episode: Episode, renumbered: Mapping[int, int]) -> None:
+        for key in [key for key in self._running if key[0] is episode]:
+            motion = self._running.pop(key)
+            node = renumbered.get(motion.node)
+            if node is None:
+                motion.over = True
+                continue
+            motion.node, motion.robot, motion.is_full = node, None, False
+            self._running[episode, node] = motion
+
     def close(self) -> None:
         """No sample is taken any more; waits for the thread."""
         with self._changed:
@@ -106,6 +129,9 @@ class Sampler:
                     continue
                 self._changed.wait(self._interval_s)
                 for motion in tuple(self._running.values()):
+                    if motion.is_full:
+                        self.left_out += 1
+                        continue
                     try:
                         self._sample(motion, margin=self._change_min)
                     except Exception as error:  # noqa: BLE001  the next sample may be taken all the same
@@ -129,10 +155,11 @@ class Sampler:
         if not changed or motion.over or self._emitter.over:
             return
         try:
-            self._emitter.offer(motion.episode.id, StateSampled(reference, changed, motion.node))
+            sequence = self._emitter.offer(motion.episode.id, StateSampled(reference, changed, motion.node))
         except (SpoolFull, SpoolStuck):
             self.left_out += 1
             return
+        motion.is_full = sequence >= motion.episode.continue_at
         before.update(changed)
         seen.sampled.setdefault(robot, {}).update(changed)
 

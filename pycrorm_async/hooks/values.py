@@ -1,14 +1,17 @@
 """The border: live values become frozen ones, copied at the moment they are seen.
 
 A parameter that cannot be written down without changing its meaning raises `Unwritable` with the reason. Results,
-arguments of failures and texts of the world never raise: what cannot be recorded becomes a `MissingValue`.
+arguments of failures and texts of the world never raise: what cannot be recorded becomes a `MissingValue`. The code of
+a value's class runs here (`__float__`, `__repr__`, properties) and may raise anything, so every exception but Ctrl-C is
+the reason why that value is missing. Reading a value is bounded in depth and in items, so a structure that holds itself
+ends as well.
 """
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from enum import Enum
 from typing import Any, Literal, Protocol, TypeAlias
@@ -24,6 +27,7 @@ from pycrorm_async.events.happenings import (
     ObjectValue,
     PoseValue,
 )
+from pycrorm_async.hooks.texts import clean, clean_repr, cut, message_of, reading_fault
 from pycrorm_async.plan.objects import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
 from pycrorm_async.plan.outcome import Outcome
 from pycrorm_async.world.objects import Object
@@ -37,9 +41,8 @@ __all__ = [
     "written",
     "written_or_missing",
     "failure_value",
-    "message_of",
-    "clean",
-    "clean_repr",
+    "missing_in",
+    "missing_value",
 ]
 
 OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
@@ -48,9 +51,12 @@ OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
 ObjectDtype: TypeAlias = Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
 
 _TEXT_MAX = 2_000
-_REPR_MAX = 200
+_REASON_MAX = 500
+_NAME_MAX = 500
 _DEPTH_MAX = 8
 _GROUP_MAX = 100
+ITEMS_MAX = 2**19
+"""Items of one value. Each takes two bytes at least, so that many are above the usual `record_bytes_max`."""
 
 
 class Unwritable(ValueError):
@@ -76,13 +82,14 @@ def written(field: FieldDeclared, enum: type[Enum] | None, value: Any, reference
         if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
             raise Unwritable(f"{_a(value)} stands where a list was declared")
         scalar = _WRITERS[field.item or "text"]
-        return [scalar(each, enum, references) if each is not None else None for each in value]
+        return [scalar(each, enum, references) if each is not None else None for each in _bounded(value, value)]
     if field.type == "dict":
         if not isinstance(value, Mapping):
             raise Unwritable(f"{_a(value)} stands where a dict was declared")
         scalar = _WRITERS[field.item or "text"]
         entries = {
-            _key(key): scalar(each, enum, references) if each is not None else None for key, each in value.items()
+            _key(key): scalar(each, enum, references) if each is not None else None
+            for key, each in _bounded(value, value.items())
         }
         if len(entries) < len(value):
             raise Unwritable("two keys of the dict have the same text")
@@ -93,21 +100,52 @@ def written(field: FieldDeclared, enum: type[Enum] | None, value: Any, reference
 def written_or_missing(value: Any, references: References) -> Any:
     """Any value as JSON, as far as it can be; a `MissingValue` where it cannot. Never raises."""
     try:
-        return _any(value, references, 0)
+        return _Freely(references).read(value, 0)
     except Unwritable as reason:
-        return MissingValue(str(reason), clean_repr(value))
-    except Exception as error:  # noqa: BLE001  a user's __repr__, __iter__ or property may raise anything
-        return MissingValue(f"reading it raised {type(error).__name__}", clean_repr(value))
+        return missing_value(str(reason), value)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # noqa: BLE001  a user's __iter__ or property may raise anything
+        return missing_value(reading_fault(error), value)
+
+
+def missing_value(reason: str, value: Any) -> MissingValue:
+    """What stands for a value that cannot be recorded."""
+    return MissingValue(cut(clean(reason), _REASON_MAX), clean_repr(value))
+
+
+def missing_in(value: Any) -> Iterator[MissingValue]:
+    """Each `MissingValue` in what was written."""
+    if isinstance(value, MissingValue):
+        yield value
+    elif isinstance(value, list | dict):
+        for each in value.values() if isinstance(value, dict) else value:
+            yield from missing_in(each)
 
 
 def failure_value(failure: BaseException, references: References) -> FailureValue:
     """Class, message and arguments of an exception. Never raises."""
-    kind = type(failure)
     return FailureValue(
-        type=f"{kind.__module__}.{kind.__qualname__}",
-        message=clean(message_of(failure))[:_TEXT_MAX],
-        arguments=_arguments(failure, references, 0),
+        type=cut(_path_of(type(failure)), _NAME_MAX),
+        message=cut(clean(message_of(failure)), _TEXT_MAX),
+        arguments=_arguments_or_missing(failure, references),
     )
+
+
+def _path_of(kind: type) -> str:
+    try:
+        return clean(f"{kind.__module__}.{kind.__qualname__}")
+    except Exception as error:  # noqa: BLE001  a metaclass may raise anything
+        return f"<an exception whose class has no name: {type(error).__name__}>"
+
+
+def _arguments_or_missing(failure: BaseException, references: References) -> list[Any]:
+    try:
+        return _arguments(failure, references, 0)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # noqa: BLE001  `args` may be a property that raises anything
+        return [MissingValue(reading_fault(error))]
 
 
 def _arguments(failure: BaseException, references: References, depth: int) -> list[Any]:
@@ -115,37 +153,16 @@ def _arguments(failure: BaseException, references: References, depth: int) -> li
     if not isinstance(failure, BaseExceptionGroup):
         return [written_or_missing(each, references) for each in failure.args]
     if depth > _DEPTH_MAX:
-        return [MissingValue(f"it is nested more than {_DEPTH_MAX} deep", clean_repr(failure))]
+        return [missing_value(f"it is nested more than {_DEPTH_MAX} deep", failure)]
     inside = [
         {
-            "type": type(each).__name__,
-            "message": clean(message_of(each))[:_REPR_MAX],
+            "type": cut(_path_of(type(each)).rpartition(".")[2], _NAME_MAX),
+            "message": cut(clean(message_of(each)), _REASON_MAX),
             "arguments": _arguments(each, references, depth + 1),
         }
         for each in failure.exceptions[:_GROUP_MAX]
     ]
-    return [clean(str(failure.message))[:_TEXT_MAX], inside]
-
-
-def message_of(failure: BaseException) -> str:
-    """The text of an exception. Never raises."""
-    try:
-        return str(failure)
-    except Exception as error:  # noqa: BLE001  a user's __str__ may raise anything
-        return f"<its message could not be made: {type(error).__name__}>"
-
-
-def clean(text: str) -> str:
-    """The text without what the log cannot hold: U+0000 and lone surrogates become escapes."""
-    return text.replace("\x00", "\\x00").encode("utf-8", "backslashreplace").decode()
-
-
-def clean_repr(value: Any) -> str:
-    """A cut repr for people."""
-    try:
-        return clean(repr(value))[:_REPR_MAX]
-    except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything
-        return f"<a {type(value).__name__} whose repr raised {type(error).__name__}>"
+    return [cut(clean(str(failure.message)), _TEXT_MAX), inside]
 
 
 # --- one writer per declared type ---------------------------------------------------------------------------------
@@ -200,7 +217,7 @@ def _member(value: Any, enum: type[Enum] | None, _references: References) -> str
     name = value.name
     if not isinstance(name, str):
         raise Unwritable(f"{clean_repr(value)} has no name in {type(value).__name__}")
-    return name
+    return str(_checked(name))
 
 
 def _pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
@@ -291,27 +308,75 @@ def _checked(value: Any) -> Any:
     return value
 
 
-def _any(value: Any, references: References, depth: int) -> Any:
-    if depth > _DEPTH_MAX:
-        raise Unwritable(f"it is nested more than {_DEPTH_MAX} deep")
-    if isinstance(value, Enum):
-        return value.name
-    if value is None or isinstance(value, bool | np.bool_):
-        return None if value is None else bool(value)
-    if isinstance(value, str | int | float):
-        return _checked(value)
-    if isinstance(value, np.generic):
-        return _any(value.item(), references, depth + 1)
-    for kind, writer in ((Pose, _pose), (datetime, _datetime), (OBJECT_TYPES, _object)):
-        if isinstance(value, kind):
-            return writer(value, None, references)
-    if isinstance(value, Outcome):
-        value = value.in_brief()
-    if isinstance(value, Mapping):
-        return {_key(key): _any(each, references, depth + 1) for key, each in value.items()}
-    if isinstance(value, list | tuple | np.ndarray):
-        return [_any(each, references, depth + 1) for each in value]
-    raise Unwritable(f"{_a(value)} has no form in JSON")
+def _bounded(holder: Any, items: Iterable[Any]) -> Iterable[Any]:
+    """The items, if there are not too many. Raises `Unwritable`."""
+    if len(holder) > ITEMS_MAX:
+        raise Unwritable(f"it holds {len(holder):,} items, {ITEMS_MAX:,} are the most")
+    return items if type(holder) in _HONEST else _counted(items)
+
+
+_HONEST = (list, tuple, dict, np.ndarray)
+"""Their length is what iterating them gives; a class of the user's own may go on for ever."""
+
+
+def _counted(items: Iterable[Any]) -> Iterator[Any]:
+    for number, each in enumerate(items):
+        if number == ITEMS_MAX:
+            raise Unwritable(f"it holds more than {ITEMS_MAX:,} items")
+        yield each
+
+
+class _Freely:
+    """Reads a value of no declared type, as far as JSON can hold it. Raises `Unwritable`."""
+
+    def __init__(self, references: References) -> None:
+        self._references = references
+        self._left = ITEMS_MAX
+        self._around: set[int] = set()
+
+    def read(self, value: Any, depth: int) -> Any:
+        self._left -= 1
+        if self._left < 0:
+            raise Unwritable(f"it holds more than {ITEMS_MAX:,} items")
+        if depth > _DEPTH_MAX:
+            raise Unwritable(f"it is nested more than {_DEPTH_MAX} deep")
+        if isinstance(value, Enum):
+            return _checked(value.name)
+        if value is None or isinstance(value, bool | np.bool_):
+            return None if value is None else bool(value)
+        if isinstance(value, str | int | float):
+            return _checked(_plainly(value))
+        if isinstance(value, np.generic):
+            return self.read(value.item(), depth + 1)
+        for kind, writer in ((Pose, _pose), (datetime, _datetime), (OBJECT_TYPES, _object)):
+            if isinstance(value, kind):
+                return writer(value, None, self._references)
+        if isinstance(value, Outcome):
+            value = value.in_brief()
+        if isinstance(value, Mapping | list | tuple | np.ndarray):
+            return self._container(value, depth)
+        raise Unwritable(f"{_a(value)} has no form in JSON")
+
+    def _container(self, value: Any, depth: int) -> Any:
+        if id(value) in self._around:
+            raise Unwritable("it holds itself")
+        self._around.add(id(value))
+        written: Any
+        if isinstance(value, Mapping):
+            written = {_key(key): self.read(each, depth + 1) for key, each in value.items()}
+        else:
+            written = [self.read(each, depth + 1) for each in value]
+        self._around.discard(id(value))
+        return written
+
+
+def _plainly(value: str | float) -> str | int | float:
+    """The value as one of the built-in types, whose form in JSON no subclass can change."""
+    if isinstance(value, str):
+        return str.__str__(value)
+    if isinstance(value, float):
+        return float.__float__(value)
+    return _integer(value, None, _NOBODY)
 
 
 def _a(value: Any) -> str:

@@ -6,8 +6,10 @@ An object's identity is the sequence of its `ObjectAdded`; its row in force that
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping
 
+from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.happenings import (
     Happening,
     JointsMoved,
@@ -22,7 +24,9 @@ from pycrorm_async.events.happenings import (
 )
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.hooks.emitter import Emitter
-from pycrorm_async.hooks.values import clean, pose_value
+from pycrorm_async.hooks.fitting import with_plain_texts
+from pycrorm_async.hooks.texts import clean
+from pycrorm_async.hooks.values import pose_value
 from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.copying import counterpart, related
@@ -37,10 +41,17 @@ class WorldRecorder:
 
     Attributes:
         sampled: by robot, what the episode's samples of its state said last, channel by channel.
+        last: the sequence of what it recorded last.
+        continue_at: a change that gets this sequence, or a later one, calls `continue_`.
     """
 
-    def __init__(self, emitter: Emitter, episode: EpisodeId, world: BulletWorld) -> None:
+    def __init__(
+        self, emitter: Emitter, episode: EpisodeId, world: BulletWorld, continue_: Callable[[], None] = lambda: None
+    ) -> None:
         self.world = world
+        self.last = 0
+        self.continue_at = sys.maxsize  # not before all that is there was recorded
+        self.continue_ = continue_
         self.sampled: dict[Object, dict[str, float]] = {}
         self._emitter = emitter
         self._episode = episode
@@ -55,6 +66,7 @@ class WorldRecorder:
 
     def empty(self) -> None:
         """The world is gone, and so is all that was in it."""
+        self.continue_at = sys.maxsize  # a follow-up would begin with what is being removed
         for each in tuple(self._references):
             self.object_removed(each)
 
@@ -90,17 +102,16 @@ class WorldRecorder:
     # --- the world's observer ---------------------------------------------------------------------------------
 
     def object_added(self, added: Object) -> None:
-        sequence = self._put(
+        self._put(
             lambda: ObjectAdded(
                 clean(added.name),
                 added.object_type.name,
                 pose_value(added.pose),
                 dict(added.joint_positions()),
                 self._node(),
-            )
+            ),
+            row_of=added,
         )
-        if sequence is not None:
-            self._references[added] = ObjectReference(sequence, sequence)
 
     def object_removed(self, removed: Object) -> None:
         reference = self._references.pop(removed, None)
@@ -111,13 +122,13 @@ class WorldRecorder:
         reference = self._references.get(moved)
         if reference is None:
             return
-        sequence = self._put(
+        self._put(
             lambda: ObjectMoved(
                 reference.object, clean(moved.name), moved.object_type.name, pose_value(moved.pose), self._node()
-            )
+            ),
+            row_of=moved,
+            identity=reference.object,
         )
-        if sequence is not None:
-            self._references[moved] = ObjectReference(reference.object, sequence)
 
     def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
         reference = self._references.get(moved)
@@ -143,17 +154,30 @@ class WorldRecorder:
         node = current_node.get()
         while node is not None and node.record is None:
             node = node.parent
-        if node is not None and node.record.episode.id == self._episode:
+        if node is not None and node.record.part == self._episode:
             sequence: int = node.record.sequence
             return sequence
         return None
 
-    def _put(self, made: Callable[[], Happening]) -> int | None:
-        """Makes the event and writes it down; whatever goes wrong is counted, and the world's setter goes on."""
+    def _put(self, made: Callable[[], Happening], *, row_of: Object | None = None, identity: int | None = None) -> None:
+        """Make the event and record it; a fault is counted, and the world's setter goes on.
+
+        The event is the row in force of the object `row_of`, whose identity is this one, or the event itself.
+        """
         if self._emitter.over:
-            return None
+            return
         try:
-            return self._emitter.put(self._episode, made())
+            event = made()
+            try:
+                sequence = self._emitter.put(self._episode, event)
+            except NotEncodable as unencodable:
+                self._emitter.missing.note(type(event).__name__, "value", str(unencodable))
+                sequence = self._emitter.put(self._episode, with_plain_texts(event))
+            self.last = sequence
         except Exception as error:  # noqa: BLE001  a world's setter never fails because of a memory
             self._emitter.note_fault("a change of the world", error)
-            return None
+            return
+        if row_of is not None:
+            self._references[row_of] = ObjectReference(sequence if identity is None else identity, sequence)
+        if sequence >= self.continue_at:
+            self.continue_()

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar
 
 from pycrorm_async.plan.actions import (
     LookAtActionPerformable,
@@ -23,6 +23,7 @@ from pycrorm_async.plan.actions import (
     SetGripperActionPerformable,
 )
 from pycrorm_async.plan.composing import Composable
+from pycrorm_async.plan.errors import NotResolved
 from pycrorm_async.plan.failures import IllPosedGoalFailure
 from pycrorm_async.plan.fetching import DetectActionPerformable, TransportActionPerformable
 from pycrorm_async.plan.manipulation import (
@@ -70,6 +71,13 @@ class ActionDescription(Composable, Generic[P]):
     def __init__(self, performable: Callable[..., P], **alternatives: Any) -> None:
         self._performable = performable
         self._alternatives = {name: _among(each) for name, each in alternatives.items()}
+
+    if not TYPE_CHECKING:  # a type checker finds the fault by itself
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name == "perform" or name in self.__dict__.get("_alternatives", ()):
+                raise NotResolved(type(self).__name__, name)
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def resolve(self) -> P:
         """The performable with the first alternative of each property.

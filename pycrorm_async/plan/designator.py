@@ -18,6 +18,7 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
 from pycrorm_async.plan.composing import Composable
+from pycrorm_async.plan.constructor import keeping_arguments
 from pycrorm_async.plan.errors import PerformNotAsync, ResourcesNotAMethod
 from pycrorm_async.plan.performing import as_node, is_node
 from pycrorm_async.plan.properties import check_properties
@@ -55,6 +56,9 @@ class Designator(Composable, ABC):
             cls.dtype = cls._name_in_memory()
         if "resources" in own.get("__annotations__", ()) or not callable(own.get("resources", len)):
             raise ResourcesNotAMethod(cls.__qualname__)
+        initialise = own.get("__init__")
+        if inspect.isfunction(initialise) and "__dataclass_fields__" not in own and not _is_ours(cls):
+            cls.__init__ = keeping_arguments(initialise)  # type: ignore[method-assign]  # as `perform` below
         perform = own.get("perform")
         if perform is None or is_node(perform):  # dataclass(slots=True) makes the class anew, hook and all
             return
@@ -73,6 +77,10 @@ class Designator(Composable, ABC):
     def resources(self) -> frozenset[Resource]:
         """The parts of the robot it needs for itself from its start to its end; those of its parts are their affair."""
         return NOTHING
+
+
+def _is_ours(designator: type) -> bool:
+    return designator.__module__.startswith("pycrorm_async.")
 
 
 class ActionAbstract(Designator):

@@ -6,7 +6,14 @@ from collections.abc import Sequence
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["PerformNotAsync", "ResourcesNotAMethod", "ResolutionError", "NoRobotChosen", "NoRobotHere"]
+__all__ = [
+    "PerformNotAsync",
+    "ResourcesNotAMethod",
+    "NotResolved",
+    "ResolutionError",
+    "NoRobotChosen",
+    "NoRobotHere",
+]
 
 
 class PerformNotAsync(CallerError, TypeError):
@@ -25,6 +32,17 @@ class ResourcesNotAMethod(CallerError, TypeError):
             f"{designator}.resources must be a method that returns a frozenset of Resource: rename the field"
         )
         self.designator = designator
+
+
+class NotResolved(CallerError, AttributeError):
+    """A description is used as what it describes: `.resolve()` is missing."""
+
+    def __init__(self, description: str, name: str) -> None:
+        super().__init__(
+            f"{description} is a description and has no {name!r}: resolve it first, as in {description}(…).resolve()"
+            f"{'.perform()' if name == 'perform' else ''}"
+        )
+        self.description = description
 
 
 class ResolutionError(CallerError):

@@ -7,10 +7,10 @@ of where it comes from.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Protocol
 
+from pycrorm_async.connected import ConnectedVar
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose
 
@@ -44,4 +44,4 @@ class Experience(Protocol):
         ...
 
 
-experience: ContextVar[Experience | None] = ContextVar("experience", default=None)
+experience: ConnectedVar[Experience] = ConnectedVar("experience")

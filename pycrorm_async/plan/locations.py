@@ -13,7 +13,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, NoReturn
 
+from pycrorm_async.plan.errors import NotResolved
 from pycrorm_async.plan.failures import (
     EnvironmentUnreachable,
     LookingHighLevelFailure,
@@ -50,6 +52,13 @@ class LocationDesignator(ABC):
 
     def __post_init__(self) -> None:
         check_properties(self)
+
+    if not TYPE_CHECKING:  # a type checker finds the fault by itself
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name in ("pose", "reachable_arms"):
+                raise NotResolved(type(self).__name__, name)
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
     def _look(self) -> Iterator[Location | None]:

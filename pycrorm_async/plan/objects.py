@@ -16,10 +16,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.plan.errors import ResolutionError
+from pycrorm_async.plan.errors import NotResolved, ResolutionError
 from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWorld
 from pycrorm_async.plan.here import world_here
 from pycrorm_async.world.copying import counterpart, original, related
@@ -216,6 +216,13 @@ class ObjectDesignatorDescription:
             there = [by_name[name] for name in dict.fromkeys(self.names) if name in by_name]
         for each in there:
             yield designator_of(each)
+
+    if not TYPE_CHECKING:  # a type checker finds the fault by itself
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name in ("name", "object_type", "pose", "world_object"):
+                raise NotResolved(type(self).__name__, name)
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def resolve(self) -> ObjectDesignator:
         """The first that fits. Raises `ObjectNotFound`."""

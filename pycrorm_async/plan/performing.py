@@ -11,15 +11,18 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import inspect
 from collections.abc import Callable, Coroutine
 from contextvars import ContextVar, Token
 from typing import TYPE_CHECKING, Any
+from weakref import ref
 
 from pycrorm_async.clock import monotonic_ns
 from pycrorm_async.plan.failures import is_plan_failure
 from pycrorm_async.plan.ports import recorder
 from pycrorm_async.plan.surroundings import Surroundings, surroundings
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collecting, current_node
+from pycrorm_async.plan.unawaited import Unstarted, called_performs
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import Designator
@@ -41,11 +44,38 @@ def is_node(perform: Any) -> bool:
 
 def as_node(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable[[Any], Coroutine[Any, Any, Any]]:
     """The same `perform`, each call a node; `super().perform()` inside belongs to the node of the outer call."""
+    run = _node_of(perform)
 
     @functools.wraps(perform)
-    async def performed(self: Designator) -> Any:
+    def performed(self: Designator) -> Coroutine[Any, Any, Any]:
+        calls = called_performs.get()
+        if calls is None:
+            return run(self, None)
+        unstarted: Unstarted = [calls]
+        coroutine = run(self, unstarted)
+        unstarted.append(ref(coroutine, calls.callbacks[type(self)]))
+        calls.waiting += 1
+        return coroutine
+
+    # It is still a coroutine function for those who ask `inspect`, before Python 3.12 by this flag alone.
+    plain: Any = performed
+    plain.__code__ = plain.__code__.replace(co_flags=plain.__code__.co_flags | inspect.CO_COROUTINE)
+    setattr(performed, _MARK, True)
+    return performed
+
+
+def _node_of(  # noqa: C901  one function, for a call costs more than most of these steps
+    perform: Callable[[Any], Coroutine[Any, Any, Any]],
+) -> Callable[[Any, Unstarted | None], Coroutine[Any, Any, Any]]:
+    """`perform` with a node around it."""
+
+    @functools.wraps(perform)
+    async def run(self: Designator, unstarted: Unstarted | None) -> Any:
+        if unstarted:
+            unstarted[0].waiting -= 1
+            unstarted.clear()
         parent = current_node.get()
-        if parent is not None and parent.designator is self and type(self).perform is not performed:
+        if parent is not None and parent.designator is self and _is_overridden(self, perform):
             return await perform(self)
         now_ns = monotonic_ns()
         if now_ns - _last_turn_ns.get() > TURN_NS_MAX:
@@ -86,8 +116,12 @@ def as_node(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable[[Any
                 claim.release()
         return result
 
-    setattr(performed, _MARK, True)
-    return performed
+    return run
+
+
+def _is_overridden(designator: Designator, perform: Callable[..., Any]) -> bool:
+    """Whether the designator performs something else, which calls this one."""
+    return getattr(type(designator).perform, "__wrapped__", None) is not perform
 
 
 async def _turn() -> int:

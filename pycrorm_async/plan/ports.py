@@ -12,6 +12,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
+from pycrorm_async.connected import ConnectedVar
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
@@ -114,7 +115,7 @@ class PlanObserver(Protocol):
         ...
 
 
-recorder: ContextVar[PlanObserver | None] = ContextVar("recorder", default=None)
+recorder: ConnectedVar[PlanObserver] = ConnectedVar("recorder")
 
 thinking: ContextVar[Thought | None] = ContextVar("thinking", default=None)
 """The innermost thought of this context; None where things really happen."""

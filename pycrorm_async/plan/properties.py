@@ -33,7 +33,7 @@ def check_properties(designator: object) -> None:
             if not optional:
                 missing.append(name)
         elif not fits(value):
-            wrong.append(f"{name}: expected {expected}, got {_short(value)}")
+            wrong.append(f"{name}: expected {expected}, got {_short(value)}{_advice(value)}")
     if missing or wrong:
         raise ResolutionError(kind.__name__, missing=missing, wrong=wrong)
 
@@ -76,6 +76,13 @@ def _in_words(hint: Any) -> str:
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         return " | ".join("None" if each is type(None) else _in_words(each) for each in typing.get_args(hint))
     return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
+
+
+def _advice(value: Any) -> str:
+    """What to do with a value that stands for another one."""
+    if hasattr(value, "pose"):
+        return " (its pose is `.pose`)"
+    return " (call its .resolve() first)" if hasattr(value, "resolve") else ""
 
 
 def _short(value: Any) -> str:

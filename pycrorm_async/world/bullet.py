@@ -59,11 +59,33 @@ class BulletWorld:
     # --- entering and leaving ---------------------------------------------------------------------------------
 
     def __enter__(self) -> Self:
+        self._begin()
+        self._outer = current_world.here()
+        current_world.set(self)
+        self._tell_entered()
+        return self
+
+    def connect(self) -> Self:
+        """Enter it for all contexts of this process that are in no world of their own, until `close`.
+
+        For notebooks, whose cells have a context each. If several are connected, plans act in the last one.
+        """
+        self._begin()
+        current_world.connect(self)
+        self._tell_entered()
+        return self
+
+    def close(self) -> None:
+        """Leave it; twice is once."""
+        if self.entered:
+            self.__exit__(None, None, None)
+
+    def _begin(self) -> None:
         if self._client is not None or self._left:
             raise WorldClosed("a world is entered once; make a new BulletWorld()")
         self._client = _connected(self.mode)
-        self._outer = current_world.get()
-        current_world.set(self)
+
+    def _tell_entered(self) -> None:
         self._watcher = watcher.get() if self.copy_of is None else None
         if self._watcher is not None:
             try:
@@ -71,7 +93,6 @@ class BulletWorld:
             except BaseException:
                 self._close()
                 raise
-        return self
 
     def __exit__(
         self,
@@ -86,7 +107,8 @@ class BulletWorld:
             self._close()
 
     def _close(self) -> None:
-        if current_world.get() is self:  # it is not when the context manager is closed in another context
+        current_world.disconnect(self)
+        if current_world.here() is self:  # it is not when the context manager is closed in another context
             current_world.set(self._outer)
         client, self._client, self._left = self.client, None, True
         engine().disconnect(physicsClientId=client)

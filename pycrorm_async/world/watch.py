@@ -7,8 +7,9 @@ task; `watcher` is told when a world is entered and left in its context.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextvars import ContextVar
 from typing import TYPE_CHECKING, Protocol
+
+from pycrorm_async.connected import ConnectedVar
 
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
@@ -61,5 +62,5 @@ class WorldWatcher(Protocol):
         ...
 
 
-current_world: ContextVar[BulletWorld | None] = ContextVar("current_world", default=None)
-watcher: ContextVar[WorldWatcher | None] = ContextVar("watcher", default=None)
+current_world: ConnectedVar[BulletWorld] = ConnectedVar("current_world")
+watcher: ConnectedVar[WorldWatcher] = ConnectedVar("watcher")

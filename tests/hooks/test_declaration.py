@@ -294,3 +294,25 @@ def test_a_mapped_class_of_ones_own_belongs_to_its_designator_and_not_to_its_des
 
     assert declared_type(SayActionPerformable).declaration.table == "my_sayings"
     assert declared_type(WhisperActionPerformable).declaration.table == "whisper_action"
+
+
+def test_names_that_a_database_cannot_take_are_mapped_by_the_name_alone() -> None:
+    long = "x" * 70
+    for names in ((long, "true"), ("true", "other", long)):
+        made: Any = dataclass(
+            type(
+                "BoundsAction", (ActionAbstract,), {"__annotations__": dict.fromkeys(names, float), "perform": perform}
+            )
+        )
+        columns = {each.name: each.column for each in declared_type(made).declaration.fields}
+        assert (columns[long], columns["true"]) == ("x" * 47 + "_" + columns[long][48:], "_true")
+        assert len(columns[long]) == 60
+    reach: Any = dataclass(
+        type("Reach" * 20 + "Action", (ActionAbstract,), {"__annotations__": {}, "perform": perform})
+    )
+    table = declared_type(reach).declaration.table
+    assert (len(table), table[:36]) == (48, "reach_reach_reach_reach_reach_reach_")
+
+
+async def perform(self: Any) -> None:
+    """Does nothing."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
+from pycrorm_async.config import Settings
 from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.happenings import (
     EpisodeEnded,
@@ -193,7 +194,8 @@ async def test_a_perform_outside_any_episode_opens_one_of_its_own() -> None:
 
 async def test_nan_in_a_pose_names_the_designator_and_the_field() -> None:
     refusal = r"^NavigateAction\.target_location cannot be recorded: the pose holds"
-    with rigged() as rig, rig.episode(), pytest.raises(Unrecordable, match=refusal):
+    strict = Settings(on_unrecordable="refuse")
+    with rigged(strict) as rig, rig.episode(), pytest.raises(Unrecordable, match=refusal):
         await NavigateActionPerformable(Pose([math.nan, 0, 0])).perform()
     assert rig.emitter.faults.total == 0
 

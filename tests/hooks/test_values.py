@@ -16,7 +16,8 @@ from pycrorm_async.events.happenings import (
     ObjectValue,
     PoseValue,
 )
-from pycrorm_async.hooks.values import Unwritable, clean_repr, failure_value, written, written_or_missing
+from pycrorm_async.hooks.texts import clean_repr
+from pycrorm_async.hooks.values import Unwritable, failure_value, written, written_or_missing
 from pycrorm_async.plan.failures import ObjectLost, PlanFailure, PlanFailures
 from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator
 from pycrorm_async.plan.outcome import Outcome
@@ -139,7 +140,11 @@ def test_a_circle_is_missing_and_no_recursion_error() -> None:
     circle.append(circle)
     missing = written_or_missing(circle, NOBODY)
     assert isinstance(missing, MissingValue)
-    assert missing.missing == "it is nested more than 8 deep"
+    assert missing.missing == "it holds itself"
+    deep: list[Any] = []
+    for _ in range(9):
+        deep = [deep]
+    assert written_or_missing(deep, NOBODY).missing == "it is nested more than 8 deep"
 
 
 def test_a_failure_keeps_class_message_and_arguments() -> None:
