@@ -30,6 +30,12 @@ class Server:
         self._server = server
         self._numbers = itertools.count(1)
 
+    @property
+    def programs(self) -> Path:
+        """The folder of the server's own tools."""
+        folder: Path = self._server.bin_path
+        return folder
+
     def url(self, database: str = "postgres", *, user: str = "postgres", password: str = "") -> str:
         who = f"{user}:{password}" if password else user
         return f"postgresql://{who}@/{database}?host={self.folder}"

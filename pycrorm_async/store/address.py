@@ -5,7 +5,7 @@
     sqlite://                           private to this process, in memory, gone when it is closed
     postgresql://user@host/database     a server
 
-The driver is ours to choose, so it is not part of the URL.
+The program chooses the driver. A URL written for another one (`_SCHEMES`) means the same database.
 """
 
 from __future__ import annotations
@@ -29,7 +29,17 @@ __all__ = ["DatabaseAddress", "BUSY_TIMEOUT_S"]
 BUSY_TIMEOUT_S = 5.0
 """How long a statement waits for another writer before the database counts as away."""
 
-_HARMLESS = frozenset({"host", "port", "user", "ssl"})
+_SCHEMES = {
+    "sqlite": "sqlite",
+    "sqlite+aiosqlite": "sqlite",
+    "postgresql": "postgresql",
+    "postgres": "postgresql",
+    "postgresql+asyncpg": "postgresql",
+    "postgresql+psycopg": "postgresql",
+}
+"""The database of each scheme that hosting services, libpq and SQLAlchemy write."""
+
+_HARMLESS = frozenset({"host", "port", "user", *postgresql.TLS})
 """Parts of a query that lead to a server and are no secret."""
 
 _WHAT_WORKS = (
@@ -56,15 +66,15 @@ class DatabaseAddress:
             parsed = make_url(url)
         except (ArgumentError, ValueError):  # neither message repeats the URL, which may hold a password
             raise UnknownUrl(f"this is not a database URL; {_WHAT_WORKS}") from None
-        match parsed.drivername:
-            case "sqlite":
-                return cls(parsed, _sqlite_path(parsed))
-            case "postgresql":
-                if reason := postgresql.refusal(parsed):
-                    raise UnknownUrl(f"{reason}; {_WHAT_WORKS}")
-                return cls(parsed, None)
-            case other:
-                raise UnknownUrl(f"{other}:// is not a database we know; {_WHAT_WORKS}")
+        database = _SCHEMES.get(parsed.drivername)
+        if database is None:
+            raise UnknownUrl(f"{parsed.drivername}:// is not a database we know; {_WHAT_WORKS}")
+        parsed = parsed.set(drivername=database)
+        if database == "sqlite":
+            return cls(parsed, _sqlite_path(parsed))
+        if reason := postgresql.refusal(parsed):
+            raise UnknownUrl(f"{reason}; {_WHAT_WORKS}")
+        return cls(parsed, None)
 
     @property
     def is_sqlite(self) -> bool:

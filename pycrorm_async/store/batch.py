@@ -46,7 +46,10 @@ class NoNumber(ValueError):
     """Every episode number is taken."""
 
     def __init__(self) -> None:
-        super().__init__(f"this memory holds {EPISODE_NUMBER_MAX:,} episodes, the most it can")
+        super().__init__(
+            f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used:"
+            " `pycrorm spool rebind` gives its spool to another"
+        )
 
 
 def sort(records: Iterable[Record]) -> Sorted:

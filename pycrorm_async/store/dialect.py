@@ -9,9 +9,20 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
+from pycrorm_async.store.rows import EpisodeRow, Incarnation, Span, StoredEvent
 
-__all__ = ["Dialect", "Birth", "Expected", "Found", "Insertion", "Migrations", "Progress", "RowRefused", "RowsByTable"]
+__all__ = [
+    "Dialect",
+    "Birth",
+    "Expected",
+    "Found",
+    "Insertion",
+    "Migrations",
+    "Progress",
+    "RowRefused",
+    "RowsByTable",
+    "StoredOn",
+]
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; format N is what the first N of them make."""
@@ -38,6 +49,13 @@ class Found(NamedTuple):
 
     log_id: str
     format: int
+
+
+class StoredOn(NamedTuple):
+    """On how many machines a committed event is; the `standbys` that confirm each COMMIT, as far as they are known."""
+
+    machines: int
+    standbys: tuple[str, ...] = ()
 
 
 class RowRefused(ValueError):
@@ -86,12 +104,41 @@ class Dialect(Protocol):
         """(fingerprint, payload) of each; those that are there already stay as they are."""
         ...
 
-    async def episodes_by_id(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
-        """Those of them that are there; nobody else changes them before the transaction ends."""
+    async def episodes_by_id(
+        self, connection: AsyncConnection, ids: Sequence[str], *, witness: str | None = None
+    ) -> list[EpisodeRow]:
+        """Those of them that are there; nobody else changes them before the transaction ends. And the witness, which
+        others may change, perhaps twice."""
         ...
 
-    async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
-        """Numbers that no episode has or will have had."""
+    async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
+        """Numbers that no episode has or will have had; if some up to `above` are not given yet, with a reserve left
+        free behind it (`numbers_reserved`)."""
+        ...
+
+    async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
+        """From now on no transaction gets a new number up to `above` and the reserve behind it, if it gives them out
+        by itself; else `new_numbers` sees to it."""
+        ...
+
+    async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:
+        """Those of these numbers that an episode has."""
+        ...
+
+    async def heads(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
+        """As `episodes_by_id`, and nobody waits for anybody."""
+        ...
+
+    async def note_incarnation(self, connection: AsyncConnection, incarnation: Incarnation) -> None:
+        """Notes that the log went back, in a table that is made if need be."""
+        ...
+
+    async def incarnations(self, connection: AsyncConnection) -> list[Incarnation]:
+        """How often the log went back, the oldest first; none where there is no table of it."""
+        ...
+
+    async def stored_on(self, connection: AsyncConnection) -> StoredOn:
+        """On how many machines an event is when its COMMIT returned."""
         ...
 
     async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
@@ -102,6 +149,14 @@ class Dialect(Protocol):
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         """`folded` and `parked` stay as they are."""
+        ...
+
+    async def note_again(self, connection: AsyncConnection) -> None:
+        """Makes COMMIT of a transaction that changes nothing as durable as that of one that does."""
+        ...
+
+    async def commit(self, connection: AsyncConnection) -> None:
+        """Commits. Raises `DatabaseUnavailable` where it is not certain that what was committed is durable."""
         ...
 
     async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
@@ -119,6 +174,14 @@ class Dialect(Protocol):
         ...
 
     async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
+
+    async def last_number(self, connection: AsyncConnection) -> int:
+        """The highest episode number; 0 without episodes."""
+        ...
+
+    async def long_episodes(self, connection: AsyncConnection, events_min: int) -> list[EpisodeRow]:
+        """The episodes that have not ended and hold at least so many events."""
+        ...
 
     async def events(
         self, connection: AsyncConnection, number: int, *, after: int, limit: int
@@ -167,6 +230,11 @@ class Dialect(Protocol):
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
         """Of empty tables: how they will be. Which of them a question is best begun with depends on it."""
+        ...
+
+    def stored_column(self, name: str) -> str:
+        """The column of a table that holds a column of the view before it: another name if the database has its own
+        use for this one."""
         ...
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
@@ -224,6 +292,10 @@ class Dialect(Protocol):
 
     faults: tuple[type[Exception], ...]
     """What its driver raises, and SQLAlchemy in its name."""
+
+    def refusal(self, error: Exception) -> str | None:
+        """Why the database never makes a table or view as it was asked to; None if it only did not do so now."""
+        ...
 
     def ours(self, error: Exception, name: str) -> PycrormError:
         """The error of ours to raise in its place."""

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-__all__ = ["StoredEvent", "EpisodeRow", "Span", "beyond", "share_out"]
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId
+
+__all__ = [
+    "StoredEvent",
+    "EpisodeRow",
+    "Basis",
+    "Stored",
+    "Incarnation",
+    "NOTHING_KNOWN",
+    "numbers_reserved",
+    "Span",
+    "beyond",
+    "share_out",
+]
 
 
 class StoredEvent(NamedTuple):
@@ -42,6 +55,52 @@ class EpisodeRow(NamedTuple):
     ended_wall_ns: int | None = None
     refused: str | None = None
     parked: str | None = None
+
+
+class Basis(NamedTuple):
+    """What an append builds on: what this log had confirmed before.
+
+    Attributes:
+        witness: the episode that was stored last, and how far. A log that holds less of it takes nothing.
+        number_of: the number that an episode was given before; it gets it back where it is free.
+        above: the highest number that is known to be given; new episodes get higher ones.
+    """
+
+    witness: tuple[EpisodeId, int] | None
+    number_of: Callable[[EpisodeId], int | None]
+    above: int
+
+
+NOTHING_KNOWN = Basis(None, lambda _: None, 0)
+
+
+class Stored(NamedTuple):
+    """What became of a batch: why episodes refused records, and every episode as it is now."""
+
+    refusals: Mapping[EpisodeId, str]
+    rows: Mapping[EpisodeId, EpisodeRow]
+
+
+class Incarnation(NamedTuple):
+    """Once that the log was found to have gone back: when, from which spool, and what could be done."""
+
+    noticed_wall_ns: int
+    noticed_by: str
+    reason: str
+
+
+_RESERVE_MAX = 4_096
+"""Left free behind the highest number known when a log went back, for what other spools had stored in it: as many
+episodes as a hundred robots begin in an hour. A thousand failovers would use up all numbers, so it shrinks then."""
+
+
+def numbers_reserved(above: int) -> int:
+    """How many numbers are left free behind this one.
+
+    >>> numbers_reserved(1_000), numbers_reserved(EPISODE_NUMBER_MAX - 640)
+    (4096, 10)
+    """
+    return min(_RESERVE_MAX, max(0, EPISODE_NUMBER_MAX - above) // 64)
 
 
 class Span(NamedTuple):

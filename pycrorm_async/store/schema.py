@@ -13,9 +13,11 @@ from pathlib import Path
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.config import FILE_MODES, FileAccess
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.store.dialect import Birth, Dialect, Found, Migrations
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.sqlite.leftovers import move_leftovers
 
 __all__ = ["Birth", "make_or_migrate", "recognise", "make_file", "must_exist"]
 
@@ -34,14 +36,26 @@ async def recognise(connection: AsyncConnection, name: str, migrations: Migratio
     return found.log_id
 
 
-async def make_or_migrate(engine: AsyncEngine, name: str, *, birth: Birth, migrations: Migrations | None = None) -> str:
-    """The id of the log in this database, which is made or brought up to date if need be."""
+async def make_or_migrate(
+    engine: AsyncEngine,
+    name: str,
+    *,
+    birth: Birth,
+    migrations: Migrations | None = None,
+    belongs_to: str | None = None,
+) -> str:
+    """The id of the log in this database, which is made or brought up to date if need be.
+
+    Raises `DatabaseUnavailable` instead of making one where the log `belongs_to` should be.
+    """
     dialect = dialect_of(engine)
     migrations = dialect.migrations if migrations is None else migrations
     await dialect.prepare(engine, name)
     async with engine.begin() as connection:
         await dialect.alone(connection)
         found = await _look(dialect, connection, name, len(migrations))
+        if found is None and belongs_to is not None:
+            raise DatabaseUnavailable(f"{name} {_gone(belongs_to)}")
         for statements in migrations[found.format if found else 0 :]:
             await dialect.execute_all(connection, statements)
         if found is None:
@@ -52,16 +66,25 @@ async def make_or_migrate(engine: AsyncEngine, name: str, *, birth: Birth, migra
         return found.log_id
 
 
-def make_file(path: Path, name: str) -> None:
+def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | None = None) -> None:
     """Makes an empty file if there is none, which SQLite takes for an empty database.
+
+    SQLite gives the files that it makes beside it the same mode. An existing file keeps its own. Raises
+    `DatabaseUnavailable` instead of making one where the file of the log `belongs_to` should be.
 
     Without opening it: whoever closes a file takes from his whole process the locks that SQLite has on it, and then
     another process that closes the database deletes the write-ahead log that this one goes on writing into.
     """
     if sqlite3.sqlite_version_info < (3, 38):
         raise DatabaseUnavailable(f"SQLite 3.38 or newer is needed, this is {sqlite3.sqlite_version}")
+    if belongs_to is not None and not path.exists():
+        raise DatabaseUnavailable(f"{name} {_gone(belongs_to)}")
     try:
-        os.mknod(os.path.realpath(path), 0o666 | stat.S_IFREG)
+        real = Path(os.path.realpath(path))
+        if not real.exists():
+            move_leftovers(real)
+        os.mknod(real, 0o600 | stat.S_IFREG)
+        real.chmod(FILE_MODES[access])  # whatever the umask took off
     except FileExistsError:
         if path.is_dir():
             raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
@@ -73,6 +96,13 @@ def must_exist(path: Path, name: str) -> None:
     """Says how to make a database where there is none."""
     if not path.is_file():
         raise DatabaseUnavailable(f"{name} does not exist: {_HOW_TO_MAKE_ONE}")
+
+
+def _gone(log_id: str) -> str:
+    return (
+        f"holds no memory, and the spool belongs to log {log_id}: restore that log, choose another spool, or"
+        " store what it holds in a new one with `pycrorm spool rebind`"
+    )
 
 
 async def _look(dialect: Dialect, connection: AsyncConnection, name: str, format_known: int) -> Found | None:

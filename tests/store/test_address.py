@@ -42,12 +42,22 @@ def test_a_password_is_in_no_text_of_an_address() -> None:
     assert str(by_socket) == "postgresql://robot:***@/memory?host=/run/postgresql"
 
 
+@pytest.mark.parametrize("scheme", ["postgres", "postgresql+psycopg", "postgresql+asyncpg", "sqlite+aiosqlite"])
+def test_a_scheme_of_another_program_means_the_same_database(scheme: str) -> None:
+    kind = "sqlite" if scheme.startswith("sqlite") else "postgresql"
+    rest = "/memory.db" if kind == "sqlite" else "robot:s3cret@lab:5433/memory?sslmode=require"
+    address, plain = (DatabaseAddress.parse(f"{each}://{rest}") for each in (scheme, kind))
+    assert address == plain
+    assert (str(address), address.to_type) == (str(plain), plain.to_type)
+    assert address.engine().dialect.driver == ("aiosqlite" if kind == "sqlite" else "asyncpg")
+
+
 @pytest.mark.parametrize(
     ("url", "reason"),
     [
         ("mysql://u:s3cret@h/db", "mysql:// is not a database we know"),
-        ("sqlite+aiosqlite:///x.db", "sqlite+aiosqlite:// is not a database we know"),
-        ("postgres://u:s3cret@h/db", "postgres:// is not a database we know"),
+        ("sqlite+pysqlcipher:///x.db", "sqlite+pysqlcipher:// is not a database we know"),
+        ("postgresql+pg8000://u:s3cret@h/db", "postgresql+pg8000:// is not a database we know"),
         ("memory.db", "this is not a database URL"),
         ("", "this is not a database URL"),
         ("postgresql://u:s3cret@h:port/db", "this is not a database URL"),
@@ -59,7 +69,10 @@ def test_a_password_is_in_no_text_of_an_address() -> None:
         ("postgresql://u:my@s3cret@h/db", "an @ in a password is written %40"),
         ("postgresql://u:s3cret@h:99999/db", "a port is a number from 1 to 65535"),
         ("postgresql://u:s3cret@/db?port=s3cret", "a port is a number from 1 to 65535"),
-        ("postgresql://u@h/db?s3cret=1", "a PostgreSQL URL takes the parameters host, port, password, passfile"),
+        (
+            "postgresql://u@h/db?s3cret=1",
+            "a PostgreSQL URL takes the parameters host, port, sslmode, sslrootcert, sslcert, sslkey, password,",
+        ),
         ("postgresql://u@h/db?sslmode=s3cret", "sslmode is one of disable, allow, prefer, require, verify-ca"),
     ],
 )

@@ -233,7 +233,10 @@ async def test_an_episode_number_beyond_the_last_is_refused_and_nothing_else_is(
     if database_url.startswith("postgresql"):  # there, numbers come from a sequence
         ask_to_change(database_url, f"SELECT setval('pycrorm.episode_number', {EPISODE_NUMBER_MAX})")
     refused = await log.append([*run_of(episode(2), 1, 2), *run_of(episode(1), 2, 3)])
-    assert refused == {episode(2): "this memory holds 4,194,303 episodes, the most it can"}
+    assert refused == {
+        episode(2): "all 4,194,303 episode numbers of this memory are used:"
+        " `pycrorm spool rebind` gives its spool to another"
+    }
     assert ask(database_url, "SELECT head FROM episode WHERE number = 1") == [(3,)]
     assert ask(database_url, "SELECT count(*) FROM episode") == [(2,)]
 
@@ -333,7 +336,7 @@ async def test_what_was_made_before_the_transaction_is_made_again_if_the_episode
         case "other":
             await log.append([record(episode(4), 1), record(episode(1), 4)])
     async with log.writing() as connection:
-        assert await appending.write(connection) == {}
+        assert (await appending.write(connection)).refusals == {}
     numbers = {1: 1, 2: 2, 3: 4, 4: 3} if meanwhile == "other" else {1: 1, 2: 2, 3: 3}
     stored = ask(database_url, "SELECT episode, sequence, payload FROM event ORDER BY episode, sequence")
     expected = {1: 9, 2: 4} | ({3: 2} if with_new else {}) | ({4: 1} if meanwhile == "other" else {})

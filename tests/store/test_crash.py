@@ -16,6 +16,7 @@ import pytest
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.crash.recording import say
 from tests.databases import ask
 from tests.store.making import episode, run_of
 
@@ -55,7 +56,7 @@ async def append_all(address: DatabaseAddress, numbers: Iterable[int]) -> None:
     log = await EventLog.open(address, create=True)
     for number in numbers:
         assert await log.append(batch(number)) == {}
-        print(f"appended {number}", flush=True)
+        say("appended", number)
     await log.close()
 
 

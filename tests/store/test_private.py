@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import fcntl
+import os
 import signal
 import subprocess
 import sys
@@ -72,6 +74,49 @@ def test_the_folder_of_a_killed_process_is_swept_and_that_of_a_living_one_is_not
         assert mine.is_dir()
     finish(living)
     assert not in_use.exists()
+
+
+def test_another_users_files_of_our_names_neither_hold_it_up_nor_are_touched(tmp_path: Path) -> None:
+    prefix = f"pycrorm-{os.geteuid()}-"
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (tmp_path / f"{prefix}link").symlink_to(victim)
+    (tmp_path / f"{prefix}loop").symlink_to(tmp_path / f"{prefix}loop")
+    os.mkfifo(tmp_path / f"{prefix}pipe")
+    held = os.open(tmp_path / f"{prefix}lock", os.O_RDWR | os.O_CREAT)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    process, folder = held_by_another_process(tmp_path)
+    assert folder.parent == tmp_path
+    assert (folder.stat().st_mode & 0o777, list(victim.iterdir())) == (0o700, [])
+    assert len(list(tmp_path.glob(f"{prefix}*"))) == 5
+    finish(process)
+    os.close(held)
+
+
+def test_a_folder_without_a_mark_is_swept_only_while_it_is_empty(tmp_path: Path) -> None:
+    prefix = f"pycrorm-{os.geteuid()}-"
+    (tmp_path / f"{prefix}empty").mkdir()
+    (tmp_path / f"{prefix}kept").mkdir()
+    (tmp_path / f"{prefix}kept" / "file").touch()
+    with private_folder(tmp_path):
+        assert {each.name for each in tmp_path.iterdir()} >= {f"{prefix}kept"}
+        assert not (tmp_path / f"{prefix}empty").exists()
+
+
+def test_many_processes_that_make_and_sweep_at_once_each_have_a_folder(tmp_path: Path) -> None:
+    script = """
+import sys
+from pathlib import Path
+from pycrorm_async.store.private import private_folder
+for _ in range(200):
+    with private_folder(Path(sys.argv[1])) as folder:
+        (folder / "memory.db").touch(exist_ok=False)
+        assert (folder / "mark").exists()
+"""
+    command = [sys.executable, "-c", script, str(tmp_path)]
+    running = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(4)]
+    assert [each.communicate()[1] for each in running] == [""] * 4
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_forked_child_that_leaves_the_context_leaves_its_parents_folder(tmp_path: Path) -> None:

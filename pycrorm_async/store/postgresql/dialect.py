@@ -10,16 +10,28 @@ from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk import make
-from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Expected, Found, Insertion, Migrations, Progress, RowRefused, RowsByTable
+from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError, TablesUntrusted
+from pycrorm_async.store.dialect import (
+    Birth,
+    Expected,
+    Found,
+    Insertion,
+    Migrations,
+    Progress,
+    RowRefused,
+    RowsByTable,
+    StoredOn,
+)
 from pycrorm_async.store.postgresql import faults, tables
 from pycrorm_async.store.postgresql import statements as sql
-from pycrorm_async.store.postgresql.engine import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
-from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
+from pycrorm_async.store.postgresql.engine import WARNING
+from pycrorm_async.store.postgresql.path import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
+from pycrorm_async.store.rows import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
 
 __all__ = ["PostgreSQL"]
 
 _SERVER_MIN = 140_000
+_RESTORING = "a restore may be under way; when it is finished, try again"
 
 
 class PostgreSQL:
@@ -44,8 +56,13 @@ class PostgreSQL:
         if not names:
             return None
         if "pycrorm_log" not in names:
-            raise DatabaseForeign(f"{name} has a schema {LOG_SCHEMA!r} of another program: it has no pycrorm_log")
-        return Found._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
+            if names & {"episode", "event", "pycrorm_declaration"} == set():
+                raise DatabaseForeign(f"{name} has a schema {LOG_SCHEMA!r} of another program: it has no pycrorm_log")
+            raise DatabaseUnavailable(f"{name}: the table pycrorm_log is missing: {_RESTORING}")
+        found = (await connection.exec_driver_sql(tables.READ_LOG)).one_or_none()
+        if found is None:
+            raise DatabaseUnavailable(f"{name}: the table pycrorm_log is empty: {_RESTORING}")
+        return Found._make(found)
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
         # In one message, past SQLAlchemy: within the transaction that a statement through it has begun before.
@@ -62,11 +79,59 @@ class PostgreSQL:
     async def insert_declarations(self, connection: AsyncConnection, named: Sequence[tuple[str, str]]) -> None:
         await connection.exec_driver_sql(sql.INSERT_DECLARATIONS, _arrays(named, 2))
 
-    async def episodes_by_id(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
-        return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES_BY_ID, list(ids))
+    async def episodes_by_id(
+        self, connection: AsyncConnection, ids: Sequence[str], *, witness: str | None = None
+    ) -> list[EpisodeRow]:
+        if witness is None:
+            return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES_BY_ID, list(ids))
+        return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES_AND_WITNESS, list(ids), witness)
 
-    async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
+    async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
+        numbers = list((await connection.exec_driver_sql(sql.NEW_NUMBERS, (count,))).scalars())
+        if numbers[0] > above:
+            return numbers
+        await self._skip(connection, numbers[-1], above)
         return list((await connection.exec_driver_sql(sql.NEW_NUMBERS, (count,))).scalars())
+
+    async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
+        number = (await connection.exec_driver_sql(sql.NEW_NUMBERS, (1,))).scalar_one()
+        if number <= above:
+            await self._skip(connection, number, above)
+
+    async def _skip(self, connection: AsyncConnection, given: int, above: int) -> None:
+        # By asking for all of them, and not by setval: that needs a privilege, and could set it back behind another's.
+        count = above + numbers_reserved(above) - given
+        if count > 0:
+            await connection.exec_driver_sql(sql.SKIP_NUMBERS, (count,))
+
+    async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:
+        return set((await connection.exec_driver_sql(sql.SELECT_NUMBERS_TAKEN, (list(numbers),))).scalars())
+
+    async def heads(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_HEADS, list(ids))
+
+    async def note_incarnation(self, connection: AsyncConnection, incarnation: Incarnation) -> None:
+        # Who appends as one role of many may not make tables: then the owner has (`roles.GRANTS`).
+        if not await self._has_incarnations(connection):
+            await self.alone(connection)
+            await connection.exec_driver_sql(tables.INCARNATION)
+        await connection.exec_driver_sql(sql.INSERT_INCARNATION, tuple(incarnation))
+
+    async def incarnations(self, connection: AsyncConnection) -> list[Incarnation]:
+        if not await self._has_incarnations(connection):
+            return []
+        return await _rows(Incarnation, connection, sql.SELECT_INCARNATIONS)
+
+    async def _has_incarnations(self, connection: AsyncConnection) -> bool:
+        return bool((await connection.exec_driver_sql(tables.HAS_INCARNATION)).scalar_one())
+
+    async def stored_on(self, connection: AsyncConnection) -> StoredOn:
+        configured = (await connection.exec_driver_sql(sql.SYNCHRONOUS_STANDBYS)).scalar_one().strip()
+        if not configured:
+            return StoredOn(1)
+        # Without the right to see them (pg_read_all_stats) their states are null: COMMIT waits for them all the same.
+        names = tuple((await connection.exec_driver_sql(sql.SELECT_SYNCHRONOUS)).scalars())
+        return StoredOn(1 + max(1, _confirming(configured)), names or (configured,))
 
     async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
         return rows
@@ -80,6 +145,17 @@ class PostgreSQL:
             for each in sorted(episodes)
         ]
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, _arrays(rows, 6))
+
+    async def note_again(self, connection: AsyncConnection) -> None:
+        await connection.exec_driver_sql(sql.WRITE_AHEAD)
+
+    async def commit(self, connection: AsyncConnection) -> None:
+        # A COMMIT that is cancelled while it waits for a synchronous standby succeeds, with a warning.
+        connected = (await connection.get_raw_connection()).info
+        connected.pop(WARNING, None)
+        await connection.commit()
+        if WARNING in connected:
+            raise faults.CommitInDoubt(connected[WARNING])
 
     async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_STORED_AGAIN, *_arrays(keys, 2))
@@ -97,6 +173,12 @@ class PostgreSQL:
 
     async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, sql.SELECT_STOPPED)
+
+    async def last_number(self, connection: AsyncConnection) -> int:
+        return int((await connection.exec_driver_sql(sql.SELECT_NUMBER_MAX)).scalar_one())
+
+    async def long_episodes(self, connection: AsyncConnection, events_min: int) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_LONG, events_min)
 
     async def events(self, connection: AsyncConnection, number: int, *, after: int, limit: int) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
@@ -144,10 +226,20 @@ class PostgreSQL:
         await connection.exec_driver_sql(f"CREATE SCHEMA IF NOT EXISTS {TABLES_SCHEMA}")
 
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
-        return bool((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).scalar_one())
+        found, stranger, login = tuple((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).one())
+        if stranger is not None:
+            raise TablesUntrusted(
+                f"the tables belong to {stranger}, whose members could run code of theirs with the rights of {login}:"
+                f" fold with a login that is a member of {stranger} and has no right to the log, read with one of"
+                " pycrorm_reader"
+            )
+        return bool(found)
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
         """The server counts by itself."""
+
+    def stored_column(self, name: str) -> str:
+        return f"_{name}" if name in tables.SYSTEM_COLUMNS else name
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
         quote = connection.dialect.identifier_preparer.quote
@@ -238,8 +330,21 @@ class PostgreSQL:
 
     # --- faults -------------------------------------------------------------------------------------------------
 
+    def refusal(self, error: Exception) -> str | None:
+        return faults.refusal(error)
+
     def ours(self, error: Exception, name: str) -> PycrormError:
         return faults.ours(error, name)
+
+
+def _confirming(configured: str) -> int:
+    """How many standbys confirm each COMMIT, as `synchronous_standby_names` says.
+
+    >>> _confirming("ANY 2 (a, b, c)"), _confirming("FIRST 1 (a)"), _confirming("2 (a, b)"), _confirming("a, b")
+    (2, 1, 2, 1)
+    """
+    words = configured.partition("(")[0].split()
+    return int(words[-1]) if "(" in configured and words and words[-1].isdigit() else 1
 
 
 class _Gone(NamedTuple):

@@ -1,21 +1,31 @@
-"""An engine for a PostgreSQL server: durable at COMMIT, our schemas first in the path, every wait bounded."""
+"""An engine for a PostgreSQL server: durable at COMMIT, the search path pinned, every wait bounded."""
 
 from __future__ import annotations
 
-from sqlalchemy import URL
+import os
+from typing import Any
+
+from sqlalchemy import URL, event
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
+from sqlalchemy.pool import ConnectionPoolEntry
 
-__all__ = ["make_engine", "refusal", "WHERE", "LOG_SCHEMA", "TABLES_SCHEMA", "VIEWS_SCHEMA", "ANSWER_S_MAX"]
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.store.postgresql.path import PIN
 
-LOG_SCHEMA = "pycrorm"
-"""Where the log is."""
-TABLES_SCHEMA = "memory_tables"
-"""Where the tables made from it are, generation beside generation."""
-VIEWS_SCHEMA = "memory"
-"""Where the views in front of them are: what people read. Replaced as a whole."""
+__all__ = [
+    "make_engine",
+    "refusal",
+    "WHERE",
+    "TLS",
+    "ANSWER_S_MAX",
+    "WARNING",
+]
 
 ANSWER_S_MAX = 60.0
 """A statement that takes longer counts as a server that is away."""
+
+WARNING = "pycrorm_warning"
+"""Key of a connection's `info` under which the server's latest warning is kept."""
 
 _VANISHED = {
     "tcp_keepalives_idle": "10",
@@ -29,7 +39,12 @@ locks half a minute later; as it comes, it waits two hours, and nobody can go on
 WHERE = ("host", "port")
 """The parameters of a URL that say where the server is, and so may be shown."""
 
-_PARAMETERS = (*WHERE, "password", "passfile", "sslmode", "target_session_attrs", "krbsrvname")
+TLS = ("sslmode", "sslrootcert", "sslcert", "sslkey")
+"""The parameters of a URL that say how the connection is encrypted, as libpq understands them. Paths are no secret."""
+
+_TLS_FILES = {"sslrootcert", "sslcert", "sslkey"}
+
+_PARAMETERS = (*WHERE, *TLS, "password", "passfile", "target_session_attrs", "krbsrvname")
 _SSL_MODES = ("disable", "allow", "prefer", "require", "verify-ca", "verify-full")
 
 
@@ -60,7 +75,7 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
     """
     settings = {
         "application_name": "pycrorm",
-        "search_path": f"{TABLES_SCHEMA}, {VIEWS_SCHEMA}, {LOG_SCHEMA}",  # what is made without a schema is a table
+        "search_path": "pg_catalog",  # until it is pinned
         "synchronous_commit": "on",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
         "lock_timeout": f"{int(busy_timeout_s * 1000)}",
         "idle_in_transaction_session_timeout": "60000",
@@ -68,12 +83,16 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
         "default_transaction_read_only": "on" if read_only else "off",
         "timezone": "UTC",
     }
-    # The driver has another name for what everybody else calls sslmode.
-    ssl = {"ssl": url.query["sslmode"]} if "sslmode" in url.query else {}
-    return create_async_engine(
-        url.set(drivername="postgresql+asyncpg").difference_update_query(["sslmode"]),
+    # The driver reads these from a URL alone; what else is in it comes as arguments, which count for more.
+    tls = {name: value for name, value in url.query.items() if name in TLS}
+    for name in sorted(_TLS_FILES & tls.keys()):
+        if not os.access(str(tls[name]), os.R_OK):
+            raise DatabaseUnavailable(f"{name} of the database's URL cannot be read: {tls[name]}")
+    dsn = {"dsn": URL.create("postgresql", query=tls).render_as_string()} if tls else {}
+    engine = create_async_engine(
+        url.set(drivername="postgresql+asyncpg").difference_update_query(TLS),
         connect_args={
-            **ssl,
+            **dsn,
             "timeout": busy_timeout_s,
             "command_timeout": ANSWER_S_MAX,
             "server_settings": settings,
@@ -84,3 +103,16 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
         pool_pre_ping=True,
         hide_parameters=True,
     )
+    event.listen(engine.sync_engine, "connect", _set_up)
+    return engine
+
+
+def _set_up(connection: Any, record: ConnectionPoolEntry) -> None:
+    """Pins the search path of a new connection, and keeps the server's latest warning in its `info`."""
+
+    def keep(_: Any, message: Any) -> None:
+        if getattr(message, "severity_en", None) == "WARNING":
+            record.info[WARNING] = " ".join(str(message).split())
+
+    connection.driver_connection.add_log_listener(keep)
+    connection.run_async(lambda driver: driver.execute(PIN))

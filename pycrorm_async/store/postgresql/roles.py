@@ -1,25 +1,37 @@
-"""Who may do what in a memory on PostgreSQL: three roles, each with no more than its work needs.
+"""Roles of a memory on PostgreSQL: three, each with no more rights than its work needs.
 
     pycrorm_recorder   appends to the log
     pycrorm_folder     appends, and makes tables and views from the log: plans, `pycrorm writer`, `pycrorm rebuild`
     pycrorm_reader     reads log, tables and views: `pycrorm episodes`, `show`, `verify`, notebooks
 
-Nobody of them can change or delete an event: they lack the privilege, and triggers refuse it to the owner too. The
-owner of the database opens the memory once (`pycrorm writer --once`), which makes the log; then he runs `GRANTS`, which
-may be run again. It hands the tables and views, which are made from the log and can be made again, to the folder, and
-leaves the log with himself. People and programs get a role by membership:
+None of them can change or delete an event: they lack the privilege, and triggers refuse it to the owner too. The owner
+of the database opens the memory once (`pycrorm writer --once`), which makes the log; then the owner runs `GRANTS`,
+which may be run again. They hand the tables and views, which are made from the log and can be made again, to the
+folder, and leave the log with the owner. An owner who may not create roles gets the statements that a role with
+CREATEROLE has to run first. People and programs get a role by membership:
 
     GRANT pycrorm_reader TO ada;
     GRANT pycrorm_folder TO robot; ALTER ROLE robot IN DATABASE memory SET role = 'pycrorm_folder';
 
 The second line makes what a robot creates belong to all robots, so that each can grow the tables of the others.
+
+From then on the owner's own login appends and brings the log up to date, and is refused at tables and views: members of
+`pycrorm_folder` could have planted code there, which would run with the owner's rights (`path` has the reasons). The
+owner folds and reads with logins that have no other rights:
+
+    CREATE ROLE lab LOGIN IN ROLE pycrorm_folder; ALTER ROLE lab IN DATABASE memory SET role = 'pycrorm_folder';
+
+All recorders and folders of a memory trust each other: each can append to the episodes of the others, end them, and use
+up the episode numbers, because to compare each event's episode with the login that began it costs an eighth of the rate
+of appending. All readers trust the folders, whose views they read.
 """
 
 from __future__ import annotations
 
-from pycrorm_async.store.postgresql.engine import LOG_SCHEMA as LOG
-from pycrorm_async.store.postgresql.engine import TABLES_SCHEMA as TABLES
-from pycrorm_async.store.postgresql.engine import VIEWS_SCHEMA as VIEWS
+from pycrorm_async.store.postgresql.path import LOG_SCHEMA as LOG
+from pycrorm_async.store.postgresql.path import TABLES_SCHEMA as TABLES
+from pycrorm_async.store.postgresql.path import VIEWS_SCHEMA as VIEWS
+from pycrorm_async.store.postgresql.tables import INCARNATION
 
 __all__ = ["GRANTS"]
 
@@ -27,12 +39,36 @@ _MADE = f"""
 DO $$
 DECLARE
     name text;
+    missing text[];
 BEGIN
-    FOREACH name IN ARRAY ARRAY['pycrorm_recorder', 'pycrorm_folder', 'pycrorm_reader'] LOOP
-        IF NOT EXISTS (SELECT FROM pg_roles WHERE rolname = name) THEN
+    PERFORM pg_catalog.set_config('search_path', 'pg_catalog', true);
+    IF to_regnamespace('{TABLES}') IS NULL OR to_regnamespace('{VIEWS}') IS NULL THEN
+        RAISE EXCEPTION 'the memory has no tables yet: run `pycrorm writer --once` first';
+    END IF;
+    missing := ARRAY(
+        SELECT each FROM unnest(ARRAY['pycrorm_recorder', 'pycrorm_folder', 'pycrorm_reader']) AS each
+        WHERE NOT EXISTS (SELECT FROM pg_roles WHERE rolname = each)
+    );
+    BEGIN
+        FOREACH name IN ARRAY missing LOOP
             EXECUTE format('CREATE ROLE %I NOLOGIN', name);
-        END IF;
-    END LOOP;
+        END LOOP;
+    EXCEPTION WHEN insufficient_privilege THEN
+        RAISE EXCEPTION 'the roles % are missing and % may not create roles; a role with CREATEROLE runs: %',
+            array_to_string(missing, ', '), current_user, (
+                SELECT string_agg(format('CREATE ROLE %I NOLOGIN; ', each), '') FROM unnest(missing) AS each
+            ) || format('GRANT pycrorm_folder TO %I', current_user);
+    END;
+    BEGIN
+        EXECUTE format('ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder');
+    EXCEPTION WHEN insufficient_privilege THEN
+        BEGIN  -- one who created the role may become a member of it, and is not by itself
+            EXECUTE format('GRANT pycrorm_folder TO %I', current_user);
+        EXCEPTION WHEN insufficient_privilege THEN
+            RAISE EXCEPTION '% cannot hand the tables over; a role with CREATEROLE runs: GRANT pycrorm_folder TO %',
+                current_user, quote_ident(current_user);
+        END;
+    END;
     EXECUTE format('GRANT CREATE ON DATABASE %I TO pycrorm_folder', current_database());
     EXECUTE 'ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder';
     EXECUTE 'ALTER SCHEMA {VIEWS} OWNER TO pycrorm_folder';
@@ -47,10 +83,12 @@ _APPENDING = "pycrorm_recorder, pycrorm_folder"
 
 GRANTS: tuple[str, ...] = (
     _MADE,
+    INCARNATION,
     f"REVOKE ALL ON SCHEMA {LOG}, {TABLES}, {VIEWS} FROM PUBLIC",
     f"GRANT USAGE ON SCHEMA {LOG} TO {_READING}",
     f"GRANT SELECT ON ALL TABLES IN SCHEMA {LOG} TO {_READING}",
     f"GRANT INSERT ON {LOG}.event, {LOG}.episode, {LOG}.pycrorm_declaration TO {_APPENDING}",
+    f"GRANT INSERT ON {LOG}.pycrorm_incarnation TO {_APPENDING}",
     f"GRANT UPDATE (head, ended_wall_ns, refused) ON {LOG}.episode TO {_APPENDING}",
     f"GRANT USAGE ON SEQUENCE {LOG}.episode_number TO {_APPENDING}",
     f"GRANT UPDATE (folded, parked) ON {LOG}.episode TO pycrorm_folder",

@@ -1,4 +1,8 @@
-"""What the log says to PostgreSQL. A batch is one statement a table: COPY for events, arrays for the rest."""
+"""What the log says to PostgreSQL. A batch is one statement a table: COPY for events, arrays for the rest.
+
+Every function is named with its schema, so that none of somebody else in the search path is called in its place;
+`unnest` of several arrays alone is syntax, which means the one in pg_catalog and cannot be named so.
+"""
 
 # ruff: noqa: S608 - what is put together here are lists of columns; every value is a parameter
 
@@ -7,13 +11,24 @@ from __future__ import annotations
 __all__ = [
     "INSERT_DECLARATIONS",
     "SELECT_EPISODES_BY_ID",
+    "SELECT_EPISODES_AND_WITNESS",
+    "SELECT_HEADS",
     "NEW_NUMBERS",
+    "SKIP_NUMBERS",
+    "SELECT_NUMBERS_TAKEN",
+    "INSERT_INCARNATION",
+    "SELECT_INCARNATIONS",
+    "SYNCHRONOUS_STANDBYS",
+    "SELECT_SYNCHRONOUS",
     "EVENT_COLUMNS",
     "UPSERT_EPISODES",
+    "WRITE_AHEAD",
     "SELECT_STORED_AGAIN",
     "SELECT_EPISODES",
     "SELECT_BEHIND",
     "SELECT_STOPPED",
+    "SELECT_NUMBER_MAX",
+    "SELECT_LONG",
     "SELECT_EVENTS",
     "SELECT_SPANS",
     "SELECT_DECLARATIONS",
@@ -26,7 +41,21 @@ INSERT INTO pycrorm.pycrorm_declaration (fingerprint, payload)
 SELECT fingerprint, payload FROM unnest($1::text[], $2::text[]) WITH ORDINALITY AS one (fingerprint, payload, place)
 ORDER BY place ON CONFLICT (fingerprint) DO NOTHING"""
 
-NEW_NUMBERS = "SELECT nextval('pycrorm.episode_number') FROM generate_series(1, $1::int)"
+NEW_NUMBERS = "SELECT pg_catalog.nextval('pycrorm.episode_number') FROM pg_catalog.generate_series(1, $1::int)"
+SKIP_NUMBERS = (
+    "SELECT pg_catalog.max(pg_catalog.nextval('pycrorm.episode_number')) FROM pg_catalog.generate_series(1, $1::int)"
+)
+SELECT_NUMBERS_TAKEN = "SELECT number FROM pycrorm.episode WHERE number = ANY ($1::bigint[])"
+
+INSERT_INCARNATION = """
+INSERT INTO pycrorm.pycrorm_incarnation (noticed_wall_ns, noticed_by, reason) VALUES ($1, $2, $3)"""
+SELECT_INCARNATIONS = """
+SELECT noticed_wall_ns, noticed_by, reason FROM pycrorm.pycrorm_incarnation ORDER BY number"""
+
+SYNCHRONOUS_STANDBYS = "SELECT pg_catalog.current_setting('synchronous_standby_names')"
+SELECT_SYNCHRONOUS = """
+SELECT application_name FROM pg_catalog.pg_stat_replication
+WHERE sync_state IN ('sync', 'quorum') ORDER BY application_name"""
 
 EVENT_COLUMNS = ("episode", "sequence", "type", "version", "wall_ns", "monotonic_ns", "payload")
 
@@ -36,9 +65,13 @@ SELECT * FROM unnest($1::bigint[], $2::text[], $3::bigint[], $4::bigint[], $5::b
 ON CONFLICT (number) DO UPDATE
 SET head = excluded.head, ended_wall_ns = excluded.ended_wall_ns, refused = excluded.refused"""
 
+WRITE_AHEAD = "SELECT pg_catalog.pg_logical_emit_message(true, 'pycrorm', '')"
+"""Writes an empty message into the server's write-ahead log: a COMMIT with nothing there waits for no standby, and
+would acknowledge what another transaction committed and no standby has yet."""
+
 _EVENT = (
     "event.episode, event.sequence, event.type, event.version, event.wall_ns, event.monotonic_ns,"
-    " convert_to(event.payload, 'UTF8')"
+    " pg_catalog.convert_to(event.payload, 'UTF8')"
 )
 
 SELECT_STORED_AGAIN = f"""
@@ -51,6 +84,12 @@ _EPISODE = "number, id, head, folded, started_wall_ns, ended_wall_ns, refused, p
 SELECT_EPISODES_BY_ID = f"""
 SELECT {_EPISODE} FROM pycrorm.episode WHERE id = ANY ($1::text[]) ORDER BY number FOR UPDATE"""
 
+# The witness is read as it is, so that the appends of two recorders do not wait for each other.
+SELECT_EPISODES_AND_WITNESS = f"""
+WITH locked AS MATERIALIZED ({SELECT_EPISODES_BY_ID})
+SELECT * FROM locked UNION ALL SELECT {_EPISODE} FROM pycrorm.episode WHERE id = $2"""
+
+SELECT_HEADS = f"SELECT {_EPISODE} FROM pycrorm.episode WHERE id = ANY ($1::text[])"
 SELECT_EPISODE_BY_ID = f"SELECT {_EPISODE} FROM pycrorm.episode WHERE id = $1"
 SELECT_EPISODES = f"SELECT {_EPISODE} FROM pycrorm.episode ORDER BY number"
 SELECT_BEHIND = f"""
@@ -58,6 +97,9 @@ SELECT {_EPISODE} FROM pycrorm.episode
 WHERE folded < head AND parked IS NULL AND number > $1 ORDER BY number LIMIT $2"""
 SELECT_STOPPED = f"""
 SELECT {_EPISODE} FROM pycrorm.episode WHERE refused IS NOT NULL OR parked IS NOT NULL ORDER BY number"""
+SELECT_NUMBER_MAX = "SELECT coalesce(max(number), 0) FROM pycrorm.episode"
+SELECT_LONG = f"""
+SELECT {_EPISODE} FROM pycrorm.episode WHERE head >= $1 AND ended_wall_ns IS NULL ORDER BY number"""
 
 SELECT_EVENTS = f"""
 SELECT {_EVENT} FROM pycrorm.event WHERE episode = $1 AND sequence > $2 ORDER BY sequence LIMIT $3"""
@@ -70,7 +112,7 @@ WITH ORDINALITY AS span (number, after, last, place) CROSS JOIN LATERAL (
     WHERE episode = span.number AND sequence > span.after AND sequence <= span.last ORDER BY sequence
 ) AS event ORDER BY span.place, event.sequence"""
 
-SELECT_DECLARATIONS = "SELECT convert_to(payload, 'UTF8') FROM pycrorm.pycrorm_declaration ORDER BY ordinal"
+SELECT_DECLARATIONS = "SELECT pg_catalog.convert_to(payload, 'UTF8') FROM pycrorm.pycrorm_declaration ORDER BY ordinal"
 
 # The rows are taken by number first, as everywhere: an UPDATE by itself takes them in whatever order it meets them, and
 # two who fold the same episodes would now and then wait for each other in a circle, for a second each time.

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
-from pycrorm_async.store.postgresql.engine import LOG_SCHEMA as LOG
-from pycrorm_async.store.postgresql.engine import TABLES_SCHEMA as TABLES
-from pycrorm_async.store.postgresql.engine import VIEWS_SCHEMA as VIEWS
+from pycrorm_async.store.postgresql.path import LOG_SCHEMA as LOG
+from pycrorm_async.store.postgresql.path import PATH, STRANGER
+from pycrorm_async.store.postgresql.path import TABLES_SCHEMA as TABLES
+from pycrorm_async.store.postgresql.path import VIEWS_SCHEMA as VIEWS
 
 __all__ = [
     "MIGRATIONS",
+    "INCARNATION",
+    "HAS_INCARNATION",
     "TABLE_NAMES",
     "HAS_TABLE",
     "READ_LOG",
@@ -25,14 +28,18 @@ __all__ = [
     "NEW_VIEWS_SCHEMA",
     "SHOW_NEW_VIEWS_SCHEMA",
     "GONE_SCHEMAS",
+    "SYSTEM_COLUMNS",
 ]
 
-SERVER_VERSION = "SELECT current_setting('server_version_num')::int"
+SYSTEM_COLUMNS = frozenset("xmin xmax cmin cmax ctid tableoid".split())
+"""Every table has them already; a view may have its own."""
 
-ALONE = "SELECT pg_advisory_xact_lock(7266203370152417861)"
+SERVER_VERSION = "SELECT pg_catalog.current_setting('server_version_num')::int"
+
+ALONE = "SELECT pg_catalog.pg_advisory_xact_lock(7266203370152417861)"
 """The number says who we are: the first letters of our name as a number. IF NOT EXISTS alone races."""
-CLAIM = "SELECT pg_try_advisory_lock(7266203370152417862)"
-RELEASE = "SELECT pg_advisory_unlock(7266203370152417862)"
+CLAIM = "SELECT pg_catalog.pg_try_advisory_lock(7266203370152417862)"
+RELEASE = "SELECT pg_catalog.pg_advisory_unlock(7266203370152417862)"
 
 # Less than deadlock_timeout: whoever changes tables is the one who gives up, never a reader.
 WAIT_BRIEFLY = "SET LOCAL lock_timeout = '300ms'"
@@ -42,11 +49,11 @@ WAIT_AS_EVER = "SET LOCAL lock_timeout TO DEFAULT"
 _NEW = f"{VIEWS}_new"
 
 IN_VIEWS_SCHEMA = f"""
-SELECT coalesce(relname, objid::text) FROM pg_namespace
-JOIN pg_depend ON refclassid = 'pg_namespace'::regclass AND refobjid = pg_namespace.oid
-LEFT JOIN pg_class ON classid = 'pg_class'::regclass AND pg_class.oid = objid
+SELECT coalesce(relname, objid::text) FROM pg_catalog.pg_namespace
+JOIN pg_catalog.pg_depend ON refclassid = 'pg_catalog.pg_namespace'::regclass::oid AND refobjid = pg_namespace.oid
+LEFT JOIN pg_catalog.pg_class ON classid = 'pg_catalog.pg_class'::regclass::oid AND pg_class.oid = objid
 WHERE nspname = '{VIEWS}' AND (relname = ANY ($1::text[])) IS NOT TRUE
-AND classid <> 'pg_default_acl'::regclass"""  # noqa: S608
+AND classid <> 'pg_catalog.pg_default_acl'::regclass::oid"""  # noqa: S608
 """What is in the schema of the views beside these."""
 
 NEW_VIEWS_SCHEMA = (
@@ -57,18 +64,25 @@ SHOW_NEW_VIEWS_SCHEMA = (
     f"""
 DO $$
 BEGIN
-    IF to_regnamespace('{VIEWS}') IS NOT NULL THEN
-        EXECUTE format('ALTER SCHEMA {VIEWS} RENAME TO %I', '{VIEWS}_gone_' || pg_current_xact_id());
+    IF pg_catalog.to_regnamespace('{VIEWS}') IS NOT NULL THEN
+        EXECUTE pg_catalog.format(
+            'ALTER SCHEMA {VIEWS} RENAME TO %I',
+            pg_catalog.concat(
+                '{VIEWS}_gone_', pg_catalog.pg_current_xact_id(), '_', pg_catalog.to_regnamespace('{VIEWS}')::oid
+            )
+        );
     END IF;
 END $$""",
     f"ALTER SCHEMA {_NEW} RENAME TO {VIEWS}",
-    "SET LOCAL search_path TO DEFAULT",
+    f"SET LOCAL search_path = {PATH}",
 )
 
 GONE_SCHEMAS = f"""
-SELECT quote_ident(nspname), array_agg(format('%I.%I', nspname, relname)) FILTER (WHERE relkind = 'v')
-FROM pg_namespace LEFT JOIN pg_class ON relnamespace = pg_namespace.oid
-WHERE starts_with(nspname, '{VIEWS}_gone_') AND pg_has_role(nspowner, 'USAGE') GROUP BY nspname"""  # noqa: S608
+SELECT pg_catalog.quote_ident(nspname),
+pg_catalog.array_agg(pg_catalog.format('%I.%I', nspname, relname)) FILTER (WHERE relkind = 'v')
+FROM pg_catalog.pg_namespace LEFT JOIN pg_catalog.pg_class ON relnamespace = pg_namespace.oid
+WHERE pg_catalog.starts_with(nspname::text, '{VIEWS}_gone_') AND pg_catalog.pg_has_role(nspowner, 'USAGE')
+GROUP BY nspname"""  # noqa: S608
 """Schemas of views that were replaced, and the views in them."""
 
 _LOG = f"""
@@ -99,8 +113,10 @@ CREATE TABLE {LOG}.episode (
     ended_wall_ns bigint,
     refused text,
     parked text
-) WITH (fillfactor = 50)"""
+)"""
 
+# Whether an episode is behind changes with each append and each fold, so no update of a row is heap-only, however much
+# room its page has. That is the price of a poll that costs the same with any number of episodes.
 _BEHIND = f"CREATE INDEX episode_behind ON {LOG}.episode (number) WHERE folded < head AND parked IS NULL"
 _STOPPED = f"CREATE INDEX episode_stopped ON {LOG}.episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
 
@@ -152,8 +168,20 @@ _FIRST = (
 
 MIGRATIONS: tuple[tuple[str, ...], ...] = (_FIRST,)
 
-TABLE_NAMES = f"SELECT relname FROM pg_class WHERE relnamespace = to_regnamespace('{LOG}')"  # noqa: S608
-HAS_TABLE = f"SELECT to_regclass(format('{TABLES}.%I', $1::text)) IS NOT NULL"
+INCARNATION = f"""
+CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_incarnation (
+    number bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    noticed_wall_ns bigint NOT NULL,
+    noticed_by text NOT NULL,
+    reason text NOT NULL
+)"""
+"""Made when a log is first found to have gone back, and no part of its format: older programs read and write it."""
+HAS_INCARNATION = f"SELECT pg_catalog.to_regclass('{LOG}.pycrorm_incarnation') IS NOT NULL"
+
+TABLE_NAMES = f"""
+SELECT relname FROM pg_catalog.pg_class WHERE relnamespace = pg_catalog.to_regnamespace('{LOG}')::oid"""  # noqa: S608
+HAS_TABLE = f"""
+SELECT pg_catalog.to_regclass(pg_catalog.format('{TABLES}.%I', $1::text)) IS NOT NULL, ({STRANGER}), session_user"""
 READ_LOG = f"SELECT id, format FROM {LOG}.pycrorm_log"  # noqa: S608
 INSERT_LOG = f"INSERT INTO {LOG}.pycrorm_log (one, id, format, created_wall_ns) VALUES (1, $1, $2, $3)"  # noqa: S608
 SET_FORMAT = f"UPDATE {LOG}.pycrorm_log SET format = $1"  # noqa: S608

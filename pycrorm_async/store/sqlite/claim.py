@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pycrorm_async.errors import DatabaseUnavailable
@@ -14,13 +14,18 @@ __all__ = ["claim"]
 
 
 @contextmanager
-def claim(path: Path) -> Iterator[bool]:
-    """Whether this file could be locked; it is until the context is left or the process dies.
+def claim(database: Path) -> Iterator[bool]:
+    """Whether the file beside this database could be locked; it is until the context is left or the process dies.
+
+    Its mode is the database's, so that a process of the same group can take over what a killed one left.
 
     Raises `DatabaseUnavailable` where no file can be made.
     """
+    path = database.with_name(f"{database.name}-rebuild")
     try:
-        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        with suppress(PermissionError):  # another user made it
+            os.fchmod(file, database.stat().st_mode & 0o666)
     except OSError as error:
         raise DatabaseUnavailable(f"{path} cannot be made: {error.strerror}") from error
     try:

@@ -16,8 +16,18 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk import make
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, PycrormError
-from pycrorm_async.store.dialect import Birth, Expected, Found, Insertion, Migrations, Progress, RowRefused, RowsByTable
-from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
+from pycrorm_async.store.dialect import (
+    Birth,
+    Expected,
+    Found,
+    Insertion,
+    Migrations,
+    Progress,
+    RowRefused,
+    RowsByTable,
+    StoredOn,
+)
+from pycrorm_async.store.rows import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
 from pycrorm_async.store.sqlite import faults, tables
 from pycrorm_async.store.sqlite import statements as sql
 from pycrorm_async.store.sqlite.binding import bound, inserts
@@ -70,12 +80,37 @@ class SQLite:
     async def insert_declarations(self, connection: AsyncConnection, named: Sequence[tuple[str, str]]) -> None:
         await connection.exec_driver_sql(sql.INSERT_DECLARATIONS, (_json(named),))
 
-    async def episodes_by_id(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
+    async def episodes_by_id(
+        self, connection: AsyncConnection, ids: Sequence[str], *, witness: str | None = None
+    ) -> list[EpisodeRow]:
+        return await self.heads(connection, ids if witness is None else [*ids, witness])
+
+    async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
+        taken = (await connection.exec_driver_sql(sql.SELECT_NUMBER_MAX)).scalar_one()
+        if taken < above:
+            taken = above + numbers_reserved(above)
+        return list(range(taken + 1, taken + 1 + count))
+
+    async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
+        """A number is one more than the highest one there is: `new_numbers` knows those that were lost."""
+
+    async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:
+        return set((await connection.exec_driver_sql(sql.SELECT_NUMBERS_TAKEN, (_json(numbers),))).scalars())
+
+    async def heads(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, sql.SELECT_EPISODES_BY_ID, _json(ids))
 
-    async def new_numbers(self, connection: AsyncConnection, count: int) -> list[int]:
-        taken = (await connection.exec_driver_sql(sql.SELECT_NUMBER_MAX)).scalar_one()
-        return list(range(taken + 1, taken + 1 + count))
+    async def note_incarnation(self, connection: AsyncConnection, incarnation: Incarnation) -> None:
+        await connection.exec_driver_sql(tables.INCARNATION)
+        await connection.exec_driver_sql(sql.INSERT_INCARNATION, incarnation)
+
+    async def incarnations(self, connection: AsyncConnection) -> list[Incarnation]:
+        if not await self.has_table(connection, "pycrorm_incarnation"):
+            return []
+        return await _rows(Incarnation, connection, sql.SELECT_INCARNATIONS)
+
+    async def stored_on(self, connection: AsyncConnection) -> StoredOn:  # noqa: ARG002
+        return StoredOn(1)
 
     async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
         return await self.insertion({("event", sql.EVENT_COLUMNS): rows})
@@ -85,6 +120,12 @@ class SQLite:
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(each) for each in episodes]),))
+
+    async def note_again(self, connection: AsyncConnection) -> None:
+        """Nothing has to be done: what another transaction committed is on the disk before this one sees it."""
+
+    async def commit(self, connection: AsyncConnection) -> None:
+        await connection.commit()
 
     async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_STORED_AGAIN, _json(keys))
@@ -102,6 +143,12 @@ class SQLite:
 
     async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, sql.SELECT_STOPPED)
+
+    async def last_number(self, connection: AsyncConnection) -> int:
+        return int((await connection.exec_driver_sql(sql.SELECT_NUMBER_MAX)).scalar_one())
+
+    async def long_episodes(self, connection: AsyncConnection, events_min: int) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, sql.SELECT_LONG, events_min)
 
     async def events(self, connection: AsyncConnection, number: int, *, after: int, limit: int) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
@@ -160,6 +207,9 @@ class SQLite:
             ]
         await connection.exec_driver_sql(sql.EXPECT, (_json(rows),))
 
+    def stored_column(self, name: str) -> str:
+        return name
+
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
         await connection.exec_driver_sql(f"ALTER TABLE {_quote(table)} ADD COLUMN {definition}")
 
@@ -191,7 +241,7 @@ class SQLite:
 
     @asynccontextmanager
     async def claim(self, engine: AsyncEngine) -> AsyncIterator[bool]:
-        with claim(Path(f"{engine.url.database}-rebuild")) as claimed:
+        with claim(Path(engine.url.database or "")) as claimed:
             yield claimed
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
@@ -222,6 +272,9 @@ class SQLite:
             await (await _driver(connection)).execute_in_turn(statements)
 
     # --- faults -------------------------------------------------------------------------------------------------
+
+    def refusal(self, error: Exception) -> str | None:
+        return faults.refusal(error.orig if isinstance(error, DBAPIError) else error)
 
     def ours(self, error: Exception, name: str) -> PycrormError:
         return faults.ours(error.orig if isinstance(error, DBAPIError) else error, name)

@@ -12,7 +12,7 @@ from pycrorm_async.errors import (
     PycrormError,
 )
 
-__all__ = ["ours"]
+__all__ = ["ours", "refusal"]
 
 _AWAY = {
     sqlite3.SQLITE_PERM,
@@ -49,3 +49,12 @@ def ours(fault: BaseException | None, database: str) -> PycrormError:
     if primary in _AWAY:
         return DatabaseUnavailable(f"{database}: {fault}")
     return InternalError(f"{database}: {fault}")
+
+
+def refusal(fault: BaseException | None) -> str | None:
+    """Why SQLite never makes a table or view of such a definition; None for a fault of another kind."""
+    code = getattr(fault, "sqlite_errorcode", None)
+    if code is None or code & 0xFF not in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_TOOBIG):
+        return None
+    # A full disk ends the transaction, and the savepoint that was made for the attempt is gone with it.
+    return None if "savepoint" in str(fault) or "transaction" in str(fault) else str(fault)

@@ -14,12 +14,16 @@ __all__ = [
     "INSERT_DECLARATIONS",
     "SELECT_EPISODES_BY_ID",
     "SELECT_NUMBER_MAX",
+    "SELECT_NUMBERS_TAKEN",
+    "INSERT_INCARNATION",
+    "SELECT_INCARNATIONS",
     "EVENT_COLUMNS",
     "UPSERT_EPISODES",
     "SELECT_STORED_AGAIN",
     "SELECT_EPISODES",
     "SELECT_BEHIND",
     "SELECT_STOPPED",
+    "SELECT_LONG",
     "SELECT_EVENTS",
     "SELECT_SPAN",
     "SELECT_DECLARATIONS",
@@ -35,6 +39,10 @@ INSERT INTO pycrorm_declaration (fingerprint, payload)
 SELECT value->>0, value->>1 FROM json_each(?) WHERE true ON CONFLICT (fingerprint) DO NOTHING"""
 
 SELECT_NUMBER_MAX = "SELECT coalesce(max(number), 0) FROM episode"
+SELECT_NUMBERS_TAKEN = "SELECT number FROM episode WHERE number IN (SELECT value FROM json_each(?))"
+
+INSERT_INCARNATION = "INSERT INTO pycrorm_incarnation (noticed_wall_ns, noticed_by, reason) VALUES (?, ?, ?)"
+SELECT_INCARNATIONS = "SELECT noticed_wall_ns, noticed_by, reason FROM pycrorm_incarnation ORDER BY number"
 
 EVENT_COLUMNS = ("episode", "sequence", "type", "version", "wall_ns", "monotonic_ns", "payload")
 
@@ -61,6 +69,7 @@ SELECT_EPISODES = f"SELECT {_EPISODE} FROM episode ORDER BY number"
 SELECT_BEHIND = f"""
 SELECT {_EPISODE} FROM episode WHERE folded < head AND parked IS NULL AND number > ? ORDER BY number LIMIT ?"""
 SELECT_STOPPED = f"SELECT {_EPISODE} FROM episode WHERE refused IS NOT NULL OR parked IS NOT NULL ORDER BY number"
+SELECT_LONG = f"SELECT {_EPISODE} FROM episode WHERE head >= ? AND ended_wall_ns IS NULL ORDER BY number"
 
 SELECT_EVENTS = f"SELECT {_EVENT} FROM event WHERE episode = ? AND sequence > ? ORDER BY sequence LIMIT ?"
 

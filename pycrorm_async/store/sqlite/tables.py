@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 
-__all__ = ["MIGRATIONS", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
+__all__ = ["MIGRATIONS", "INCARNATION", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
 
 
 def _refuse(name: str, change: str, table: str) -> str:
@@ -76,6 +76,15 @@ _FIRST = (
 )
 
 MIGRATIONS: tuple[tuple[str, ...], ...] = (_FIRST,)
+
+INCARNATION = """
+CREATE TABLE IF NOT EXISTS pycrorm_incarnation (
+    number INTEGER PRIMARY KEY,
+    noticed_wall_ns INTEGER NOT NULL,
+    noticed_by TEXT NOT NULL,
+    reason TEXT NOT NULL
+) STRICT"""
+"""Made when a log is first found to have gone back, and no part of its format: older programs read and write it."""
 
 TABLE_NAMES = (
     "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"

@@ -1,0 +1,59 @@
+"""Warnings before an episode, or a memory, has used up its numbers.
+
+Row ids have 53 bits: 22 for the episode's number, 26 for the event's sequence. Both limits are far away (a thousand
+episodes a day for eleven years, a week of a hundred events a second), so that a user who comes near one has time to
+act: from nine tenths on `status` warns, and the process that stores the events writes one line to its log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
+from pycrorm_async.store.rows import EpisodeRow
+
+__all__ = ["EPISODES_MANY", "EVENTS_MANY", "number_warning", "events_warning", "warnings_of"]
+
+EPISODES_MANY = EPISODE_NUMBER_MAX * 9 // 10 + 1
+"""From this episode number on a memory is nearly full: 3,774,873."""
+
+EVENTS_MANY = SEQUENCE_MAX * 9 // 10 + 1
+"""From this sequence on an episode is nearly full: 60,397,977."""
+
+
+def number_warning(number: int) -> str | None:
+    """Why the latest episode number of a memory is worth a warning; None if it is not.
+
+    >>> number_warning(4_000_000)
+    '4,000,000 of 4,194,303 episode numbers are used (95 %): record into a new database before none is left'
+    """
+    if number < EPISODES_MANY:
+        return None
+    if number >= EPISODE_NUMBER_MAX:
+        return (
+            f"all {EPISODE_NUMBER_MAX:,} episode numbers are used: new episodes are kept in the spool until it belongs"
+            " to a new database"
+        )
+    share = number * 100 // EPISODE_NUMBER_MAX
+    return (
+        f"{number:,} of {EPISODE_NUMBER_MAX:,} episode numbers are used ({share} %): record into a new database before"
+        " none is left"
+    )
+
+
+def events_warning(episode: EpisodeRow) -> str | None:
+    """Why an episode that has not ended is worth a warning; None if it is not."""
+    if episode.head < EVENTS_MANY or episode.ended_wall_ns is not None:
+        return None
+    share = episode.head * 100 // SEQUENCE_MAX
+    return (
+        f"episode {episode.number} ({episode.id}) has {episode.head:,} of {SEQUENCE_MAX:,} events ({share} %): it goes"
+        " on in a follow-up episode before its last one"
+    )
+
+
+def warnings_of(episodes: Sequence[EpisodeRow]) -> dict[str, str]:
+    """The warnings that these rows are worth, by what they limit: "numbers", or the id of an episode."""
+    last = max((each.number for each in episodes), default=0)
+    found = {"numbers": number_warning(last)} | {each.id: events_warning(each) for each in episodes}
+    return {what: warning for what, warning in found.items() if warning is not None}

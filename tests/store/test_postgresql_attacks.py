@@ -1,0 +1,187 @@
+"""A member of `pycrorm_folder` who plants code in the tables' schemas gains no right that the owner has.
+
+Each attack is a real login. It plants a payload that rewrites the log, which only the owner can, and gives itself the
+owner's rights back first with RESET ROLE. Then the owner does everything that comes across the tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from sqlalchemy import text
+
+from pycrorm_async import Memory
+from pycrorm_async.adoption import recover
+from pycrorm_async.errors import PycrormError, TablesUntrusted
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.postgresql.roles import GRANTS
+from tests.crash.walking import SETTINGS, StepActionPerformable
+from tests.databases import Server, ask
+
+PAYLOAD = """
+CREATE FUNCTION memory_tables.payload() RETURNS void LANGUAGE plpgsql AS $$
+BEGIN
+    RESET ROLE;
+    SET LOCAL default_transaction_read_only = off;
+    ALTER TABLE pycrorm.event DISABLE TRIGGER ALL;
+    UPDATE pycrorm.event SET payload = '{"rewritten":true}';
+EXCEPTION WHEN OTHERS THEN
+    RETURN;
+END $$"""
+
+
+def shadow(signature: str, result: str, value: str) -> str:
+    """A function that PostgreSQL takes instead of its own where the arguments match better."""
+    return (
+        f"CREATE FUNCTION memory_tables.{signature} RETURNS {result} LANGUAGE plpgsql AS"
+        f" $$ BEGIN PERFORM memory_tables.payload(); RETURN {value}; END $$"
+    )
+
+
+def trigger_on(table: str, when: str) -> str:
+    return (
+        f"CREATE TRIGGER planted BEFORE {when} ON memory_tables.{table}"
+        " FOR EACH ROW EXECUTE FUNCTION memory_tables.planted()"
+    )
+
+
+def view_instead_of(table: str) -> Sequence[str]:
+    return (
+        f"ALTER TABLE memory_tables.{table} RENAME TO moved",
+        f"CREATE VIEW memory_tables.{table} AS SELECT * FROM memory_tables.moved WHERE memory_tables.is_shown()",
+    )
+
+
+FUNCTIONS = (
+    PAYLOAD,
+    shadow("planted()", "trigger", "NEW"),
+    shadow("is_shown()", "boolean", "true"),
+    shadow("one()", "integer", "1"),
+    shadow("same(oid, regnamespace)", "boolean", "true"),
+)
+ATTACKS: dict[str, Sequence[str]] = {
+    "functions and an operator that shadow those of the catalogue": (
+        shadow("starts_with(name, text)", "boolean", "false"),
+        shadow("format(text, text)", "text", "'memory_tables.pycrorm_generation'"),
+        shadow("convert_to(text, text)", "bytea", "'\\x7b7d'"),
+        shadow("nextval(text)", "bigint", "77"),
+        "CREATE OPERATOR memory_tables.= (LEFTARG = oid, RIGHTARG = regnamespace, FUNCTION = memory_tables.same)",
+    ),
+    "triggers on tables that are folded into": (
+        trigger_on("process_metadata__1", "INSERT"),
+        trigger_on("pycrorm_generation", "INSERT OR UPDATE"),
+    ),
+    "a view in the place of a table": view_instead_of("object__1"),
+    "a view in the place of the note of the generations": view_instead_of("pycrorm_generation"),
+    "a default value": (
+        "ALTER TABLE memory_tables.process_metadata__1 ADD COLUMN planted integer DEFAULT memory_tables.one()",
+    ),
+}
+
+
+@pytest.fixture(params=["superuser"])
+async def owner(request: pytest.FixtureRequest, server: Server, tmp_path: Path) -> str:
+    """The URL of the owner of a memory with roles and with one action in its tables."""
+    url = server.new_database()
+    database = urlsplit(url).path.removeprefix("/")
+    if request.param == "ordinary":
+        ask(url, f"CREATE ROLE owner_of_{database} LOGIN CREATEROLE")
+        ask(url, f"ALTER DATABASE {database} OWNER TO owner_of_{database}")
+        for role in ("recorder", "folder", "reader"):
+            with suppress(Exception):
+                ask(url, f"CREATE ROLE pycrorm_{role}")
+        ask(url, f"GRANT pycrorm_folder TO owner_of_{database}")
+        url = server.url(database, user=f"owner_of_{database}")
+    await _record(url, tmp_path / "spool", "first", 1)
+    for statement in GRANTS:
+        ask(url, statement)
+    return url
+
+
+def member(server: Server, url: str, role: str) -> str:
+    """The URL of a login that is a member of this role and of no other."""
+    database = urlsplit(url).path.removeprefix("/")
+    name = f"{role}_of_{database}"
+    ask(server.url(database), f"CREATE ROLE {name} LOGIN IN ROLE pycrorm_{role}")
+    ask(server.url(database), f"ALTER ROLE {name} IN DATABASE {database} SET role = 'pycrorm_{role}'")
+    return server.url(database, user=name)
+
+
+async def _record(url: str, spool: Path, description: str, step: int) -> None:
+    opening = Memory.open(url, spool=spool, settings=SETTINGS)
+    async with opening as memory, memory.episode(description=description):
+        await StepActionPerformable("a", step).perform()
+
+
+async def _do_everything(url: str, spool: Path) -> None:
+    """Whatever an owner does with a memory; each that is refused is refused with an error of ours."""
+    address = DatabaseAddress.parse(url)
+    with suppress(PycrormError):
+        await _record(url, spool, "more", 2)
+    with suppress(PycrormError):
+        await recover(url, spool=spool)
+    log = await EventLog.open(address, create=False)
+    for each in await log.episodes():
+        await log.events(each.number)
+    await log.declarations()
+    with suppress(PycrormError):
+        await verify(log)
+    await log.close()
+    with suppress(PycrormError):
+        async with Reading.open(url) as reading:
+            await reading.episodes()
+            await reading.tree(1)
+    with suppress(PycrormError):
+        await rebuild_memory(url, workers=1)
+    for statement in GRANTS:
+        ask(url, statement)
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+async def test_a_folder_cannot_rewrite_the_log_by_code_that_the_owner_comes_across(
+    attack: str, owner: str, server: Server, tmp_path: Path
+) -> None:
+    attacker = member(server, owner, "folder")
+    before = ask(owner, "SELECT episode, sequence, payload FROM pycrorm.event ORDER BY 1, 2")
+    for statement in (*FUNCTIONS, *ATTACKS[attack]):
+        ask(attacker, statement)
+    await _do_everything(owner, tmp_path / "spool")
+    after = ask(owner, "SELECT episode, sequence, payload FROM pycrorm.event ORDER BY 1, 2")
+    assert after[: len(before)] == before
+    assert len(after) > len(before)  # the owner's own episode was appended
+    enabled = "SELECT DISTINCT tgenabled FROM pg_trigger WHERE tgrelid = 'pycrorm.event'::regclass"
+    assert ask(owner, enabled) == [(b"O",)]
+
+
+@pytest.mark.parametrize("owner", ["superuser", "ordinary"], indirect=True)
+async def test_the_owner_is_refused_at_the_tables_and_another_login_folds_what_the_owner_appended(
+    owner: str, server: Server, tmp_path: Path
+) -> None:
+    folder, reader = (member(server, owner, role) for role in ("folder", "reader"))
+    with pytest.raises(TablesUntrusted, match="fold with a login that is a member of pycrorm_folder"):
+        await _record(owner, tmp_path / "spool", "more", 2)
+    log = await EventLog.open(DatabaseAddress.parse(folder), create=True)
+    projector = Projector(log)
+    await projector.open()
+    assert await projector.fold_behind() > 0
+    assert (await verify(log)).drift == 0
+    await log.close()
+    assert ask(reader, "SELECT step FROM memory.step_action ORDER BY step") == [(1,), (2,)]
+    async with Reading.open(reader) as reading:
+        assert [each.description for each in await reading.episodes()] == ["first", "more"]
+    log = await EventLog.open(DatabaseAddress.parse(owner), create=True)
+    async with log.reading() as connection:  # so that nothing there is found in place of what is in pg_catalog
+        assert (await connection.execute(text("SHOW search_path"))).scalar_one() == "pycrorm"
+    await log.close()
+    with pytest.raises(TablesUntrusted, match="read with one of pycrorm_reader"):
+        async with Reading.open(owner):
+            pass

@@ -1,0 +1,92 @@
+"""`GRANTS` run by an owner of a database who is no superuser, with and without the right to create roles."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import asyncpg
+import pytest
+
+from pycrorm_async.errors import TablesUntrusted
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.postgresql.roles import GRANTS
+from tests.databases import Server, ask, server_in
+from tests.store.making import episode, run_of
+
+
+@pytest.fixture(scope="module")
+def new_server() -> Iterator[Server]:
+    """A server that never had the roles of a memory, which belong to a whole server."""
+    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
+        yield running
+
+
+def owned(server: Server, *, may: str) -> str:
+    """The URL of an ordinary owner of a new database, who has this attribute."""
+    url = server.new_database()
+    database = urlsplit(url).path.removeprefix("/")
+    ask(url, f"CREATE ROLE owner_of_{database} LOGIN {may}")
+    ask(url, f"ALTER DATABASE {database} OWNER TO owner_of_{database}")
+    return server.url(database, user=f"owner_of_{database}")
+
+
+async def make_log(url: str) -> EventLog:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    await Projector(log).open()
+    await log.append(run_of(episode(1), 1, 1))
+    return log
+
+
+def grant(url: str) -> None:
+    for statement in GRANTS:
+        ask(url, statement)
+
+
+async def test_an_owner_gets_the_statements_that_are_missing_runs_them_by_another_and_keeps_the_log(
+    new_server: Server,
+) -> None:
+    # One after the other: the roles are missing only on a server where no memory has them.
+    url = owned(new_server, may="NOCREATEROLE")
+    login = urlsplit(url).username
+    superuser = new_server.url(urlsplit(url).path.removeprefix("/"))
+    with pytest.raises(asyncpg.RaiseError, match="the memory has no tables yet: run `pycrorm writer --once` first"):
+        grant(url)
+    log = await make_log(url)
+    with pytest.raises(asyncpg.RaiseError, match="may not create roles; a role with CREATEROLE runs: ") as missing:
+        grant(url)
+    assert "pycrorm_recorder, pycrorm_folder, pycrorm_reader are missing" in str(missing.value)
+    *create, member = str(missing.value).partition("runs: ")[2].split("; ")
+    assert member == f"GRANT pycrorm_folder TO {login}"
+    for statement in create:
+        ask(superuser, statement)
+    with pytest.raises(asyncpg.RaiseError, match=f"a role with CREATEROLE runs: GRANT pycrorm_folder TO {login}$"):
+        grant(url)
+    ask(superuser, member)
+    grant(url)
+    grant(url)
+    # The log is the owner's as before, through connections from before and new ones.
+    assert await log.append(run_of(episode(1), 2, 3)) == {}
+    await log.close()
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    assert await log.append(run_of(episode(2), 1, 2)) == {}
+    assert [each.head for each in await log.episodes()] == [3, 2]
+    with pytest.raises(TablesUntrusted):
+        await Projector(log).open()
+    await log.close()
+
+    # Who may create roles needs nobody else.
+    url = owned(new_server, may="CREATEROLE")
+    for role in ("recorder", "folder", "reader"):
+        ask(superuser, f"DROP OWNED BY pycrorm_{role}")
+    for role in ("recorder", "folder", "reader"):
+        ask(superuser, f"DROP ROLE pycrorm_{role}")
+    await (await make_log(url)).close()
+    grant(url)
+    grant(url)
+    tables_owner = "SELECT nspowner::regrole::text FROM pg_namespace WHERE nspname = 'memory_tables'"
+    assert ask(url, tables_owner) == [("pycrorm_folder",)]

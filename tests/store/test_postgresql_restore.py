@@ -1,0 +1,171 @@
+"""While a backup is put back, tables of the memory are missing: writers wait, readers get a line, no log is made."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from pycrorm_async import Memory
+from pycrorm_async.adoption import recover
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.backoff import Backoff
+from pycrorm_async.writer.drain import Drain
+from tests.crash.walking import SETTINGS, StepActionPerformable
+from tests.databases import Server, ask
+from tests.store.making import declaration, episode, run_of
+from tests.writer.ends import CountingFold, KeptSource
+
+QUICKLY = Backoff(first_s=0.005, longest_s=0.02)
+DROP = "DROP SCHEMA IF EXISTS pycrorm, memory_tables, memory CASCADE"
+
+
+@pytest.fixture
+def database_url(server: Server) -> str:
+    """All of this is about PostgreSQL."""
+    return server.new_database()
+
+
+def run_tool(server: Server, tool: str, *arguments: str) -> None:
+    command = [str(server.programs / tool), "--username=postgres", f"--host={server.folder}", *arguments]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def _away(memory: Memory) -> str | None:
+    writer = memory.status.writer
+    return None if writer is None else writer.queue.away
+
+
+class Backup:
+    """A backup of a database by the server's own tools."""
+
+    def __init__(self, server: Server, url: str, file: Path) -> None:
+        self._server, self._file = server, file
+        self._database = urlsplit(url).path.removeprefix("/")
+        run_tool(server, "pg_dump", "--format=custom", f"--file={file}", self._database)
+
+    def put_back(self, *sections: str) -> None:
+        """All of it, or sections of it: `pre-data` makes the tables, `data` fills them, `post-data` adds keys."""
+        chosen = [f"--section={each}" for each in sections]
+        run_tool(self._server, "pg_restore", f"--dbname={self._database}", *chosen, str(self._file))
+
+
+async def until_asked_again(drain: Drain, *, times: int) -> None:
+    """Waits until the drain has met so many refusals more."""
+    enough = drain.state.retries + times
+    while drain.state.retries < enough:  # noqa: ASYNC110  nothing tells of it
+        await asyncio.sleep(0.001)
+
+
+async def test_a_writer_waits_while_its_tables_are_dropped_and_put_back_step_by_step(
+    server: Server, database_url: str, tmp_path: Path
+) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    await Projector(log).open()
+    first = [declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 20, position=2)]
+    rest = [declaration(b'{"dtype":"B"}', position=22), *run_of(episode(1), 21, 40, position=23)]
+    rest += run_of(episode(2), 1, 10, position=43)
+    source = KeptSource(first)
+    drain = Drain(source, CountingFold(log), settings=SETTINGS, backoff=QUICKLY)
+    async with asyncio.timeout(60), asyncio.TaskGroup() as tasks:
+        tasks.create_task(drain.run())
+        await drain.reached(first[-1].position)
+        backup = await asyncio.to_thread(Backup, server, database_url, tmp_path / "backup")
+        await asyncio.to_thread(ask, database_url, DROP)
+        source.put(rest)
+        source.close()
+        for sections in ([], ["pre-data"], ["data"]):
+            if sections:
+                await asyncio.to_thread(backup.put_back, *sections)
+            await until_asked_again(drain, times=3)
+            assert drain.state.away is not None
+        await asyncio.to_thread(backup.put_back, "post-data")
+    assert drain.state.away is None
+    assert ask(database_url, "SELECT id FROM pycrorm_log") == [(log.log_id,)]
+    heads = ask(
+        database_url, "SELECT head, (SELECT count(*) FROM event WHERE episode = number) FROM episode ORDER BY 1"
+    )
+    assert heads == [(10, 10), (40, 40)]
+    assert ask(database_url, "SELECT count(*) FROM pycrorm_declaration") == [(2,)]
+    await log.close()
+
+
+async def test_a_memory_goes_on_after_its_schemas_were_dropped_and_put_back_while_it_recorded(
+    server: Server, database_url: str, tmp_path: Path
+) -> None:
+    opening = Memory.open(database_url, spool=tmp_path / "spool", settings=SETTINGS)
+    async with opening as memory, memory.episode(description="restored"):
+        await StepActionPerformable("a", 1).perform()
+        await memory.flush()
+        backup = await asyncio.to_thread(Backup, server, database_url, tmp_path / "backup")
+        await asyncio.to_thread(ask, database_url, DROP)
+        await StepActionPerformable("a", 2).perform()
+        flushing = asyncio.create_task(memory.flush())
+        while _away(memory) is None and not flushing.done():  # noqa: ASYNC110
+            await asyncio.sleep(0.001)
+        assert not flushing.done()
+        await asyncio.to_thread(backup.put_back)
+        await flushing
+    assert ask(database_url, "SELECT step FROM step_action ORDER BY step") == [(1,), (2,)]
+
+
+GONE: dict[str, Callable[[Backup], None]] = {
+    "nothing is there": lambda _: None,
+    "the tables are there and empty": lambda backup: backup.put_back("pre-data"),
+}
+
+
+@pytest.mark.parametrize("state", GONE)
+async def test_no_log_is_made_in_the_place_of_the_one_a_spool_belongs_to(
+    state: str, server: Server, database_url: str, tmp_path: Path
+) -> None:
+    spool = tmp_path / "spool"
+    async with Memory.open(database_url, spool=spool, settings=SETTINGS):
+        pass
+    backup = Backup(server, database_url, tmp_path / "backup")
+    memory = await Memory.open(database_url, spool=spool, writer="daemon", settings=SETTINGS).__aenter__()
+    async with memory.episode(description="kept"):
+        await StepActionPerformable("a", 1).perform()
+    ask(database_url, DROP)
+    GONE[state](backup)
+    before = ask(database_url, "SELECT count(*) FROM pg_class")
+    with pytest.raises(DatabaseUnavailable, match=r"restore|restored"):
+        await recover(database_url, spool=spool)
+    with pytest.raises(DatabaseUnavailable, match=r"restore|restored"):
+        async with Memory.open(database_url, spool=spool, settings=SETTINGS):
+            pass
+    assert ask(database_url, "SELECT count(*) FROM pg_class") == before
+    ask(database_url, DROP)
+    backup.put_back()
+    await recover(database_url, spool=spool)
+    await memory.__aexit__(None, None, None)
+    assert ask(database_url, "SELECT step FROM step_action") == [(1,)]
+
+
+@pytest.mark.parametrize("state", GONE)
+async def test_a_reader_gets_one_line_while_a_backup_is_put_back(
+    state: str, server: Server, database_url: str, tmp_path: Path
+) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    await Projector(log).open()
+    await log.append(run_of(episode(1), 1, 3))
+    backup = await asyncio.to_thread(Backup, server, database_url, tmp_path / "backup")
+    ask(database_url, DROP)
+    GONE[state](backup)
+    for asking in (log.episodes, lambda: log.events(1), lambda: verify(log)):
+        if state == "nothing is there":
+            with pytest.raises(DatabaseUnavailable, match="restore") as caught:
+                await asking()
+            assert "\n" not in str(caught.value)
+    with pytest.raises(DatabaseUnavailable, match=r"holds no memory yet|a restore may be under way"):
+        await EventLog.open(DatabaseAddress.parse(database_url), create=False)
+    await log.close()

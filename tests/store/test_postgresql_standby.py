@@ -1,0 +1,95 @@
+"""A batch that waits for a synchronous standby in vain is never acknowledged, whatever is in it and however it ends."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import asyncpg
+import pytest
+
+from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.databases import Server, ask
+from tests.store.making import declaration, episode, run_of
+
+_WAITING = "SELECT pid FROM pg_stat_activity WHERE wait_event = 'SyncRep' AND datname = current_database()"
+_PROBE = "SELECT pg_logical_emit_message(true, 'test', '')"
+
+BATCHES = {
+    "declarations only": [declaration(b'{"dtype":"A"}')],
+    "the first events of an episode, which take its number": run_of(episode(2), 1, 5),
+    "more events of an episode": run_of(episode(1), 4, 6),
+    "events that are stored already": run_of(episode(1), 1, 3),
+    "a gap, which the log notes": run_of(episode(1), 9, 9),
+    "declarations and events": [declaration(b'{"dtype":"B"}'), *run_of(episode(3), 1, 2)],
+}
+
+
+@pytest.fixture
+def database_url(server: Server) -> str:
+    """All of this is about PostgreSQL."""
+    return server.new_database()
+
+
+@asynccontextmanager
+async def standby_missing(url: str) -> AsyncIterator[asyncpg.Connection]:
+    """While inside, every COMMIT on the server waits for a standby that is not there."""
+    watch = await asyncpg.connect(url)
+    try:
+        await watch.execute("ALTER SYSTEM SET synchronous_standby_names = 'nowhere'")
+        await watch.execute("SELECT pg_reload_conf()")
+        while not await _is_in_force(url, watch):
+            pass
+        yield watch
+    finally:
+        await watch.execute("ALTER SYSTEM RESET synchronous_standby_names")
+        await watch.execute("SELECT pg_reload_conf()")
+        await watch.close()
+
+
+async def _is_in_force(url: str, watch: asyncpg.Connection) -> bool:
+    probe = await asyncpg.connect(url)
+    committing = asyncio.create_task(probe.execute(_PROBE))
+    waits = await _ended_while_waiting(committing, watch, "pg_cancel_backend")
+    await committing
+    await probe.close()
+    return waits
+
+
+async def _ended_while_waiting(committing: asyncio.Task[object], watch: asyncpg.Connection, how: str) -> bool:
+    """Cancels or terminates the session that waits for the standby; False if the task was done without waiting."""
+    while not committing.done():
+        pids = [row["pid"] for row in await watch.fetch(_WAITING)]
+        for pid in pids:
+            await watch.execute(f"SELECT {how}({pid})")
+        if pids:
+            await asyncio.wait([committing])
+            return True
+        await asyncio.sleep(0)
+    return False
+
+
+@pytest.mark.parametrize("how", ["pg_cancel_backend", "pg_terminate_backend"])
+async def test_a_batch_that_was_ended_while_it_waited_for_a_standby_is_not_stored_however_often_it_is_tried(
+    how: str, database_url: str
+) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    assert await log.append(run_of(episode(1), 1, 3)) == {}
+    try:
+        async with standby_missing(database_url) as watch:
+            for name, records in BATCHES.items():
+                for _ in range(2):  # the first one commits, the second one finds all of it there
+                    appending = asyncio.create_task(log.append(records))
+                    assert await _ended_while_waiting(appending, watch, how), f"{name}: {appending}"
+                    assert isinstance(appending.exception(), DatabaseUnavailable), name
+        refusals = [await log.append(records) for records in BATCHES.values()]  # now each is answered
+        assert [each.keys() for each in refusals] == [{episode(1)} if "gap" in name else set() for name in BATCHES]
+    finally:
+        await log.close()
+    rows = ask(database_url, "SELECT number, head, refused IS NULL FROM episode ORDER BY number")
+    assert rows == [(1, 6, False), (2, 5, True), (3, 2, True)]
+    stored = ask(database_url, "SELECT episode, count(*), max(sequence) FROM event GROUP BY episode ORDER BY episode")
+    assert stored == [(number, head, head) for number, head, _ in rows]
