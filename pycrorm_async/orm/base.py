@@ -76,6 +76,10 @@ class ProcessMetaData(Base):
     """UUID of the episode it was thought through in."""
     thought_by_node: Mapped[int | None]
     """The sequence, in that episode, of the node that thought it through."""
+    continues: Mapped[str | None]
+    """UUID of the episode that came near its last sequence, and of which this one is the rest."""
+    continued_in: Mapped[str | None]
+    """UUID of the episode that is the rest of this one."""
 
 
 class Position(Base):

@@ -32,6 +32,8 @@ from pycrorm_async.orm.types import Moment, known_classes
 
 __all__ = ["DynamicClasses"]
 
+_DEPTH_MAX = 32
+"""Classes that one descends from: a question joins the views of all of them, and SQLite joins 64."""
 _ROOTS: dict[str, type[Designator]] = {"action": Action, "motion": Motion, "language": Language}
 _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "integer": BigInteger(),
@@ -166,10 +168,10 @@ class DynamicClasses:
         root = _ROOTS[declared.kind]
         for dtype in map(self._present_name, declared.bases):
             found = self._classes.get(dtype) or self._shared(dtype)
-            if found is None and dtype in self._declared and dtype not in descendants:
+            if found is None and dtype in self._declared and dtype not in descendants and len(descendants) < _DEPTH_MAX:
                 self._make(dtype, descendants)
                 found = self._classes.get(dtype)
-            if found is not None and _root(found) is root:
+            if found is not None and _root(found) is root and len(found.__mro__) - len(root.__mro__) < _DEPTH_MAX:
                 return found
         return root
 
@@ -203,7 +205,7 @@ class DynamicClasses:
         target = Pose if field.type == "pose" else Object
         column = Column(field.column, BigInteger(), ForeignKey(target.__table__.c.id))
         table.append_column(column)
-        mapper.add_property(field.column, column)
+        mapper.add_property(f"{field.name}_id", column)
         mapper.add_property(
             field.name,
             relationship(
@@ -216,7 +218,7 @@ class DynamicClasses:
         )
         if not mapper.has_property(field.type):  # the first pose is also `pose`, the first object also `object`
             mapper.add_property(field.type, synonym(field.name))
-            mapper.add_property(f"{field.type}_id", synonym(field.column))
+            mapper.add_property(f"{field.type}_id", synonym(f"{field.name}_id"))
 
     def _introduce(self, engine: AsyncEngine) -> None:
         identities = {dtype: str(made.__mapper__.polymorphic_identity) for dtype, made in self._classes.items()}

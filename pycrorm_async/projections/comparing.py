@@ -77,7 +77,9 @@ class Comparison:
         tables: their names in the database.
     """
 
-    def __init__(self, generation: Generation, core: Mapping[str, dict[str, Storage]] = CORE) -> None:
+    def __init__(
+        self, generation: Generation, stored: Callable[[str], str], core: Mapping[str, dict[str, Storage]] = CORE
+    ) -> None:
         self.generation = generation
         self.count = 0
         self._tables: dict[str, Table] = {}
@@ -85,7 +87,7 @@ class Comparison:
             name: {"id": "key", **columns} for name, columns in generation.layout.leaves.items()
         }
         for name, columns in (dict(core) | leaves).items():
-            self._tables[name] = make_table(name, columns, generation.number)
+            self._tables[name] = make_table(name, columns, generation.number, stored)
         self.tables = [each.name for each in self._tables.values()]
 
     async def differences(
@@ -119,7 +121,7 @@ class Comparison:
                     made.pop((each,), None)
                     there.pop((each,), None)
             self.count += len(there)
-            found += _compared(name, [each.name for each in table.columns], made, there)
+            found += _compared(name, [*table.columns.keys()], made, there)
         for name, made in expected.items():  # of a type that came later than these tables
             found += _compared(name, [], made, {})
         return found
@@ -141,7 +143,7 @@ class Comparison:
         expected: dict[str, dict[Row, Row]] = {}
         for (name, columns), made in rows.to_insert().items():
             table = self._tables.get(name)
-            whole = columns if table is None else tuple(each.name for each in table.columns)
+            whole = columns if table is None else tuple(table.columns.keys())
             into = expected.setdefault(name, {})
             keys = _key_of(columns, table)
             if whole == columns:
@@ -155,16 +157,15 @@ class Comparison:
 
 async def _rows(connection: AsyncConnection, table: Table, *where: ColumnElement[bool]) -> dict[Row, Row]:
     """By their keys. Without their types: what a database holds is compared, not what is made of it."""
-    columns = tuple(each.name for each in table.columns)
-    untyped: list[ColumnElement[Any]] = [column(each) for each in columns]
+    untyped: list[ColumnElement[Any]] = [column(each.name) for each in table.columns]
     answer = await connection.execute(select(*untyped).select_from(table).where(*where))
-    keys = _key_of(columns, table)
+    keys = _key_of(table.columns.keys(), table)
     return {keys(row): row for row in map(tuple, answer.all())}
 
 
 def _key_of(columns: Sequence[str], table: Table | None) -> Callable[[Row], Row]:
     """The key of a row of these columns."""
-    names = ["id"] if table is None else [each.name for each in table.primary_key.columns]
+    names = ["id"] if table is None else [each.key for each in table.primary_key.columns]
     places = [columns.index(each) for each in names]
     if len(places) == 1:
         (only,) = places

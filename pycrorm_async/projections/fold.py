@@ -92,6 +92,8 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
         started.simulated,
         started.thought_by.episode if started.thought_by else None,
         started.thought_by.node if started.thought_by else None,
+        started.continues,
+        None,
     ]
     if started.simulated:
         rows.inserts["simulated_episode"].append((event.number,))
@@ -106,6 +108,7 @@ def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Design
             microseconds(event.wall_ns),
             failure.type if failure else None,
             failure.message if failure else None,
+            ended.continued_in,
         )
     )
 

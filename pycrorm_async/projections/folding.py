@@ -18,9 +18,9 @@ from typing import Protocol
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.errors import DatabaseError
 from pycrorm_async.projections.fold import CannotFold, fold
 from pycrorm_async.projections.generations import Generation, Hold
+from pycrorm_async.projections.growth import Growing, grow
 from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.parameters import Designators
 from pycrorm_async.projections.rows import Rows
@@ -33,18 +33,18 @@ from pycrorm_async.store.rows import Span, StoredEvent
 
 __all__ = ["Folding", "Goal", "Meaning", "Batch", "Prepared", "TABLES"]
 
+_REASON_LENGTH_MAX = 2_000
+"""Characters of the reason that an episode is parked for: `status` shows it, and a value may be megabytes long."""
 _SLICE_EVENTS = 100
 """So many are folded before others of the loop get their turn; some 0.4 ms."""
 
 
-class Goal(Protocol):
+class Goal(Growing, Protocol):
     """A generation that is folded into. Everything happens in the caller's transaction."""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
         """As it is now, and stays until the transaction ends."""
         ...
-
-    async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation: ...
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
         """False if one of the episodes is not where it was believed to be: then nothing may be committed."""
@@ -180,11 +180,15 @@ class Folding:
         """The second half."""
         try:
             async with self._log.writing() as connection:
-                written = await self._write(connection, batch.done, batch.types)
+                found = await self._generation(connection, batch.done, batch.types)
+                grown = found is not None and found.layout != batch.types.layout
+                written = found if grown else await self._write(connection, batch.done, found)
                 if written is None:
                     await connection.rollback()
                     return 0
             self.generation = written
+            if grown:  # some tables are not there yet, or never will be: read and folded again with those that are
+                return 0
         except RowRefused as refusal:
             return await self._apart(batch.spans, batch.events, refusal)
         return batch.count
@@ -192,7 +196,11 @@ class Folding:
     async def batch_in(self, connection: AsyncConnection, spans: Sequence[Span], events: Sequence[StoredEvent]) -> bool:
         """The same in the caller's transaction, which must not be committed if it says False or raises `RowRefused`."""
         types = await self._types_now()
-        return await self._write(connection, await self._folded(spans, events, types), types) is not None
+        done = await self._folded(spans, events, types)
+        generation = await self._generation(connection, done, types)
+        if generation is not None and generation.layout != types.layout:
+            return False
+        return await self._write(connection, done, generation) is not None
 
     async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent], types: _Types) -> _Folded:
         rows, number = types.batch(), self.generation.number
@@ -200,8 +208,11 @@ class Folding:
         await rows.ready(self._log.engine, number)
         return _Folded(rows, number, steps, parked)
 
-    async def _write(self, connection: AsyncConnection, done: _Folded, types: _Types) -> Generation | None:
-        """The generation written to; None if the tables or the progress are not what the fold took them to be."""
+    async def _generation(self, connection: AsyncConnection, done: _Folded, types: _Types) -> Generation | None:
+        """The generation to write to, grown by what was declared; None if it is not what the fold took it to be.
+
+        Its layout is another than that of `types` if not all could be made.
+        """
         growing = types.layout != self.generation.layout
         if growing:
             await dialect_of(connection).alone(connection)
@@ -209,21 +220,17 @@ class Folding:
         if (generation.number, generation.revision) != (done.number, types.revision):
             self.generation = generation
             return None
-        if growing:
-            try:
-                generation = await self._goal.grow(connection, generation, types.layout)
-            except dialect_of(connection).faults as error:
-                said = getattr(error, "orig", error)
-                if "already exists" not in str(said):
-                    raise
-                raise DatabaseError(
-                    f"{self._log.address}: {said}, and the memory needs that name: rename yours, then flush again"
-                ) from error
-        if not await self._goal.advance(connection, done.steps):
+        return await grow(connection, self._goal, generation, types.payloads) if growing else generation
+
+    async def _write(
+        self, connection: AsyncConnection, done: _Folded, generation: Generation | None
+    ) -> Generation | None:
+        """The generation written to; None if there is none, or the progress is not what the fold took it to be."""
+        if generation is None or not await self._goal.advance(connection, done.steps):
             return None
         await done.rows.write(connection, generation.number)
         for number, reason in done.parked.items():
-            await self._goal.park(connection, number, reason)
+            await self._goal.park(connection, number, _writable(reason))
         return generation
 
     async def _types_now(self) -> _Types:
@@ -249,8 +256,14 @@ class Folding:
             return count + (await self.batch([span._replace(after=cut)], events[middle:]) if count == middle else 0)
         async with self._log.writing() as connection:
             reason = f"event {events[0].sequence}: the database refuses it: {refusal}"
-            await self._goal.park(connection, events[0].number, reason)
+            await self._goal.park(connection, events[0].number, _writable(reason))
         return 0
+
+
+def _writable(reason: str) -> str:
+    """The reason as every database takes it: it may name what a declaration or an event holds."""
+    shown = reason[:_REASON_LENGTH_MAX] + ("…" if len(reason) > _REASON_LENGTH_MAX else "")
+    return shown.encode(errors="backslashreplace").decode().replace("\0", "\\x00")
 
 
 async def _fold_all(

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import msgspec
-from sqlalchemy import Dialect, Integer, Text, column, delete, select, table, text
+from sqlalchemy import Integer, Text, column, delete, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement, Index
 
@@ -57,7 +57,7 @@ __all__ = [
     "show",
 ]
 
-PROJECTION_VERSION = 3
+PROJECTION_VERSION = 4
 """Counts what the fold means: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"
@@ -104,6 +104,10 @@ class Generation:
     layout: Layout
     views: dict[str, str]
     version: int = PROJECTION_VERSION
+
+    def without_unmade(self) -> Generation:
+        """The generation before the database refused to make some of its tables."""
+        return replace(self, layout=msgspec.structs.replace(self.layout, unmade={}))
 
 
 async def current_generation(connection: AsyncConnection, *, hold: Hold | None = None) -> Generation | None:
@@ -197,7 +201,7 @@ async def grow_tables(connection: AsyncConnection, generation: Generation, layou
 async def show(connection: AsyncConnection, generation: Generation) -> Generation:
     """Puts views in front of its tables, in place of those of whatever was shown before."""
     before = await noted(connection, SHOWN, hold="change")
-    views = view_texts_of(generation, projections_in(await all_noted(connection)), connection.dialect)
+    views = view_texts_of(connection, generation, projections_in(await all_noted(connection)))
     await dialect_of(connection).replace_views(connection, before.views if before else {}, views)
     shown = replace(generation, views=views)
     await note(connection, SHOWN, shown)
@@ -205,7 +209,11 @@ async def show(connection: AsyncConnection, generation: Generation) -> Generatio
 
 
 def view_texts_of(
-    generation: Generation, projections: Mapping[str, Generation], dialect: Dialect, *, simulated: bool = False
+    connection: AsyncConnection,
+    generation: Generation,
+    projections: Mapping[str, Generation],
+    *,
+    simulated: bool = False,
 ) -> dict[str, str]:
     """Name and SQL of every view in front of these tables; one stands on those before it.
 
@@ -213,8 +221,9 @@ def view_texts_of(
     later, is not shown.
     """
     layout, number = generation.layout, generation.number
-    meanings = public_views(layout, number, simulated=simulated)
-    texts = dict(layout.user_views) if simulated else shown_texts(layout, number)
+    stored = dialect_of(connection).stored_column
+    meanings = public_views(layout, number, stored, simulated=simulated)
+    texts = dict(layout.user_views) if simulated else shown_texts(layout, number, stored)
     users = {
         name: each for name, each in texts.items() if name not in meanings
     }  # one of ours may have been noted there
@@ -226,16 +235,16 @@ def view_texts_of(
             _log.warning("the projection %s is not shown: the memory itself has %s", name, ", ".join(names & taken))
             continue
         taken |= names
-        meanings |= own_views(each.layout, each.number, number, simulated=simulated)
+        meanings |= own_views(each.layout, each.number, number, stored, simulated=simulated)
         own |= each.layout.user_views
-    return {name: view_text(meaning, dialect) for name, meaning in meanings.items()} | users | own
+    return {name: view_text(meaning, connection.dialect) for name, meaning in meanings.items()} | users | own
 
 
 async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[str, Storage]], generation: int) -> None:
     """Makes these tables of a generation, by name and columns, and their indexes."""
     statements: list[str] = []
     for name, columns in tables.items():
-        table = make_table(name, dict(columns), generation)
+        table = make_table(name, dict(columns), generation, dialect_of(connection).stored_column)
         indexes = sorted(table.indexes, key=lambda each: str(each.name))
         made: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
         statements += [str(each.compile(dialect=connection.dialect)) for each in made]
@@ -253,8 +262,8 @@ async def _add_columns(
     present: dict[str, Storage],
     generation: int,
 ) -> None:
-    table = make_table(name, {"id": "key", **columns}, generation)
-    for new in columns.keys() - present.keys():
+    table = make_table(name, {"id": "key", **columns}, generation, dialect_of(connection).stored_column)
+    for new in [each for each in columns if each not in present]:
         definition = CreateColumn(table.c[new]).compile(dialect=connection.dialect)
         await dialect_of(connection).add_column(connection, physical_name(name, generation), str(definition))
         if new in indexed(name, columns):

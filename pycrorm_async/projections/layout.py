@@ -15,7 +15,7 @@ from typing import NamedTuple, Self
 
 import msgspec
 
-from pycrorm_async.events.fields import fault_in_table, table_name
+from pycrorm_async.events.fields import fault_in_declaration, table_name
 from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldType
 from pycrorm_async.projections.tables import Storage
 
@@ -32,6 +32,12 @@ STORED_AS: dict[FieldType, Storage] = {
     "object": "object",
 }
 """A field's column; lists and dicts have none."""
+
+COLUMNS_MAX = 1_000
+"""Columns of one type, over all its declarations: a table of SQLite has 2,000 at most, one of PostgreSQL 1,600."""
+LEAVES_MAX = 2_000
+"""Leaf tables of one memory. Whoever reads the view of a type on PostgreSQL locks the tables of all its descendants,
+with an index each, and a server as it is installed has room for some 7,000 locks."""
 
 _BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Language"}
 
@@ -69,7 +75,8 @@ class Layout(msgspec.Struct, frozen=True):
     """Leaf tables by name, designator types by dtype, and users' views of one memory.
 
     Of views the meaning as SQL, by name; the tables of those that are kept; and tables of kept views whose meaning was
-    changed. `renamed` gives the present name of types by those they had before.
+    changed. `renamed` gives the present name of types by those they had before; `unmade`, by fingerprint, why the
+    database refused to make the tables of a declaration; `unreadable` are declarations that no view may read as JSON.
     """
 
     leaves: dict[str, dict[str, Storage]] = {}
@@ -78,6 +85,8 @@ class Layout(msgspec.Struct, frozen=True):
     kept: dict[str, Kept] = {}
     outdated: tuple[str, ...] = ()
     renamed: dict[str, str] = {}
+    unmade: dict[str, str] = {}
+    unreadable: tuple[str, ...] = ()
 
     def with_leaves(self, leaves: Iterable[Leaf]) -> Self:
         """With the tables of these mapped classes; what is declared already wins."""
@@ -87,6 +96,15 @@ class Layout(msgspec.Struct, frozen=True):
             if leaf.dtype is not None and leaf.kind is not None and leaf.dtype not in {*types, *self.renamed}:
                 types[leaf.dtype] = DesignatorType(leaf.kind, (leaf.table,))
         return msgspec.structs.replace(self, leaves=tables, types=types)
+
+    def with_unmade(self, declaration: str, reason: str) -> Self:
+        """Without tables for the declaration of this fingerprint, and why."""
+        return msgspec.structs.replace(self, unmade=self.unmade | {declaration: reason})
+
+    def with_unreadable(self, declarations: Iterable[str]) -> Self:
+        """Remembering the fingerprints of declarations that are not JSON a database can read."""
+        every = dict.fromkeys((*self.unreadable, *declarations))
+        return msgspec.structs.replace(self, unreadable=tuple(every))
 
     def with_views(self, views: Mapping[str, str], kept: Mapping[str, Kept]) -> Self:
         """With these users' views, in place of those of the same names."""
@@ -99,6 +117,9 @@ class Layout(msgspec.Struct, frozen=True):
 
     def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
         """With the table of this type. Raises `Contradictory` and says why."""
+        fault = fault_in_declaration(declared)
+        if fault is not None:
+            raise Contradictory(f"{declared.dtype[:80]}: {fault}")
         columns = {each.column: STORED_AS[each.type] for each in declared.fields if each.type in STORED_AS}
         dtype = self.present_name(declared.dtype)
         former = tuple(each for each in declared.aliases if each != dtype and self.present_name(each) != dtype)
@@ -120,6 +141,12 @@ class Layout(msgspec.Struct, frozen=True):
         for table in tables:
             _refuse_different(declared.dtype, self.leaves.get(table, {}), agreed)
             agreed = agreed | self.leaves.get(table, {})
+        if len(agreed) > COLUMNS_MAX:
+            raise Contradictory(f"{dtype} would have {len(agreed):,} columns, {COLUMNS_MAX:,} are the most")
+        if declared.table not in self.leaves and len(self.leaves) >= LEAVES_MAX:
+            raise Contradictory(
+                f"{dtype} would be type {len(self.leaves) + 1:,}, a memory has tables for {LEAVES_MAX:,}"
+            )
         types = {name: each for name, each in self.types.items() if name not in former}
         renamed = {old: dtype if new in former else new for old, new in self.renamed.items()}
         return msgspec.structs.replace(
@@ -134,9 +161,8 @@ class Layout(msgspec.Struct, frozen=True):
         return self.renamed.get(dtype, dtype)
 
     def _refuse_taken(self, declared: DesignatorTypeDeclared, own: Collection[str]) -> None:
-        fault = fault_in_table(declared.table)
-        if fault is not None:
-            raise Contradictory(f"{declared.dtype}: {fault}")
+        if any(dtype in self.types and declared.table in self.types[dtype].tables for dtype in own):
+            return  # it was accepted before
         asks = f"{declared.dtype} asks for the table {declared.table}"
         for dtype, each in self.types.items():
             if declared.table in each.tables and dtype not in own:
@@ -152,7 +178,7 @@ class Layout(msgspec.Struct, frozen=True):
         shown = [
             member
             for dtype, each in self.types.items()
-            if dtype in own or own.intersection(self._bases(each))
+            if dtype in own or (each.bases and own.intersection(self._bases(each)))
             for member in each.tables
         ]
         return tuple(dict.fromkeys((table, *shown)))

@@ -7,6 +7,8 @@ also a process that does not know the view: what it means is noted as SQL.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from sqlalchemy import Index, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateIndex, CreateTable
@@ -25,11 +27,12 @@ _PROGRESS: dict[str, Storage] = {"id": "key", "folded": "integer"}
 
 async def make_kept(connection: AsyncConnection, kept: Kept, generation: int) -> None:
     """Makes its two tables, empty."""
-    rows = make_table(kept.table, kept.columns, generation)
+    stored = dialect_of(connection).stored_column
+    rows = make_table(kept.table, kept.columns, generation, stored)
     await connection.execute(CreateTable(rows))
     index = Index(index_name(kept.table, EPISODE, generation), rows.c[EPISODE])
     await connection.execute(CreateIndex(index))
-    await connection.execute(CreateTable(make_table(kept.progress, _PROGRESS, generation)))
+    await connection.execute(CreateTable(make_table(kept.progress, _PROGRESS, generation, stored)))
 
 
 def kept_tables(layout: Layout) -> list[str]:
@@ -38,11 +41,13 @@ def kept_tables(layout: Layout) -> list[str]:
     return [*now, *layout.outdated]
 
 
-def shown_texts(layout: Layout, generation: int) -> dict[str, str]:
+def shown_texts(layout: Layout, generation: int, stored: Callable[[str], str]) -> dict[str, str]:
     """Name and SQL of every user's view, as people see it."""
     texts = dict(layout.user_views)
     for name, kept in layout.kept.items():
-        texts[name] = f"SELECT * FROM {physical_name(kept.table, generation)}"  # noqa: S608
+        renamed = any(stored(each) != each for each in kept.columns)
+        columns = ", ".join(f'"{stored(each)}" AS "{each}"' for each in kept.columns) if renamed else "*"
+        texts[name] = f"SELECT {columns} FROM {physical_name(kept.table, generation)}"  # noqa: S608
     return texts
 
 
@@ -73,11 +78,12 @@ async def refresh_some(
         done = True
         numbers = ", ".join(str(int(number)) for number, _ in behind)
         columns = ", ".join(f'"{each}"' for each in kept.columns)
+        stored = ", ".join(f'"{dialect_of(connection).stored_column(each)}"' for each in kept.columns)
         meaning = layout.user_views[name]
         some = f"{EPISODE} IN ({numbers})"
         for statement in (
             f"DELETE FROM {table} WHERE {some}",  # noqa: S608
-            f"INSERT INTO {table} ({columns}) SELECT {columns} FROM ({meaning}) AS meaning WHERE {some}",  # noqa: S608
+            f"INSERT INTO {table} ({stored}) SELECT {columns} FROM ({meaning}) AS meaning WHERE {some}",  # noqa: S608
             f"DELETE FROM {progress} WHERE id IN ({numbers})",  # noqa: S608
         ):
             await connection.exec_driver_sql(statement)  # a meaning may hold what looks like a parameter

@@ -14,6 +14,7 @@ from pycrorm_async.projections.own import OF_EVERY_TABLE, Changes, Event, Projec
 from pycrorm_async.projections.rows import Row
 from pycrorm_async.projections.tables import OWN, Storage, column_type, physical_name
 from pycrorm_async.projections.values import is_missing, json_text, microseconds
+from pycrorm_async.projections.write import stored_rows
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.rows import StoredEvent
@@ -71,10 +72,7 @@ class OwnRows:
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         """Makes ready what is to be inserted."""
-        inserts = self.to_insert().items()
-        self._insertion = await dialect_of(engine).insertion(
-            {(physical_name(table, generation), columns): rows for (table, columns), rows in inserts}
-        )
+        self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self.to_insert(), generation))
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:
         """All of it, in this transaction. Raises `RowRefused`."""
@@ -86,7 +84,9 @@ class OwnRows:
                 alike.setdefault(tuple(sorted(values)), []).append((id_, *(values[name] for name in sorted(values))))
             for columns, made in alike.items():
                 kinds = {
-                    quote(name): column_type(self._columns[table][name]).compile(dialect=connection.dialect)
+                    quote(dialect.stored_column(name)): column_type(self._columns[table][name]).compile(
+                        dialect=connection.dialect
+                    )
                     for name in ("id", *columns)
                 }
                 await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, made)

@@ -72,7 +72,7 @@ async def _part(log: EventLog, projection: Projection, first: int, end: int | No
             generation = projections_in(await all_noted(connection)).get(projection.name)
             if generation is None or generation.version != projection.version:
                 return None, Compared(0, [])
-            comparison = Comparison(generation, {})
+            comparison = Comparison(generation, dialect_of(connection).stored_column, {})
             place = progress.place_of(generation.number, projection.name)
             if await dialect_of(connection).keep(connection, [*comparison.tables, place]):
                 return await _look(connection, projection, comparison, first, end)

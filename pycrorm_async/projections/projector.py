@@ -7,14 +7,12 @@ await projector.fold_behind()
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Mapping, Sequence
-from typing import Protocol
+from collections.abc import Sequence
 
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DatabaseForeign, InternalError
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.projections.classes import mapped_leaves
 from pycrorm_async.projections.folding import Folding, Prepared
 from pycrorm_async.projections.generations import (
@@ -29,6 +27,7 @@ from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.materialised import refresh_some
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_tables import OwnTables
+from pycrorm_async.projections.releasing import release_parked
 from pycrorm_async.projections.views import UserView, with_user_views
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
@@ -36,25 +35,9 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.progress import advance_folded, park
 from pycrorm_async.store.rows import Span
 
-__all__ = ["Helper", "Projector"]
+__all__ = ["Projector"]
 
 _ANYTHING_FOLDED = text("SELECT 1 FROM episode WHERE folded > 0 LIMIT 1")
-_HELP_EVENTS_MIN = 2_000
-"""Fewer are folded sooner than somebody else has begun."""
-
-
-class Helper(Protocol):
-    """Another process that folds into the same tables, whenever it is told to, while it `is_there`."""
-
-    is_there: bool
-
-    def prepare(self, spans: Sequence[Span]) -> None:
-        """It reads and folds these, and forgets what it had been told to before."""
-        ...
-
-    async def write(self) -> int:
-        """It writes them; how many events that were. Fewer if it was refused or is gone: then they are still to do."""
-        ...
 
 
 class Projector:
@@ -66,7 +49,6 @@ class Projector:
         projections: of one's own, to be kept up to date too.
         found: the same, but a fault in one of them is told and not raised.
         batch_events: how many events one transaction takes at most.
-        helper: takes every other batch where more than one is behind: one is read and folded while another is written.
     """
 
     def __init__(
@@ -77,17 +59,14 @@ class Projector:
         projections: Sequence[Projection] = (),
         found: Sequence[Projection] = (),
         batch_events: int = 10_000,
-        helper: Helper | None = None,
     ) -> None:
         self._log = log
-        self._helper = helper
         self._views = views
         self._batch_events = batch_events
         self._own = OwnTables(log, projections, found, batch_events=batch_events)
         self._has_news = True
         self._folding: Folding | None = None
         self._last_number = 0
-        self._ready: Prepared | None = None
 
     async def open(self) -> None:
         """Makes tables and views that are missing: those of every memory, of the mapped classes, of the users.
@@ -107,6 +86,7 @@ class Projector:
                 changed = await self._own.set_up(connection, layout)
                 if found is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
+                generation = await release_parked(connection, _Live(), generation)
             self._folding = Folding(self._log, _Live(), generation)
             await self._sweep()
 
@@ -129,12 +109,16 @@ class Projector:
     async def fold_some(self) -> bool:
         """One batch of the same, or some of the views that are kept; False if nothing was behind."""
         with self._log.translated():
-            self._has_news = (
-                await self._fold_next() is not None
-                or await self._refresh()
-                or await self._own.fold_some(now=self._has_news)
-            )
+            self._has_news = await self._fold_next() is not None or await self.fold_rest(now=self._has_news)
         return self._has_news
+
+    async def fold_rest(self, *, now: bool) -> bool:
+        """Some of the views that are kept, or of the projections of one's own; False if nothing was behind.
+
+        Of a projection few events are left for later unless it is to be `now`.
+        """
+        with self._log.translated():
+            return await self._refresh() or await self._own.fold_some(now=now)
 
     async def prepare(self, spans: Sequence[Span]) -> Prepared:
         """Reads and folds these, and writes nothing. Raises `DatabaseUnavailable`."""
@@ -153,41 +137,13 @@ class Projector:
         return count
 
     async def _fold_next(self) -> int | None:
-        """Folds a batch, or two with the helper; how many events, None if nothing is behind."""
-        batch, self._ready = self._ready or await self._next({}), None
-        if batch is None:
-            return None
-        theirs: Sequence[Span] = ()
-        if self._helper is not None and self._helper.is_there and batch.is_whole:
-            theirs = await self._spans(batch.reached)
-            if _size(theirs) >= _HELP_EVENTS_MIN:
-                self._helper.prepare(theirs)
-            else:
-                theirs = ()
-        count = await self.write(batch)
-        if not theirs or count < batch.count:
-            return count
-        assert self._helper is not None, "it was told to prepare"
-        writing = asyncio.create_task(self._helper.write())
-        try:
-            ready = await self._next({each.number: each.last for each in theirs})
-        finally:
-            written = await writing
-        if written == _size(theirs):
-            self._ready = ready
-        return count + written
-
-    async def _next(self, reached: Mapping[int, int]) -> Prepared | None:
-        """The next batch. `reached` is how far episodes are once the one before it is written."""
-        spans = await self._spans(reached)
-        return await self.prepare(spans) if spans else None
-
-    async def _spans(self, reached: Mapping[int, int]) -> list[Span]:
+        """Folds a batch; how many events, None if nothing is behind."""
         # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
-        spans = await self._log.unfolded(self._batch_events, after=self._last_number, reached=reached)
-        if spans:
-            self._last_number = spans[-1].number
-        return spans
+        spans = await self._log.unfolded(self._batch_events, after=self._last_number)
+        if not spans:
+            return None
+        self._last_number = spans[-1].number
+        return await self.write(await self.prepare(spans))
 
     async def _refresh(self) -> bool:
         assert self._folding is not None, "opened before anything is folded"
@@ -203,17 +159,13 @@ class Projector:
             await dialect_of(connection).sweep(connection)
 
 
-def _size(spans: Sequence[Span]) -> int:
-    return sum(each.last - each.after for each in spans)
-
-
 class _Live:
     """What people see, and `episode.folded`. Implements `Goal`."""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
         generation = await current_generation(connection, hold=hold)
         if generation is None:
-            raise InternalError("the tables are gone: open the memory again")
+            raise DatabaseUnavailable("the tables are missing: restore them from a backup, or run `pycrorm rebuild`")
         return generation
 
     async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:

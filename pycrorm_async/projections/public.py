@@ -9,11 +9,12 @@ asks for that too (`query.thoughts`) gets views of the same names that leave out
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self, TypeAlias
 
 from sqlalchemy import (
     Boolean,
+    Column,
     ColumnElement,
     Select,
     Table,
@@ -45,6 +46,9 @@ _Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
 
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
 """So many bits of a row's id are below the episode's number."""
+
+_UNITED_MAX = 400
+"""Selects in one UNION: SQLite takes 500. More are united in groups, which both databases read as one UNION."""
 
 _PICKED = "pick_up_action"
 
@@ -107,12 +111,17 @@ def _is_null(element: _Absent, compiler: Any, **options: Any) -> str:
     return str(compiler.process(element.looked_up, **options))
 
 
-def public_views(layout: Layout, generation: int, *, simulated: bool = False) -> dict[str, View]:
+def public_views(
+    layout: Layout, generation: int, stored: Callable[[str], str], *, simulated: bool = False
+) -> dict[str, View]:
     """Name and meaning of every view in front of this generation; users' views not among them.
 
-    With `simulated` they also show what was only thought through.
+    Args:
+        layout, generation: of the tables behind them.
+        stored: gives the names of the tables' columns in this database.
+        simulated: they also show what was only thought through.
     """
-    core = {name: make_table(name, columns, generation) for name, columns in CORE.items()}
+    core = {name: make_table(name, columns, generation, stored) for name, columns in CORE.items()}
     thoughts = core.pop("simulated_episode")
 
     def shown(view: Select[Any], rows: Table) -> Select[Any]:
@@ -120,23 +129,28 @@ def public_views(layout: Layout, generation: int, *, simulated: bool = False) ->
 
     views: dict[str, View] = {name: shown(select(each), each) for name, each in core.items()}
     views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
-    views |= {name: _leaf(name, layout, generation, shown) for name in layout.leaves}
+    leaves = {
+        name: make_table(name, {"id": "key", **columns}, generation, stored) for name, columns in layout.leaves.items()
+    }
+    views |= {name: _leaf(name, layout, leaves, shown) for name in layout.leaves}
     if _PICKED in layout.leaves:
         node, thing, pose = (core[name] for name in ("task_tree_node", "object", "pose"))
-        picked = _leaf(_PICKED, layout, generation, lambda view, _: view).subquery("picked")
+        picked = _leaf(_PICKED, layout, leaves, lambda view, _: view).subquery("picked")
         view = pick_ups_with_context(picked, node, thing, pose, layout.dtypes(_PICKED))
         views["PickUpWithContextView"] = shown(view, node)
-    views["designator_type"] = _designator_type()
+    views["designator_type"] = _designator_type(layout)
     return views
 
 
-def own_views(layout: Layout, number: int, generation: int, *, simulated: bool = False) -> dict[str, View]:
+def own_views(
+    layout: Layout, number: int, generation: int, stored: Callable[[str], str], *, simulated: bool = False
+) -> dict[str, View]:
     """The same for the tables of a projection of its generation `number`; `generation` is that of our tables."""
-    thoughts = make_table("simulated_episode", CORE["simulated_episode"], generation)
+    thoughts = make_table("simulated_episode", CORE["simulated_episode"], generation, stored)
     views: dict[str, View] = {}
     for name, columns in layout.leaves.items():
-        rows = make_table(name, {"id": "key", **columns}, number)
-        view = select(rows)
+        rows = make_table(name, {"id": "key", **columns}, number, stored)
+        view = select(*map(_shown, rows.c))
         views[name.removeprefix(OWN)] = view if simulated else view.where(_happened(rows, thoughts))
     return views
 
@@ -157,18 +171,25 @@ def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     )
 
 
-def _designator_type() -> View:
-    def said(name: str) -> ColumnElement[Any]:
-        return _member(_declaration.c.payload, name)
+def _designator_type(layout: Layout) -> View:
+    """Without what cannot be read as JSON, whichever part of it is asked for."""
+    declared: ColumnElement[Any] = _declaration.c.payload
+    if layout.unreadable:
+        unreadable = _declaration.c.fingerprint.in_(layout.unreadable)
+        declared = case((unreadable, "{}"), else_=declared)
 
-    return select(
+    def member(name: str) -> ColumnElement[Any]:
+        return _member(declared, name)
+
+    view = select(
         _declaration.c.fingerprint,
-        said("dtype").label("dtype"),
-        said("kind").label("kind"),
-        said("table").label("leaf"),
-        said("concept").label("concept"),
-        func.coalesce(said("fields"), "[]").label("fields"),
+        member("dtype").label("dtype"),
+        member("kind").label("kind"),
+        member("table").label("leaf"),
+        member("concept").label("concept"),
+        func.coalesce(member("fields"), "[]").label("fields"),
     )
+    return view.where(~unreadable) if layout.unreadable else view
 
 
 def _task_tree_node(core: dict[str, Table], _layout: Layout) -> Select[Any]:
@@ -259,14 +280,33 @@ _CUT: dict[str, tuple[str, _Cut]] = {
 """Name, the table its rows are from, and how they are cut."""
 
 
-def _leaf(name: str, layout: Layout, generation: int, shown: Callable[[Select[Any], Table], Select[Any]]) -> View:
+def _leaf(
+    name: str,
+    layout: Layout,
+    leaves: Mapping[str, Table],
+    shown: Callable[[Select[Any], Table], Select[Any]],
+) -> View:
     """The rows of a leaf table and of its members, with the columns of its type; what a member lacks is null."""
     parts = []
+    together = layout.columns(name)
     for member in layout.members(name):
-        rows = make_table(member, {"id": "key", **layout.leaves[member]}, generation)
+        rows = leaves[member]
         columns: list[ColumnElement[Any]] = [rows.c.id]
-        for each, storage in layout.columns(name).items():
+        for each, storage in together.items():
             same = layout.leaves[member].get(each) == storage
-            columns.append(rows.c[each] if same else cast(null(), column_type(storage)).label(each))
+            columns.append(_shown(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
         parts.append(shown(select(*columns), rows))
+    return _united(parts)
+
+
+def _united(parts: Sequence[Select[Any]]) -> View:
+    """All rows of these, which have the same columns."""
+    while len(parts) > _UNITED_MAX:
+        groups = [parts[first : first + _UNITED_MAX] for first in range(0, len(parts), _UNITED_MAX)]
+        parts = [select(union_all(*each).subquery()) for each in groups]
     return parts[0] if len(parts) == 1 else union_all(*parts)
+
+
+def _shown(column: Column[Any]) -> ColumnElement[Any]:
+    """A column under the name it has in the view."""
+    return column if column.name == column.key else column.label(column.key)

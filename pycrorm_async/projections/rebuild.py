@@ -44,13 +44,13 @@ from pycrorm_async.projections.generations import (
     projections_in,
     show,
 )
+from pycrorm_async.projections.growth import grow
 from pycrorm_async.projections.materialised import kept_tables, refresh_some
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_tables import OwnMeaning, layout_of, make_own, refuse_taken
 from pycrorm_async.projections.public import public_views
 from pycrorm_async.projections.shadowing import with_views
 from pycrorm_async.projections.tables import CORE, physical_name
-from pycrorm_async.projections.union import unite
 from pycrorm_async.projections.views import UserView, view_text, with_user_views
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
@@ -147,7 +147,15 @@ class Rebuild:
                     numbers = [each.number for key, each in there.items() if not key.startswith(PROJECTION)]
                     making = await make_generation(connection, 1 + max(numbers, default=0))
                     await make_empty(connection, {progress.TABLE: progress.COLUMNS}, making.number)
-                layout = unite(making.layout.with_leaves(mapped_leaves()), payloads).layout
+                making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
+                await note(connection, MAKING, making)
+            goal = Beside(MAKING, None, making.version, number=making.number)
+            while (grown := await _grown(log, goal, payloads)).layout != making.layout:
+                making = grown
+            async with log.engine.begin() as connection:
+                await dialect_of(connection).alone(connection)
+                making = await goal.generation(connection, "change")
+                layout = making.layout
                 if shown is not None:
                     layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
                 layout = with_user_views(layout, views, connection.dialect)
@@ -201,8 +209,9 @@ class Rebuild:
             making = await self._making.generation(connection, "share")
         if not making.layout.kept:
             return
-        dialect = self._log.engine.dialect
-        views = {name: view_text(each, dialect) for name, each in public_views(making.layout, self.number).items()}
+        engine = self._log.engine
+        meanings = public_views(making.layout, self.number, dialect_of(engine).stored_column)
+        views = {name: view_text(each, engine.dialect) for name, each in meanings.items()}
         async with with_views(self._log.engine, views | making.layout.user_views) as connection:
             more = True
             while more:
@@ -259,6 +268,13 @@ class Rebuild:
         tables = await current_generation(connection, hold="change")
         assert tables is not None, "looked for when this was begun"
         await show(connection, replace(tables, revision=tables.revision + 1))
+
+
+async def _grown(log: EventLog, goal: Beside, payloads: Sequence[bytes]) -> Generation:
+    """The generation with more of the tables of these declarations, or as it was if it has all that can be made."""
+    async with log.engine.begin() as connection:
+        await dialect_of(connection).alone(connection)
+        return await grow(connection, goal, await goal.generation(connection, "change"), payloads)
 
 
 async def _going_on(

@@ -40,6 +40,7 @@ class EpisodeEnd(NamedTuple):
     ended_at: int
     failure_type: str | None
     failure_message: str | None
+    continued_in: str | None
 
 
 _STATUS, _END_TIME, _END_NS = (_NODE.index(name) for name in ("status", "end_time", "end_ns"))

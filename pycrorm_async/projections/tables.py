@@ -7,11 +7,13 @@ foreign key is enforced here, that would cost a third of the rate; `verify` is t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal, TypeAlias
 
 from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, Table, Text
 from sqlalchemy.types import TypeEngine
 
+from pycrorm_async.events.fields import bounded
 from pycrorm_async.store.dialect import Expected
 
 __all__ = [
@@ -63,6 +65,8 @@ CORE: dict[str, dict[str, Storage]] = {
         "simulated": "boolean",
         "thought_by": "text",
         "thought_by_node": "integer",
+        "continues": "text",
+        "continued_in": "text",
     },
     "simulated_episode": {"id": "key"},
     "task_tree_node": {
@@ -234,22 +238,31 @@ _ALIKE_OTHERS = [10]
 index, in the first two."""
 
 
+_NAME_LENGTH_MAX = 63
+"""So many bytes of a name PostgreSQL keeps."""
+
+
 def physical_name(table: str, generation: int) -> str:
     """Where the rows are: `pose__1`."""
-    return f"{table}__{generation}"
+    number = f"__{generation}"
+    return f"{bounded(table, _NAME_LENGTH_MAX - len(number))}{number}"
 
 
-def make_table(name: str, columns: dict[str, Storage], generation: int) -> Table:
-    """The table and its indexes, in one generation."""
+def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> Table:
+    """The table and its indexes, in one generation.
+
+    `stored` gives the names of columns in this database; the keys of the table's columns are those of the layout.
+    """
     table = Table(
         physical_name(name, generation),
         MetaData(),
         *(
             Column(
-                column,
+                stored(column),
                 Text() if (name, column) in _TEXT_KEYS else column_type(storage),
                 primary_key=storage == "key",
                 autoincrement=False,
+                key=column,
             )
             for column, storage in columns.items()
         ),
@@ -280,7 +293,7 @@ def expected(name: str, columns: dict[str, Storage], generation: int) -> Expecte
 
 
 def index_name(name: str, column: str, generation: int) -> str:
-    return f"{physical_name(name, generation)}_by_{column}"
+    return bounded(f"{physical_name(name, generation)}_by_{column}", _NAME_LENGTH_MAX)
 
 
 def column_type(storage: Storage) -> TypeEngine[Any]:

@@ -1,7 +1,8 @@
 """Which declarations of a log share the tables, and which are refused: one answer for the fold and for mapped classes.
 
 Declarations unite in the order they first arrived, so every process finds the same answer, and one that was accepted
-stays so. The first of two that contradict each other is kept, the nodes of the other cannot be folded.
+stays so. The first of two that contradict each other is kept, the nodes of the other cannot be folded. Nor can those of
+a type whose tables the database refused to make; the layout remembers it, and why.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import msgspec
 
 from pycrorm_async.events.codec import UnknownShape, declaration_of, fingerprint
+from pycrorm_async.events.fields import mapped_declaration
 from pycrorm_async.events.happenings import DesignatorTypeDeclared
 from pycrorm_async.projections.layout import Contradictory, Layout
 
@@ -32,12 +34,27 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
     refused: dict[str, str] = {}
     for payload in payloads:
         name = fingerprint(payload)
+        if name in layout.unmade:
+            refused[name] = layout.unmade[name]
+            continue
         try:
-            declared = declaration_of(payload)
+            declared = mapped_declaration(declaration_of(payload))
             layout = layout.with_declaration(declared)
             accepted[name] = declared
         except Contradictory as reason:
             refused[name] = str(reason)
         except (UnknownShape, msgspec.DecodeError) as error:  # a newer version's, or damaged
             refused[name] = f"this version cannot read the declaration of its type: {error}"
-    return Union(layout, accepted, refused)
+    unreadable = [fingerprint(each) for each in payloads if not _is_readable(each)]
+    return Union(layout.with_unreadable(unreadable) if unreadable else layout, accepted, refused)
+
+
+def _is_readable(payload: bytes) -> bool:
+    """Whether a database can take a member out of it: it is JSON without U+0000, which PostgreSQL has in no text."""
+    if b"\\u0000" in payload:
+        return False
+    try:
+        msgspec.json.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return False
+    return True

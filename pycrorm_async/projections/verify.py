@@ -13,10 +13,11 @@ from typing import NamedTuple
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable
+from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, TablesOutdated
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.projections.comparing import Comparison, Difference, Range
+from pycrorm_async.projections.findings import Damage, Stopped, Verified
 from pycrorm_async.projections.generations import Generation, current_generation
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_verify import compared, not_compared
@@ -24,11 +25,12 @@ from pycrorm_async.projections.parameters import Designators
 from pycrorm_async.projections.rereading import Rereading
 from pycrorm_async.projections.rows import Rows
 from pycrorm_async.projections.union import unite
+from pycrorm_async.projections.unmade import unmade_types
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import EpisodeRow, Span, StoredEvent
 
-__all__ = ["Verified", "Damage", "verify"]
+__all__ = ["Verified", "Damage", "Stopped", "verify"]
 
 _PART_EVENTS = 4_000
 _TOLD_MAX = 100
@@ -51,43 +53,6 @@ SELECT number, head, first, last FROM (
 ) AS each_episode WHERE first < 1 OR last > head ORDER BY number""")
 
 
-class Damage(NamedTuple):
-    """Where the log contradicts itself. Without an episode it is the database as a whole."""
-
-    number: int | None
-    sequence: int | None
-    reason: str
-
-    def __str__(self) -> str:
-        if self.number is None:
-            return self.reason
-        return f"episode {self.number}, event {self.sequence}: {self.reason}"
-
-
-class Verified(NamedTuple):
-    """What was found.
-
-    Attributes:
-        episodes, events, rows: that were looked at.
-        behind: events that the tables do not show yet, which is no fault.
-        damage, drift: how many findings of each kind there are.
-        damages, differences: the first hundred of each.
-        remarks: what is unusual in the order of events and happens in honest plans.
-        not_compared: by name, why the tables of a projection of somebody's were not looked at.
-    """
-
-    episodes: int
-    events: int
-    rows: int
-    behind: int
-    damage: int
-    drift: int
-    damages: list[Damage]
-    differences: list[Difference]
-    remarks: int
-    not_compared: Mapping[str, str]
-
-
 async def verify(
     log: EventLog,
     *,
@@ -103,15 +68,20 @@ async def verify(
         projections: whose tables are looked at too.
         tell: how many events were looked at, of how many.
 
-    Raises `DatabaseForeign` for tables of another version, `DatabaseUnavailable` for a memory without tables.
+    Raises `DatabaseForeign` for tables of a newer version, `DatabaseUnavailable` for a memory without tables.
     """
     check = _Check(log, tell)
     with log.translated():
         if episode is None:
             await check.whole()
-            await check.episodes(_Place(0, 0), None)
-        else:
-            await check.episodes(_Place(episode.number, 0), episode.number + 1)
+        await check.stopped(episode)
+        try:
+            if episode is None:
+                await check.episodes(_Place(0, 0), None)
+            else:
+                await check.episodes(_Place(episode.number, 0), episode.number + 1)
+        except TablesOutdated as fault:
+            check.outdated = str(fault)
         await check.projections(projections, episode)
     return check.found()
 
@@ -128,6 +98,9 @@ class _Check:
         self._damage = self._drift = self._remarks = 0
         self._episodes = self._events = self._rows = self._behind = 0
         self._not_compared: dict[str, str] = {}
+        self._stopped: list[Stopped] = []
+        self._unmade: dict[str, str] = {}
+        self.outdated: str | None = None
         self._unfinished = Rereading(0)
         self._comparison: Comparison | None = None
 
@@ -143,6 +116,9 @@ class _Check:
             differences=self._differences,
             remarks=self._remarks,
             not_compared=self._not_compared,
+            stopped=self._stopped,
+            unmade=self._unmade,
+            outdated=self.outdated,
         )
 
     async def whole(self) -> None:
@@ -159,6 +135,17 @@ class _Check:
                     self._damaged(None, None, f"there are events of an episode {number}, which is not in the log")
         except DamageError as fault:
             self._damaged(None, None, str(fault))
+
+    async def stopped(self, episode: EpisodeRow | None) -> None:
+        """The episodes that stopped, and the types without tables that stop every episode which performs them."""
+        for each in await self._log.stopped():
+            if episode is None or each.number == episode.number:
+                if each.refused is not None:
+                    self._stopped.append(Stopped(each.number, "refused", each.refused))
+                if each.parked is not None:
+                    self._stopped.append(Stopped(each.number, "parked", each.parked))
+        if episode is None:
+            self._unmade = await unmade_types(self._log)
 
     async def episodes(self, at: _Place, end: int | None) -> None:
         """Those from this place on and below number `end`; to the end of the memory if None."""
@@ -216,7 +203,7 @@ class _Check:
                     )
                 comparison = self._comparison
                 if comparison is None or comparison.generation != generation:
-                    self._comparison = comparison = Comparison(generation)
+                    self._comparison = comparison = Comparison(generation, self._dialect.stored_column)
                 if await self._dialect.keep(connection, comparison.tables):
                     return await self._look(connection, comparison, at, end, limit)
             # Between two statements tables were made anew and the old ones dropped.

@@ -12,16 +12,23 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.projections.rows import EpisodeEnd, NodeEnd, Rows
 from pycrorm_async.projections.tables import CORE, column_type, physical_name
-from pycrorm_async.store.dialect import Insertion
+from pycrorm_async.store.dialect import Insertion, RowsByTable
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["insertion_of", "write_rows"]
+__all__ = ["insertion_of", "stored_rows", "write_rows"]
 
 
 async def insertion_of(engine: AsyncEngine, rows: Rows, generation: int) -> Insertion:
     """What inserts them."""
-    made = {(physical_name(table, generation), columns): some for (table, columns), some in rows.to_insert().items()}
-    return await dialect_of(engine).insertion(made)
+    return await dialect_of(engine).insertion(stored_rows(engine, rows.to_insert(), generation))
+
+
+def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> RowsByTable:
+    """The rows by the names that their tables and columns have in this database, in a generation."""
+    stored = dialect_of(engine).stored_column
+    return {
+        (physical_name(table, generation), (*map(stored, columns),)): some for (table, columns), some in rows.items()
+    }
 
 
 async def write_rows(connection: AsyncConnection, rows: Rows, insertion: Insertion, generation: int) -> None:

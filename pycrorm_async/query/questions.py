@@ -45,6 +45,8 @@ class EpisodeSummary:
         nodes: of its task tree, the root included; `failed` of them failed, raised an error or were lost.
         simulated: it was thought through in a copy of the world, and nothing of it happened.
         thought_by: who thought it, as far as that is known.
+        continues: UUID of the episode of which this one is the rest.
+        continued_in: UUID of the episode that is the rest of this one.
     """
 
     number: int
@@ -59,6 +61,8 @@ class EpisodeSummary:
     failed: int
     simulated: bool = False
     thought_by: Thinker | None = None
+    continues: str | None = None
+    continued_in: str | None = None
 
 
 @dataclass(frozen=True)
@@ -110,6 +114,8 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             thought_by=Thinker(row.thought_by, row.thinker_number, row.thinker_id, row.thinker_dtype)
             if row.thought_by is not None
             else None,
+            continues=row.continues,
+            continued_in=row.continued_in,
         )
         for row in await connection.execute(question)
     ]

@@ -12,4 +12,4 @@ __all__ = ["all_views"]
 async def all_views(connection: AsyncConnection, generation: Generation) -> dict[str, str]:
     """Name and SQL of every view there is, as it is without anything left out; a view stands on those before it."""
     projections = projections_in(await all_noted(connection))
-    return view_texts_of(generation, projections, connection.dialect, simulated=True)
+    return view_texts_of(connection, generation, projections, simulated=True)

@@ -25,6 +25,7 @@ from pycrorm_async.events.happenings import (
     PoseValue,
     RobotValue,
 )
+from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
 from tests.projections.asking import all_rows, ask, names, stored_and_folded
@@ -306,8 +307,9 @@ async def test_opening_again_changes_nothing(log: EventLog) -> None:
 async def test_tables_of_another_version_are_refused(log: EventLog) -> None:
     await Projector(log).open()
     async with log.engine.begin() as connection:
-        await connection.exec_driver_sql("UPDATE pycrorm_generation SET version = 4")
-    with pytest.raises(DatabaseForeign, match=r"made by version 4 of the fold, this is version 3: use a newer pycrorm"):
+        await connection.exec_driver_sql("UPDATE pycrorm_generation SET version = version + 1")
+    refusal = f"made by version {PROJECTION_VERSION + 1} of the fold, this is version {PROJECTION_VERSION}: use a newer"
+    with pytest.raises(DatabaseForeign, match=refusal):
         await Projector(log).open()
 
 

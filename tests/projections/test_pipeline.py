@@ -1,4 +1,4 @@
-"""Folding by two: every other batch is read, folded and written by a helper, here a projector with a log of its own."""
+"""Two hands fold one log, each a projector with a log of its own: one prepares a batch while the other one writes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from pycrorm_async.events.happenings import (
     NodeStarted,
 )
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.projections import projector as projecting
+from pycrorm_async.projections import pipeline as pipelines
 from pycrorm_async.projections.folding import Prepared
+from pycrorm_async.projections.pipeline import FoldPipeline, Outlook
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.rows import Span
@@ -27,29 +28,26 @@ from tests.projections.asking import ask
 from tests.projections.script import SAYING, Script, declarations, declared, field, mixed, name_of, row
 
 
-class OtherHand:
-    """Implements `Helper`. `wrote` is how many events each of its batches had."""
-
-    is_there = True
+class InLoop:
+    """A hand in this loop. `wrote` is how many events each of its batches had."""
 
     def __init__(self, projector: Projector) -> None:
         self.projector = projector
         self.wrote: list[int] = []
-        self._task: asyncio.Task[Prepared] | None = None
+        self.batch: Prepared | None = None
 
-    def prepare(self, spans: Sequence[Span]) -> None:
-        if self._task is not None:
-            self._task.cancel()
-        self._task = asyncio.create_task(self.projector.prepare(spans))
+    async def prepare(self, spans: Sequence[Span]) -> Outlook:
+        self.batch = await self.projector.prepare(spans)
+        return Outlook(self.batch.count, self.batch.reached, self.batch.is_whole)
 
     async def write(self) -> int:
-        assert self._task is not None
-        batch, self._task = await self._task, None
+        assert self.batch is not None
+        batch, self.batch = self.batch, None
         self.wrote.append(await self.projector.write(batch))
         return self.wrote[-1]
 
 
-class Unheard(OtherHand):
+class Unheard(InLoop):
     """Writes, and its answers do not arrive."""
 
     async def write(self) -> int:
@@ -57,44 +55,53 @@ class Unheard(OtherHand):
         return 0
 
 
-class Idle(OtherHand):
-    """Writes nothing."""
+class Forgetful(InLoop):
+    """Has lost every third batch when it is to write it."""
+
+    asked = 0
 
     async def write(self) -> int:
-        return 0
+        self.asked += 1
+        return 0 if self.asked % 3 == 0 else await super().write()
 
 
-class Gone(Idle):
-    """Is gone when it is to write for the first time, and is asked no more."""
+class Mortal(InLoop):
+    """Dies at every third request; another one takes its place."""
 
-    def prepare(self, spans: Sequence[Span]) -> None:
-        assert self.is_there
-        super().prepare(spans)
+    asked = 0
 
-    async def write(self) -> int:
-        self.is_there = False
-        return 0
-
-
-class Eager(OtherHand):
-    """Writes before it is told to."""
-
-    def prepare(self, spans: Sequence[Span]) -> None:
-        super().prepare(spans)
-        self._early = asyncio.create_task(self._write_early(self._task))
-
-    async def _write_early(self, task: asyncio.Task[Prepared] | None) -> int:
-        assert task is not None
-        return await self.projector.write(await task)
+    async def prepare(self, spans: Sequence[Span]) -> Outlook:
+        self._live()
+        return await super().prepare(spans)
 
     async def write(self) -> int:
-        await self._early
+        self._live()
         return await super().write()
+
+    def _live(self) -> None:
+        self.asked += 1
+        if self.asked % 3 == 0:
+            raise Died
+
+
+class Died(Exception):
+    pass
+
+
+class Eager(InLoop):
+    """Writes before it is asked to, and again then."""
+
+    async def prepare(self, spans: Sequence[Span]) -> Outlook:
+        outlook = await super().prepare(spans)
+        batch = self.batch
+        await super().write()
+        self.batch = batch
+        return outlook
 
 
 @pytest.fixture(autouse=True)
-def _helped_with_anything(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(projecting, "_HELP_EVENTS_MIN", 1)
+def _any_batch_is_prepared_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipelines, "LOOKAHEAD_EVENTS_MIN", 1)
 
 
 @pytest.fixture
@@ -119,18 +126,36 @@ def talk(episode: int, *, words: int) -> Script:
     return script
 
 
+async def hands_of(logs: Sequence[EventLog], kind: type[InLoop], batch_events: int) -> list[InLoop]:
+    hands = []
+    for log in logs:
+        projector = Projector(log, batch_events=batch_events)
+        await projector.open()
+        hands.append(kind(projector))
+    return hands
+
+
+async def fold_all(log: EventLog, hands: Sequence[InLoop], batch_events: int) -> int:
+    """Until nothing is behind; the number of events that were folded, as far as the pipeline knows."""
+    pipeline, count = FoldPipeline(log, batch_events=batch_events), 0
+    while True:
+        try:
+            folded = await pipeline.fold_next(hands)
+        except Died:
+            hands = [*hands[1:], hands[0]]
+            continue
+        if folded is None:
+            return count
+        count += folded
+
+
 async def folded_by_two(
-    log: EventLog, other_log: EventLog, records: Sequence[Record], hand: type[OtherHand], batch_events: int
-) -> OtherHand:
-    other = Projector(other_log, batch_events=batch_events)
-    await other.open()
-    helper = hand(other)
-    projector = Projector(log, batch_events=batch_events, helper=helper)
-    await projector.open()
+    log: EventLog, other_log: EventLog, records: Sequence[Record], kind: type[InLoop], batch_events: int
+) -> list[InLoop]:
+    hands = await hands_of([log, other_log], kind, batch_events)
     await log.append(records)
-    while await projector.fold_some():
-        pass
-    return helper
+    await fold_all(log, hands, batch_events)
+    return hands
 
 
 async def told(log: EventLog) -> list[tuple[object, ...]]:
@@ -156,13 +181,13 @@ def words_of(number: int, words: int, *, episode: int | None = None) -> list[tup
 
 @pytest.mark.parametrize(
     ("hand", "batch_events"),
-    [(OtherHand, 1), (OtherHand, 2), (OtherHand, 7), (Unheard, 2), (Idle, 2), (Gone, 2), (Eager, 3)],
+    [(InLoop, 1), (InLoop, 2), (InLoop, 7), (Unheard, 2), (Forgetful, 2), (Mortal, 2), (Eager, 3)],
 )
 async def test_every_event_is_shown_once_and_in_its_place(
-    log: EventLog, other_log: EventLog, hand: type[OtherHand], batch_events: int
+    log: EventLog, other_log: EventLog, hand: type[InLoop], batch_events: int
 ) -> None:
     records = [*declarations(SAYING), *mixed(talk(1, words=12), talk(2, words=2)), *talk(3, words=6).records]
-    helper = await folded_by_two(log, other_log, records, hand, batch_events)
+    hands = await folded_by_two(log, other_log, records, hand, batch_events)
     assert await told(log) == [*words_of(1, 12), *words_of(2, 2), *words_of(3, 6)]
     assert await ask(log, "SELECT status, count(*) FROM process_metadata GROUP BY status") == [("SUCCEEDED", 3)]
     assert await ask(log, "SELECT count(*) FROM task_tree_node WHERE parent_id IS NULL AND end_time IS NOT NULL") == [
@@ -173,9 +198,9 @@ async def test_every_event_is_shown_once_and_in_its_place(
         (2, 0, None),
         (3, 0, None),
     ]
-    if hand is OtherHand:
-        assert sum(helper.wrote) >= len(records) // 3
-        assert 0 not in helper.wrote[1:]  # nothing is folded in vain; at the first batch the tables grow
+    if hand is InLoop:
+        assert all(sum(each.wrote) >= len(records) // 3 for each in hands)
+        assert not any(0 in each.wrote[1:] for each in hands)  # nothing is folded in vain; first the tables grow
 
 
 @pytest.mark.parametrize("bad", ["unknown", "refused by the database", "missing"])
@@ -193,7 +218,7 @@ async def test_an_episode_stops_where_it_cannot_be_folded_whoever_meets_that(
         case _:
             await _forget_when_stored(log, place)
     records = [*declarations(SAYING), *first.records, *talk(2, words=4).records]
-    await folded_by_two(log, other_log, records, OtherHand, batch_events=2)
+    await folded_by_two(log, other_log, records, InLoop, batch_events=2)
     rows = await ask(log, "SELECT number, folded, parked IS NULL FROM episode ORDER BY number")
     assert [tuple(map(int, each)) for each in rows] == [(1, place - 1, 0), (2, 12, 1)]
     ((reason,),) = await ask(log, "SELECT parked FROM episode WHERE number = 1")
@@ -205,22 +230,20 @@ async def test_an_episode_stops_where_it_cannot_be_folded_whoever_meets_that(
 
 
 async def test_types_that_come_meanwhile_are_learned_by_both(log: EventLog, other_log: EventLog) -> None:
-    class Interrupted(OtherHand):
-        """Each time it is told what to prepare, a type that nobody has seen is recorded first, and used."""
+    class Interrupted(InLoop):
+        """The first times that it is to prepare, a type that is new to both is recorded before that, and used."""
 
         count = 0
 
-        def prepare(self, spans: Sequence[Span]) -> None:
-            self._task = asyncio.create_task(self._prepared(spans))
-
-        async def _prepared(self, spans: Sequence[Span]) -> Prepared:
-            self.count += 1
-            if self.count <= 3:
-                louder = declared("SayingAction", "saying_action", field("text", "text", 2), volume(self.count))
-                script = Script(100 + self.count)
-                script.put(NodeStarted("action", None, name_of(louder), {"text": "LOUD", f"volume{self.count}": 0.5}))
+        async def prepare(self, spans: Sequence[Span]) -> Outlook:
+            Interrupted.count += 1
+            if Interrupted.count <= 3:
+                number = Interrupted.count
+                louder = declared("SayingAction", "saying_action", field("text", "text", 2), volume(number))
+                script = Script(100 + number)
+                script.put(NodeStarted("action", None, name_of(louder), {"text": "LOUD", f"volume{number}": 0.5}))
                 await other_log.append([*declarations(louder), *script.records])
-            return await self.projector.prepare(spans)
+            return await super().prepare(spans)
 
     records = [*declarations(SAYING), *talk(1, words=30).records]
     await folded_by_two(log, other_log, records, Interrupted, batch_events=4)
@@ -237,16 +260,11 @@ def volume(number: int) -> FieldDeclared:
     return field(f"volume{number}", "real", 2 + number)
 
 
-async def test_several_who_are_helped_show_every_event_once(log: EventLog, other_log: EventLog) -> None:
-    projectors = []
-    for each in (log, other_log):
-        other = Projector(log if each is other_log else other_log, batch_events=3)
-        await other.open()
-        projectors.append(Projector(each, batch_events=3, helper=OtherHand(other)))
-        await projectors[-1].open()
+async def test_several_pipelines_show_every_event_once(log: EventLog, other_log: EventLog) -> None:
+    pairs = [await hands_of([log, other_log], InLoop, 3) for _ in range(2)]
     talks = [talk(number, words=10) for number in range(1, 6)]
     await log.append([*declarations(SAYING), *mixed(*talks)])
-    counts = await asyncio.gather(*(each.fold_behind() for each in projectors))
+    counts = await asyncio.gather(*(fold_all(log, each, 3) for each in pairs))
     assert await told(log) == [word for number in range(1, 6) for word in words_of(number, 10)]
     assert sum(counts) == sum(len(each.records) for each in talks)
 
