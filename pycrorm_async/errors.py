@@ -30,8 +30,11 @@ __all__ = [
     "SpoolForeign",
     "DatabaseError",
     "DatabaseUnavailable",
+    "LogWentBack",
     "DatabaseForeign",
+    "TablesForeign",
     "TablesOutdated",
+    "TablesUntrusted",
     "EpisodeParked",
     "FlushTimeout",
     "DamageError",
@@ -152,12 +155,35 @@ class DatabaseUnavailable(DatabaseError):
     """No such database, or it does not answer."""
 
 
+class LogWentBack(DatabaseUnavailable):
+    """The log holds less of an episode than it had confirmed: a failover, or a backup that was restored.
+
+    Nothing of the batch is stored, and the call may be made again once what is missing was offered again.
+    """
+
+    def __init__(self, episode: str, confirmed: int, head: int) -> None:
+        super().__init__(
+            f"the database went back: it had stored events 1 to {confirmed} of episode {episode} and holds {head}"
+        )
+        self.episode = episode
+        self.confirmed = confirmed
+        self.head = head
+
+
 class DatabaseForeign(DatabaseError):
     """A database of another program, or of a newer version of this one."""
 
 
-class TablesOutdated(DatabaseForeign):
-    """The tables were made by an older fold: recording goes on, and they are shown again after `pycrorm rebuild`."""
+class TablesForeign(DatabaseForeign):
+    """This process can append to the log and cannot use the tables: recording goes on."""
+
+
+class TablesOutdated(TablesForeign):
+    """The tables were made by an older fold: they are shown again after `pycrorm rebuild`."""
+
+
+class TablesUntrusted(TablesForeign):
+    """The tables belong to a role with fewer rights than this login has, and could hold code that would use them."""
 
 
 class EpisodeParked(DatabaseError):

@@ -13,30 +13,37 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager, contextmanager, suppress
-from contextvars import ContextVar
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import (
+    AbstractAsyncContextManager,
+    AbstractContextManager,
+    AsyncExitStack,
+    asynccontextmanager,
+    suppress,
+)
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async import __version__
-from pycrorm_async.adoption import dead_queues, open_destination
+from pycrorm_async.adoption import dead_queues, expected_log, open_destination
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.config import Settings, Writer
-from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesOutdated
+from pycrorm_async.connected import set_inside
+from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesForeign
 from pycrorm_async.events.ids import episode_id
-from pycrorm_async.hooks.emitter import Emitter, Faults
+from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.recorder import Recorder, current_episode
-from pycrorm_async.plan.experience import experience
-from pycrorm_async.plan.ports import recorder
+from pycrorm_async.memory_parts import Parts
+from pycrorm_async.memory_status import MemoryStatus
+from pycrorm_async.plan.unawaited import called_performs
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import checked
 from pycrorm_async.projections.views import UserView
@@ -50,8 +57,6 @@ from pycrorm_async.queue.recorder import RecorderQueue
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.world.watch import watcher
-from pycrorm_async.writer.live import WriterState
 from pycrorm_async.writer.thread import WriterThread
 
 if TYPE_CHECKING:
@@ -60,44 +65,6 @@ if TYPE_CHECKING:
 __all__ = ["Memory", "MemoryStatus"]
 
 _log = logging.getLogger("pycrorm_async")
-
-
-class MemoryStatus(NamedTuple):
-    """How a memory is.
-
-    Attributes:
-        written, synced, stored: positions in this memory's queue: what survives the process, the machine, and is in
-            the database.
-        bytes_spooled: what the queue holds on disk.
-        faults: what the hooks failed to record.
-        samples_left_out: samples of the robot's state that the spool had no room for.
-        folded: position up to which all shows in the tables, as the daemon says; None where a thread writes.
-        drained: whether somebody moves events out of the queue now.
-        writer: what the writer of this process does; None where a daemon writes.
-        unadopted: folders of dead recorders that could not be recovered, and why.
-    """
-
-    written: int
-    synced: int
-    stored: int
-    bytes_spooled: int
-    folded: int | None
-    drained: bool
-    faults: Faults
-    samples_left_out: int
-    writer: WriterState | None
-    unadopted: Mapping[str, PycrormError]
-
-
-class _Parts(NamedTuple):
-    """What an open memory is made of."""
-
-    queue: RecorderQueue
-    writer: WriterThread | HandedOver
-    reading: Reading
-    emitter: Emitter
-    recorder: Recorder
-    experience: PickUpExperience
 
 
 class Memory:
@@ -126,7 +93,7 @@ class Memory:
         self._clock = clock
         self._unadopted: dict[str, PycrormError] = {}
         self._stack = AsyncExitStack()
-        self._parts: _Parts | None = None
+        self._parts: Parts | None = None
         self._told: set[str] = set()
         in_forked_child(self._forked)
 
@@ -154,8 +121,7 @@ class Memory:
                 the `daemon`, a `pycrorm writer` for the same URL and spool. With a daemon this process has no
                 connection for writing, the database need not be there yet, and `session()`, `dataframe()` and
                 `reading` open their own connection at the first question.
-            settings: limits and rhythms.
-            clock: where the time comes from.
+            settings, clock: limits and rhythms; where the time comes from.
 
         Raises:
             UnknownUrl: at once. `CallerError`: at once, for a private database or views of this process with a daemon.
@@ -163,8 +129,8 @@ class Memory:
                 `SpoolForeign`.
         """
         address, settings = DatabaseAddress.parse(url), settings or Settings()
-        if writer is not None:
-            settings = replace(settings, writer=writer)
+        keep_s = 0.0 if address.is_private else settings.keep_stored_s  # sqlite:// is never restored
+        settings = replace(settings, writer=writer or settings.writer, keep_stored_s=keep_s)
         if settings.writer == "daemon" and address.is_private:
             raise CallerError("sqlite:// is private to this process: no daemon can write it")
         if settings.writer == "daemon" and (views or projections):
@@ -179,42 +145,69 @@ class Memory:
             clock=clock,
         )
 
+    @classmethod
+    async def connect(
+        cls,
+        url: str,
+        *,
+        spool: Path | str | None = None,
+        views: Sequence[UserView] = (),
+        projections: Sequence[Projection] = (),
+        writer: Writer | None = None,
+        settings: Settings | None = None,
+    ) -> Memory:
+        """Open a memory for all contexts of this process that have none of their own, until `close`; as `open` does.
+
+        For notebooks, whose cells have a context each: what the following cells perform is recorded, each action in an
+        episode of its own or in that of its cell. If several are connected, the last one records. A thread of the
+        user's own finds it as well. One that is not closed keeps in its spool what was not stored when the process
+        ends, and the next memory of that database stores it.
+        """
+        memory = cls.open(url, spool=spool, views=views, projections=projections, writer=writer, settings=settings)
+        return await memory._enter(Parts.in_process)  # noqa: SLF001  its own class
+
+    async def close(self) -> None:
+        """Store and fold what is left; open episodes end as INTERRUPTED. Twice is once."""
+        await self.__aexit__(None, None, None)
+
     # --- opening and closing ----------------------------------------------------------------------------------
 
     async def __aenter__(self) -> Self:
+        return await self._enter(Parts.in_context)
+
+    async def _enter(self, found: Callable[[Parts], AbstractContextManager[None]]) -> Self:
         try:
             self._parts = await self._open()
-            self._stack.enter_context(self._recording(self._parts))
+            self._stack.enter_context(found(self._parts))
         except BaseException:
             await self._stack.aclose()
             raise
         return self
 
-    async def _open(self) -> _Parts:
+    async def _open(self) -> Parts:
         address = self._stack.enter_context(self._address.located())
         by_daemon = self._settings.writer == "daemon"
+        spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
-            # The database first: where it is refused, no spool is made beside it.
-            await (await EventLog.open(address, create=True, clock=self._clock)).close()
-        spool = Spool(self._spool or address.default_spool)
+            # The database first: where it is refused, no spool is made. Then bound, while this recorder is not in it.
+            access, expected = spool.access, expected_log(address, spool)
+            log = await EventLog.open(address, create=True, clock=self._clock, file_access=access, belongs_to=expected)
+            await log.close()
+            spool.bind(log.log_id)
+        recorder_id = episode_id(self._clock.wall_ns(), os.urandom(10))
         queue = RecorderQueue.create(
-            spool.path,
-            settings=self._settings,
-            clock=self._clock,
-            recorder=episode_id(self._clock.wall_ns(), os.urandom(10)),
-            offered=by_daemon,
+            spool.path, settings=self._settings, clock=self._clock, recorder=recorder_id, offered=by_daemon
         )
         self._stack.callback(queue.release)
         writer: WriterThread | HandedOver
         if by_daemon:
             writer = HandedOver(queue, self._settings)
         else:
+            opened = partial(open_destination, address, spool, clock=self._clock, settings=self._settings)
             writer = WriterThread(
                 source=queue,
-                open_destination=lambda: open_destination(
-                    address, spool, clock=self._clock, views=self._views, projections=self._projections
-                ),
-                adopt=lambda: dead_queues(spool, self._unadopted),
+                open_destination=partial(opened, views=self._views, projections=self._projections),
+                adopt=lambda: dead_queues(spool, self._unadopted, settings=self._settings),
                 settings=self._settings,
             )
             await writer.start()
@@ -222,11 +215,11 @@ class Memory:
         reading = Reading(address)
         self._stack.push_async_callback(reading.close)
         if not by_daemon:
-            with suppress(TablesOutdated):  # recording goes on; who asks, or flushes, is told
+            with suppress(TablesForeign):  # recording goes on; who asks, or flushes, is told
                 await reading.refresh()
         emitter = Emitter(queue, self._settings)
         told = Recorder(emitter, clock=self._clock, software=__version__)
-        return _Parts(queue, writer, reading, emitter, told, PickUpExperience(reading))
+        return Parts(queue, writer, reading, emitter, told, PickUpExperience(reading))
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -248,14 +241,17 @@ class Memory:
         error: BaseException | None,
         _traceback: TracebackType | None,
     ) -> None:
-        """Store and fold what is left. A failure of ours never hides the plan's own."""
+        """Store and fold what is left. A failure of ours never hides the plan's own.
+
+        A parked episode is no failure of closing: it is logged, and `pycrorm status` names it. `flush` raises for it.
+        """
         self._parts = None
         queue.close()
         try:
             await writer.close()
         except PycrormError as fault:
             news = self._news(fault)
-            if news is not None and error is None:
+            if news is not None and error is None and not isinstance(news, EpisodeParked):
                 raise news from fault
             if news is not None:
                 _log.error("when closing the memory: %s", news)
@@ -298,7 +294,11 @@ class Memory:
             await room
         episode = told.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
         failure: BaseException | None = None
-        with self._recording(parts), _set(current_episode, episode):
+        with (
+            parts.in_context(),
+            set_inside(current_episode, episode),
+            set_inside(called_performs, episode.calls),
+        ):
             try:
                 yield episode
             except BaseException as raised:
@@ -308,7 +308,11 @@ class Memory:
                 told.close_episode(episode, failure)
 
     async def synced(self) -> None:
-        """All emitted so far survives power loss when this returns."""
+        """All emitted so far survives power loss when this returns.
+
+        Raises `SpoolUnavailable` when the disk refuses, or when files of the spool were deleted or replaced: recording
+        goes on in a new folder where one can be made, and `status` says what was lost.
+        """
         await self._now.queue.synced_to(self._now.queue.written)
 
     async def flush(self) -> None:
@@ -316,8 +320,7 @@ class Memory:
 
         Raises:
             EpisodeParked: with the reason, if an episode could not be stored or folded; each is told once.
-            FlushTimeout: after `flush_timeout_s`. What was emitted is safe in the spool. Where a daemon writes it
-                says whether one is there.
+            FlushTimeout: nothing was stored or folded for `flush_timeout_s`. What was emitted is safe in the spool.
         """
         parts = self._now
         position = parts.queue.written
@@ -344,9 +347,14 @@ class Memory:
             folded=None if outside is None else outside.folded,
             drained=parts.queue.is_drained,
             faults=parts.emitter.faults,
+            unawaited=parts.emitter.unawaited,
+            missing=parts.emitter.missing.count,
             samples_left_out=parts.recorder.samples_left_out,
+            episodes_continued=parts.recorder.continued_count,
             writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
             unadopted=dict(self._unadopted),
+            spool_fault=parts.queue.setback,
+            spool_lost=parts.queue.lost,
         )
 
     @property
@@ -407,29 +415,7 @@ class Memory:
     # --- inside -----------------------------------------------------------------------------------------------
 
     @property
-    def _now(self) -> _Parts:
+    def _now(self) -> Parts:
         if self._parts is None:
             raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
         return self._parts
-
-    @contextmanager
-    def _recording(self, parts: _Parts) -> Iterator[None]:
-        """What is performed and entered in this context is told to this memory, and it is asked what went well."""
-        with _set(recorder, parts.recorder), _set(watcher, parts.recorder), _set(experience, parts.experience):
-            yield
-
-
-@contextmanager
-def _set(variable: ContextVar[Any], value: object) -> Iterator[None]:
-    """The variable has this value inside. Left in another context than entered in, there is nothing of ours to undo."""
-    before = variable.get()
-    token = variable.set(value)
-    try:
-        yield
-    finally:
-        # Memories may be closed in another order than they were opened: only what we set is taken back.
-        if variable.get() is value:
-            with suppress(ValueError):
-                variable.reset(token)
-            if getattr(before, "over", False):
-                variable.set(None)

@@ -13,10 +13,11 @@ QUICK = Settings(sync_interval_ms=5, flush_timeout_s=60)
 class Daemon:
     """A daemon in this loop, and what it said."""
 
-    def __init__(self, url: str, spool: Path) -> None:
+    def __init__(self, url: str, spool: Path, settings: Settings = QUICK) -> None:
         self.said: list[str] = []
         self.leave = asyncio.Event()
-        self.task = asyncio.create_task(serve(url, spool=spool, leave=self.leave, say=self.said.append, settings=QUICK))
+        serving = serve(url, spool=spool, leave=self.leave, say=self.said.append, settings=settings)
+        self.task = asyncio.create_task(serving)
 
     async def says(self, pattern: str) -> None:
         async with asyncio.timeout(60):

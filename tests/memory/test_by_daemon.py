@@ -28,6 +28,7 @@ from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.living import LiveQueue
 from pycrorm_async.queue.spool import RecorderFolder
+from pycrorm_async.queue.stored import StoredSegments
 from pycrorm_async.writer.ports import Held
 from tests.databases import ask, ask_to_change
 from tests.memory.daemons import QUICK, Daemon
@@ -39,14 +40,14 @@ def spool(tmp_path: Path) -> Path:
     return tmp_path / "spool"
 
 
-Start = Callable[[], AbstractAsyncContextManager[Daemon]]
+Start = Callable[..., AbstractAsyncContextManager[Daemon]]
 
 
 @pytest.fixture
 def daemon(database_url: str, spool: Path) -> Start:
     @asynccontextmanager
-    async def running() -> AsyncIterator[Daemon]:
-        started = Daemon(database_url, spool)
+    async def running(settings: Settings = QUICK) -> AsyncIterator[Daemon]:
+        started = Daemon(database_url, spool, settings)
         yield started
         started.leave.set()
         await started.task
@@ -195,9 +196,10 @@ async def test_an_episode_that_is_parked_is_told_by_flush_once_and_the_others_go
 async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later_daemon_when_it_can_be(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
-    async with memory_at(database_url, spool) as memory:
+    settings = replace(QUICK, keep_stored_s=0)  # a daemon that keeps nothing heals nothing
+    async with memory_at(database_url, spool, settings) as memory:
         async with memory.episode(description="refused") as refused:
-            async with daemon():
+            async with daemon(settings):
                 await NoteActionPerformable("a").perform()
                 await memory.flush()
                 [[head]] = ask(database_url, "SELECT head FROM episode")
@@ -205,11 +207,11 @@ async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later
                 await NoteActionPerformable("b").perform()
                 with pytest.raises(EpisodeParked, match=f"{refused}: events 2 to .* did not arrive before"):
                     await memory.flush()
-            async with daemon() as started:  # which goes on where the one before was
+            async with daemon(settings) as started:  # which goes on where the one before was
                 await NoteActionPerformable("c").perform()
                 await memory.flush()
                 await started.says(f"episode {refused} was refused: events 2 to .*; its events are kept in the spool")
-        async with daemon() as started:
+        async with daemon(settings) as started:
             async with memory.episode(description="other"):
                 await NoteActionPerformable("d").perform()
             await memory.flush()
@@ -225,7 +227,7 @@ async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later
     assert list(report.drained.stopped) == [str(refused)]
     assert {path: path.read_bytes() for path in kept.path.glob("*.segment")} == segments
     ask_to_change(database_url, f"UPDATE episode SET folded = {head}, head = {head} WHERE number = 1")
-    async with daemon() as started:
+    async with daemon(settings) as started:
         await started.says(f"recorder {kept.name} is recovered; ")
     assert Spool(spool).recorders() == []
     async with Reading.open(database_url) as reading:
@@ -297,10 +299,10 @@ async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folder
 ) -> None:
     looking, cancelled = threading.Event(), threading.Event()
 
-    def take(folder: RecorderFolder, *, again: bool) -> Held | None:
+    def take(folder: RecorderFolder, stored: StoredSegments, *, again: bool) -> Held | None:
         looking.set()
         assert cancelled.wait(60)
-        return _take(folder, again=again)
+        return _take(folder, stored, again=again)
 
     async with memory_at(database_url, spool) as memory:
         await NoteActionPerformable("a").perform()
@@ -325,6 +327,8 @@ async def test_a_spool_of_another_database_is_refused_and_nothing_of_it_is_moved
         await NoteActionPerformable("a").perform()
         await recover(database_url, spool=spool)
         await NoteActionPerformable("b").perform()
+        async with Memory.open(f"sqlite:///{tmp_path}/other.db"):
+            pass
         with pytest.raises(SpoolForeign, match="belongs to log"):
             await serve(f"sqlite:///{tmp_path}/other.db", spool=spool, leave=asyncio.Event(), say=print)
         await recover(database_url, spool=spool)

@@ -12,7 +12,6 @@ import pytest
 from pycrorm_async import Memory, Reading, Settings
 from pycrorm_async.errors import (
     CallerError,
-    DatabaseError,
     DatabaseForeign,
     DatabaseUnavailable,
     EpisodeParked,
@@ -26,6 +25,7 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.happenings import NodeStarted
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.plan.ports import recorder
+from tests.commands import answer
 from tests.memory.notes import NoteActionPerformable, texts, url_of
 
 
@@ -59,12 +59,21 @@ async def test_bad_addresses_are_refused_with_their_class(tmp_path: Path) -> Non
     assert recorder.get() is None
 
 
-async def test_a_spool_belongs_to_one_database(tmp_path: Path) -> None:
-    async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=tmp_path / "spool"):
+async def test_a_spool_belongs_to_one_database_while_anything_is_in_it(tmp_path: Path) -> None:
+    spool = tmp_path / "spool"
+    async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=spool):
         await NoteActionPerformable("a").perform()
-    with pytest.raises(SpoolForeign):
-        async with Memory.open(f"sqlite:///{tmp_path}/2.db", spool=tmp_path / "spool"):
-            pass
+    async with Memory.open(f"sqlite:///{tmp_path}/2.db", spool=spool) as memory:
+        await NoteActionPerformable("b").perform()
+        await memory.flush()
+        with pytest.raises(SpoolForeign, match="pycrorm spool rebind"):
+            async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=spool):
+                pass
+        with pytest.raises(DatabaseUnavailable, match="the spool belongs to log"):  # nothing is made in its place
+            async with Memory.open(f"sqlite:///{tmp_path}/3.db", spool=spool):
+                pass
+        assert not (tmp_path / "3.db").exists()
+        assert await texts(memory) == ["b"]
 
 
 async def test_a_flush_that_cannot_reach_the_database_gives_up_and_loses_nothing(tmp_path: Path) -> None:
@@ -129,7 +138,7 @@ async def test_a_type_that_contradicts_the_tables_parks_its_episode_with_both_ty
 async def test_what_an_episode_cannot_be_opened_with_is_refused_by_name(
     tmp_path: Path, arguments: dict[str, Any], named: str
 ) -> None:
-    async with Memory.open(url_of(tmp_path)) as memory:
+    async with Memory.open(url_of(tmp_path), settings=Settings(on_unrecordable="refuse")) as memory:
         with pytest.raises(CallerError, match=f"the {named} of an episode must be"):
             async with memory.episode(**arguments):
                 pass
@@ -181,18 +190,40 @@ async def test_a_parked_episode_is_told_once(tmp_path: Path) -> None:
         assert memory.status.faults.total == 0
 
 
-async def test_a_table_of_the_users_own_in_the_way_is_named_and_nothing_is_lost(tmp_path: Path) -> None:
+async def test_a_table_of_the_users_own_in_the_way_is_named_and_parks_that_type_until_it_is_renamed(
+    tmp_path: Path,
+) -> None:
+    in_the_way = r"note_action already exists: rename yours, then open the memory again"
     async with Memory.open(url_of(tmp_path)) as memory:
         with sqlite3.connect(tmp_path / "memory.db") as plain:
             plain.execute("CREATE TABLE note_action (mine TEXT)")
         await NoteActionPerformable("a").perform()
-        with pytest.raises(DatabaseError, match=r"note_action already exists, .* rename yours, then flush again"):
+        with pytest.raises(EpisodeParked, match=in_the_way):
             await memory.flush()
-        with plain:
-            plain.execute("ALTER TABLE note_action RENAME TO my_notes")
-        plain.close()
+    with plain:
+        plain.execute("ALTER TABLE note_action RENAME TO my_notes")
+    plain.close()
+    async with Memory.open(url_of(tmp_path)) as memory:
         await memory.flush()
         assert await texts(memory) == ["a"]
+
+
+async def test_closing_logs_a_parked_episode_and_raises_nothing_over_a_plan_that_succeeded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with sqlite3.connect(tmp_path / "memory.db") as plain:
+            plain.execute("CREATE TABLE note_action (mine TEXT)")
+        plain.close()
+        async with memory.episode(description="well done") as episode:
+            await NoteActionPerformable("a").perform()
+    [line] = [each.message for each in caplog.records if each.name == "pycrorm_async"]
+    assert line.startswith(f"when closing the memory: not everything could be stored or folded: episode {episode}: ")
+    done = answer("status", "--url", url_of(tmp_path), cwd=tmp_path, code=1)
+    assert [(each["id"], "note_action already exists" in each["parked"]) for each in done["episodes"]] == [
+        (str(episode), True)
+    ]
+    assert [*done["unmade"]] == ["NoteAction"]
 
 
 async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tmp_path: Path) -> None:

@@ -1,0 +1,60 @@
+"""The parts an open memory is made of, and the ways in which plans find them: in a context, or in the whole process."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any, NamedTuple
+
+from pycrorm_async.connected import ConnectedVar, set_inside
+from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.recorder import Recorder
+from pycrorm_async.plan.experience import experience
+from pycrorm_async.plan.ports import recorder
+from pycrorm_async.plan.unawaited import called_performs
+from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.queue.handed_over import HandedOver
+from pycrorm_async.queue.recorder import RecorderQueue
+from pycrorm_async.world.watch import watcher
+from pycrorm_async.writer.thread import WriterThread
+
+__all__ = ["Parts"]
+
+
+class Parts(NamedTuple):
+    """What an open memory is made of."""
+
+    queue: RecorderQueue
+    writer: WriterThread | HandedOver
+    reading: Reading
+    emitter: Emitter
+    recorder: Recorder
+    experience: PickUpExperience
+
+    @contextmanager
+    def in_context(self) -> Iterator[None]:
+        """What is performed and entered in this context is recorded here, and this memory knows what went well."""
+        with ExitStack() as stack:
+            for variable, value in self._variables():
+                stack.enter_context(set_inside(variable, value))
+            yield
+
+    @contextmanager
+    def in_process(self) -> Iterator[None]:
+        """The same for all contexts of this process that have no memory of their own."""
+        for variable, value in self._variables():
+            variable.connect(value)
+        try:
+            yield
+        finally:
+            for variable, value in self._variables():
+                variable.disconnect(value)
+
+    def _variables(self) -> tuple[tuple[ConnectedVar[Any], object], ...]:
+        return (
+            (recorder, self.recorder),
+            (watcher, self.recorder),
+            (called_performs, self.recorder.calls),
+            (experience, self.experience),
+        )

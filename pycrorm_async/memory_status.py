@@ -1,0 +1,49 @@
+"""What an open memory reports about itself at one moment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from pycrorm_async.errors import PycrormError
+from pycrorm_async.hooks.emitter import Faults
+from pycrorm_async.hooks.missing import Missing
+from pycrorm_async.writer.live import WriterState
+
+__all__ = ["MemoryStatus"]
+
+
+class MemoryStatus(NamedTuple):
+    """How a memory is.
+
+    Attributes:
+        written, synced, stored: positions of what survives the process, the machine, and is in the database.
+        bytes_spooled: what the queue holds on disk.
+        faults: what the hooks failed to record, and performs that were never awaited.
+        unawaited: for each type of designator whose perform was called and never awaited, a sentence that says so.
+        missing: values that could not be recorded, and the reason of the last.
+        samples_left_out, episodes_continued: samples that found no room; episodes that went on in a follow-up episode.
+        folded: position up to which all shows in the tables, as the daemon says; None where a thread writes.
+        drained: whether somebody moves events out of the queue now.
+        writer: what the writer of this process does; None where a daemon writes.
+        unadopted: folders of dead recorders that could not be recovered, and why.
+        spool_fault: what befell the queue's files last (a failed sync; deleted or replaced files, and where recording
+            goes on); None if nothing did.
+        spool_lost: the records that were lost with deleted files, one line for each run of positions.
+    """
+
+    written: int
+    synced: int
+    stored: int
+    bytes_spooled: int
+    folded: int | None
+    drained: bool
+    faults: Faults
+    unawaited: tuple[str, ...]
+    missing: Missing
+    samples_left_out: int
+    episodes_continued: int
+    writer: WriterState | None
+    unadopted: Mapping[str, PycrormError]
+    spool_fault: str | None
+    spool_lost: tuple[str, ...]

@@ -1,0 +1,34 @@
+"""Executes a notebook in a kernel of this interpreter, in a process of its own: `execute_notebook.py IN FOLDER`.
+
+The kernel is described in that folder, so none of the user's is needed; nor is a network.
+"""
+
+import json
+import os
+import sys
+from importlib import import_module
+from pathlib import Path
+
+
+def main() -> None:
+    source, folder = Path(sys.argv[1]), Path(sys.argv[2])
+    kernel = folder / "kernels" / "this"
+    kernel.mkdir(parents=True)
+    argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+    (kernel / "kernel.json").write_text(json.dumps({"argv": argv, "display_name": "this", "language": "python"}))
+    for name in ("IPYTHONDIR", "JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR"):
+        os.environ[name] = str(folder / name.lower())
+    specifications = import_module("jupyter_client.kernelspec").KernelSpecManager(
+        kernel_dirs=[str(kernel.parent)], ensure_native_kernel=False
+    )
+    manager = import_module("jupyter_client.manager").AsyncKernelManager(
+        kernel_spec_manager=specifications, kernel_name="this"
+    )
+    notebook = import_module("nbformat").reads(source.read_text(), as_version=4)
+    where = {"metadata": {"path": str(folder)}}
+    import_module("nbclient").NotebookClient(notebook, km=manager, timeout=120, resources=where).execute()
+    (folder / "executed.ipynb").write_text(json.dumps(notebook))
+
+
+if __name__ == "__main__":
+    main()

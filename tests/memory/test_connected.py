@@ -1,0 +1,142 @@
+"""A memory and a world that are connected are found by every context without its own: cells, tasks, threads."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import threading
+from contextvars import Context
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm import NavigateAction, ProcessMetaData
+from pycrorm_async.plan.ports import recorder
+from pycrorm_async.world import BulletWorld, Object, ObjectType
+from pycrorm_async.world.errors import NoWorld, WorldClosed
+from tests.commands import pycrorm
+from tests.memory.notes import NoteActionPerformable, texts, url_of
+
+HERE = Path(__file__).parent
+
+
+async def in_a_cell(text: str) -> None:
+    """As a cell of a notebook does it: in a task with a context of its own, which knows of none before."""
+    await asyncio.get_running_loop().create_task(NoteActionPerformable(text).perform(), context=Context())
+
+
+async def test_what_finds_no_memory_in_its_context_uses_the_one_connected_last(tmp_path: Path) -> None:
+    folders = [tmp_path / name for name in "abc"]
+    for each in folders:
+        each.mkdir()
+    first = await Memory.connect(url_of(folders[0]))
+    await in_a_cell("1")
+    second = await Memory.connect(url_of(folders[1]))
+    await in_a_cell("2")
+    async with Memory.open(url_of(folders[2])):
+        await NoteActionPerformable("3").perform()  # this context has its own
+        await in_a_cell("4")
+    thread = threading.Thread(target=lambda: asyncio.run(NoteActionPerformable("5").perform()))
+    thread.start()
+    thread.join()
+    await second.close()
+    await second.close()
+    await in_a_cell("6")
+    await first.close()
+    await in_a_cell("7")
+    assert recorder.get() is None
+    found = []
+    for each in folders:
+        async with Reading.open(url_of(each)) as reading:
+            found.append(await texts(reading))
+    assert found == [["1", "6"], ["2", "4", "5"], ["3"]]
+
+
+async def test_closing_while_an_episode_is_open_ends_it_as_interrupted(tmp_path: Path) -> None:
+    memory = await Memory.connect(url_of(tmp_path))
+    async with memory.episode(description="left open"):
+        await NoteActionPerformable("kept").perform()
+        await memory.close()
+        await NoteActionPerformable("not recorded").perform()
+    with pytest.raises(CallerError, match="not open"):
+        await memory.flush()
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["kept"]
+        async with reading.session() as session:
+            assert (await session.scalars(select(ProcessMetaData.status))).all() == ["INTERRUPTED"]
+
+
+def test_a_connected_world_is_that_of_every_context_until_it_is_closed() -> None:
+    outer = BulletWorld().connect()
+    milk = Context().run(Object, "milk", ObjectType.MILK)
+    assert milk.world is outer
+    with BulletWorld() as inner:
+        assert Object("milk", ObjectType.MILK).world is inner
+    later = BulletWorld().connect()
+    assert Context().run(Object, "milk", ObjectType.MILK).world is later
+    later.close()
+    later.close()
+    assert Context().run(Object, "cup", ObjectType.JEROEN_CUP).world is outer
+    outer.close()
+    with pytest.raises(NoWorld):
+        Object("milk", ObjectType.MILK)
+    with pytest.raises(WorldClosed):
+        outer.connect()
+
+
+async def run_python(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    def run() -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"PYTHONPATH": str(HERE.parent.parent)}
+        command = [sys.executable, *arguments]
+        return subprocess.run(
+            command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=200, check=False
+        )
+
+    return await asyncio.to_thread(run)
+
+
+FORGETS = """
+import asyncio
+from pycrorm_async import Memory
+from tests.commands import pycrorm
+from tests.memory.notes import NoteActionPerformable
+
+async def main():
+    memory = await Memory.connect("sqlite:///memory.db")
+    await NoteActionPerformable("kept").perform()
+
+asyncio.run(main())
+"""
+
+
+async def test_a_memory_that_is_never_closed_loses_nothing_and_ends_without_a_traceback(tmp_path: Path) -> None:
+    ran = await run_python("-c", FORGETS, cwd=tmp_path)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    stored = await asyncio.to_thread(pycrorm, "writer", "--once", "--url", url_of(tmp_path), cwd=tmp_path)
+    assert stored.returncode == 0, stored.stderr
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["kept"]
+
+
+async def test_the_cells_of_a_notebook_record_into_the_memory_that_one_of_them_connected(tmp_path: Path) -> None:
+    ran = await run_python(
+        str(HERE / "execute_notebook.py"), str(HERE / "connected.ipynb"), str(tmp_path), cwd=tmp_path
+    )
+    assert ran.returncode == 0, ran.stderr
+    executed = json.loads((tmp_path / "executed.ipynb").read_text())
+    (shown,) = [output for cell in executed["cells"] for output in cell.get("outputs", ())]
+    assert "".join(shown["data"]["text/plain"]) == "[1.0, 2.0, 3.0]"
+    async with Reading.open(url_of(tmp_path)) as reading, reading.session() as session:
+        actions = (await session.scalars(select(NavigateAction).order_by(NavigateAction.id))).all()
+        assert [each.robot_state and each.robot_state.pose.x for each in actions] == [0.0, 1.0, 2.0]
+        episodes = (await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id))).all()
+        assert [(each.description, each.status) for each in episodes] == [
+            ("NavigateAction", "SUCCEEDED"),
+            ("two ways in one cell", "SUCCEEDED"),
+        ]
