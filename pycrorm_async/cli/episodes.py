@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
@@ -37,12 +38,20 @@ def episodes(
     if as_json:
         print_json(found)
         return
+    numbers = {e.id: e.number for e in found}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")
     rows: list[tuple[object, ...]] = [
-        (e.number, moment(e.started_at), duration(e.duration_ns), e.status, e.nodes, e.failed, e.description)
+        (e.number, moment(e.started_at), duration(e.duration_ns), e.status, e.nodes, e.failed, _description(e, numbers))
         for e in found
     ]
     if simulated:
         columns = (*columns, "thought through")
         rows = [(*row, thinker_text(e) if e.simulated else "") for row, e in zip(rows, found, strict=True)]
     print_table(f"Episodes of {DatabaseAddress.parse(url)}", columns, rows)
+
+
+def _description(episode: EpisodeSummary, numbers: Mapping[str, int]) -> str:
+    """The description, and the episode of which this one is the rest, by its number where the list has it."""
+    if episode.continues is None:
+        return episode.description
+    return f"{episode.description} (continues episode {numbers.get(episode.continues, episode.continues)})"

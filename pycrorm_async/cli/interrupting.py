@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from pycrorm_async.cli.output import note, problem, stderr
+from pycrorm_async.cli.output import note, write_last
 
 __all__ = ["Interrupting"]
 
@@ -39,8 +39,7 @@ class Interrupting:
         def told(_number: int, _frame: FrameType | None) -> None:
             self._count += 1
             if self._storing or self._count > self._patience:
-                stderr.show_cursor()  # a bar had hidden it
-                problem("interrupted; what is not stored yet is safe in the spool, and the next start brings it in")
+                write_last("interrupted; what is not stored yet is safe in the spool, and the next start brings it in")
                 os._exit(130)
             if self._count > 1:  # a plan that never suspends, or does not let itself be cancelled
                 raise KeyboardInterrupt

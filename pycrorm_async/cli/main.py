@@ -75,7 +75,10 @@ def _told_in_a_line(verb: Callable[..., int | None]) -> Callable[..., None]:
 _HELP = "Episodic memory for robots: plans remembered as events, asked about as tables."
 _VERBS = ("demo", "run", "episodes", "show", "events", "copy", "writer", "status", "rebuild", "verify", "learn")
 _GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "spool": ("Look into the write-ahead queue's files, and mend damaged ones.", ("inspect", "repair")),
+    "spool": (
+        "The write-ahead queue's files: look, mend, store in another database.",
+        ("inspect", "repair", "rebind"),
+    ),
 }
 
 

@@ -7,9 +7,17 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.config import Writer
+from pycrorm_async.config import FileAccess, Writer
 
-__all__ = ["UrlOption", "SpoolOption", "JsonOption", "WriterOption", "ProjectionOption", "DEFAULT_URL"]
+__all__ = [
+    "UrlOption",
+    "SpoolOption",
+    "JsonOption",
+    "WriterOption",
+    "FileAccessOption",
+    "ProjectionOption",
+    "DEFAULT_URL",
+]
 
 DEFAULT_URL = "sqlite:///pycrorm.db"
 
@@ -18,7 +26,9 @@ UrlOption = Annotated[
     typer.Option(
         "--url",
         envvar="PYCRORM_URL",
-        help="The database: sqlite:///memory.db, sqlite:////absolute/path.db, postgresql://user@host/database.",
+        help="The database: sqlite:///memory.db, sqlite:////absolute/path.db, postgresql://user@host/database."
+        " A password given here is visible in the list of processes: put it into the environment variable, or into"
+        " ~/.pgpass.",
         show_envvar=True,
     ),
 ]
@@ -34,6 +44,15 @@ WriterOption = Annotated[
         "--writer",
         envvar="PYCRORM_WRITER",
         help="Who moves events to the database: a thread of this process, or the daemon `pycrorm writer`.",
+        show_envvar=True,
+    ),
+]
+FileAccessOption = Annotated[
+    FileAccess,
+    typer.Option(
+        "--file-access",
+        envvar="PYCRORM_FILE_ACCESS",
+        help="A new spool and a new SQLite file are for their owner alone (0700, 0600), or for their folder's group.",
         show_envvar=True,
     ),
 ]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from typing import Any
 
@@ -14,7 +16,18 @@ from rich.table import Table
 
 from pycrorm_async.watching import stderr
 
-__all__ = ["stdout", "stderr", "problem", "note", "print_json", "print_table", "print_facts", "duration", "moment"]
+__all__ = [
+    "stdout",
+    "stderr",
+    "problem",
+    "write_last",
+    "note",
+    "print_json",
+    "print_table",
+    "print_facts",
+    "duration",
+    "moment",
+]
 
 _WIDTH_PIPED = 160
 """A pipe has no width; tables are then as wide as this, so that lines stay whole."""
@@ -25,6 +38,17 @@ stdout = Console(highlight=False, width=None if sys.stdout and sys.stdout.isatty
 def problem(line: str) -> None:
     """One line that says what is wrong and what to do."""
     stderr.print(f"[bold red]pycrorm:[/] {escape(' '.join(line.split()))}")
+
+
+def write_last(line: str) -> None:
+    """Write a problem with one system call, in a signal handler that leaves with `os._exit`.
+
+    The signal may have come while `stderr` was printing: a console prints no second line inside the first, it keeps
+    that line for later, and there is no later.
+    """
+    cursor = "\x1b[?25h" if stderr.is_terminal else ""  # a bar had hidden it
+    with suppress(OSError):
+        os.write(2, f"{cursor}pycrorm: {line}\n".encode())
 
 
 def note(line: str) -> None:

@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk import collect_seldom
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, note, print_json, stdout
+from pycrorm_async.cli.waiting import note_what_waits
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import installed_besides, named
@@ -27,6 +28,7 @@ def rebuild(
         list[str] | None, typer.Argument(metavar="[NAME]...", help="`tables`, or a projection; default: all.")
     ] = None,
     url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -70,6 +72,7 @@ def rebuild(
             )
         for episode, reason in each.parked.items():
             note(f"episode {episode} is parked{f' in {name}' if name in known else ''}: {reason}")
+    note_what_waits(url, spool)
     return 1 if any(each.parked for each in done.values()) else 0
 
 

@@ -56,6 +56,8 @@ def _show(episode: str, url: str, spool: Path | None, *, as_json: bool) -> None:
             "by": found.created_by,
             "took": duration(found.duration_ns),
             "status": found.status,
+            "continues": f"episode {found.continues}" if found.continues else None,
+            "goes on": f"in episode {found.continued_in}" if found.continued_in else None,
             "simulated": f"thought through {thinker_text(found)}; nothing of it happened" if found.simulated else None,
         },
     )

@@ -1,7 +1,8 @@
-"""`pycrorm spool inspect` and `pycrorm spool repair`: what is in a spool's files, and mending damaged ones."""
+"""`pycrorm spool`: `inspect` its files, `repair` damaged ones, `rebind` it to another database."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -10,15 +11,27 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import JsonOption
+from pycrorm_async import adoption
+from pycrorm_async.adoption import Rebinding
+from pycrorm_async.cli.options import (
+    DEFAULT_URL,
+    FileAccessOption,
+    JsonOption,
+    ProjectionOption,
+    SpoolOption,
+    UrlOption,
+)
 from pycrorm_async.cli.output import moment, note, print_facts, print_json, print_table, problem, stdout
-from pycrorm_async.errors import FilesError, PycrormError
-from pycrorm_async.queue.folder import REFUSED
+from pycrorm_async.cli.writer import store_once
+from pycrorm_async.config import Settings
+from pycrorm_async.errors import PycrormError
+from pycrorm_async.projections.own_found import named
+from pycrorm_async.queue.folder import REFUSED, fault_in
 from pycrorm_async.queue.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
 from pycrorm_async.queue.repair import RepairReport, finish_repairs, repair_folder
 from pycrorm_async.queue.rescue import Range
 
-__all__ = ["inspect", "repair"]
+__all__ = ["inspect", "repair", "rebind"]
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The spool: `memory.db.spool` beside `memory.db`.")]
 
@@ -63,8 +76,8 @@ def repair(folder: FolderArgument, as_json: JsonOption = False) -> int:
             continue
         try:
             report = repair_folder(Path(each.path))
-        except FilesError as refusal:
-            refused[each.name] = refusal
+        except Exception as fault:  # noqa: BLE001 - reported of this folder; the next may be repaired
+            refused[each.name] = fault_in(Path(each.path), fault)
         else:
             mended += [report] if report is not None else []
     if as_json:
@@ -83,6 +96,32 @@ def repair(folder: FolderArgument, as_json: JsonOption = False) -> int:
     if refused:
         return 3
     return 0 if all(each.complete for each in mended) else 1
+
+
+def rebind(
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    projection: ProjectionOption = None,
+    file_access: FileAccessOption = "owner",
+    as_json: JsonOption = False,
+) -> int:
+    """Store what a spool holds in the database that is at the URL now, when its own was deleted or replaced.
+
+    A database that does not exist is made. Nothing is deleted before it is stored. An episode whose beginning was in
+    the deleted database alone cannot be stored: its events stay in the spool as dead letters, and the exit code is 1.
+    Refused with exit code 3 while a process records into the spool or drains it. Other exit codes as of `pycrorm writer
+    --once`.
+    """
+    projections, settings = named(projection or ()), Settings(file_access=file_access)
+    done = asyncio.run(adoption.rebind(url, spool=spool, settings=settings, say=_say_rebinding))
+    beside = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
+    return store_once(url, spool, projections, settings, as_json=as_json, beside=beside)
+
+
+def _say_rebinding(planned: Rebinding) -> None:
+    before = f"log {planned.before}" if planned.before else "no log yet"
+    holds = f"{planned.events} events of {planned.recorders} recorder{'' if planned.recorders == 1 else 's'}"
+    note(f"{planned.spool} belongs to {before}; from now on to log {planned.after}, which gets its {holds}.")
 
 
 def _print(report: SpoolReport) -> None:
@@ -162,7 +201,10 @@ def _told(damage: Damage) -> str:
 
 
 def _time(wall_ns: int) -> str:
-    return f"{moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))} UTC"
+    try:
+        return f"{moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))} UTC"
+    except (ValueError, OverflowError, OSError):  # a clock that was never set
+        return f"{wall_ns} ns"
 
 
 def _line(text: str) -> None:

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+
 from pycrorm_async.adoption import shared_address
+from pycrorm_async.cli.durability import Durability, durability, kept_in, print_durability
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import print_json, print_table, problem, stdout
+from pycrorm_async.cli.output import note, print_json, print_table, problem, stdout
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError
+from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
 from pycrorm_async.projections.own_found import installed_besides
 from pycrorm_async.projections.own_tables import ProjectionState, states
-from pycrorm_async.queue.folder import DRAIN, available
+from pycrorm_async.projections.unmade import unmade_types
+from pycrorm_async.queue.folder import DRAIN, available, fault_in
 from pycrorm_async.queue.locks import is_locked
 from pycrorm_async.queue.progress import Progress
 from pycrorm_async.queue.segment import segment_numbers, segment_path
@@ -38,6 +44,7 @@ class RecorderState:
         away: why the database takes nothing now, as whoever drains it says.
         given_up: why nothing more of it is stored.
         stopped: by id, its episodes that are refused or parked, and why.
+        fault: why its folder cannot be read; the other fields say nothing then.
     """
 
     name: str
@@ -50,6 +57,7 @@ class RecorderState:
     away: str | None
     given_up: str | None
     stopped: Mapping[str, str]
+    fault: str | None = None
 
 
 @dataclass(frozen=True)
@@ -78,7 +86,8 @@ class RefusedState:
 def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
     """Say who records, who drains, and how far database and tables are behind. Reads only.
 
-    Exit code 1 if an episode or a recorder is stopped, 3 if the database or the spool is not available.
+    Exit code 1 if an episode or a recorder is stopped or a designator type has no tables, 3 if the database or the
+    spool is not available.
     """
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
@@ -86,11 +95,15 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     recorders = [_recorder(each) for each in folders if each.refused is None]
     refused = [RefusedState(each.refused, each.path, _bytes(each.path)) for each in folders if each.refused is not None]
     has_daemon = place.has_writer
+    workers = _workers(place.writer_note())
     episodes: list[EpisodeState] = []
     projections: list[ProjectionState] = []
+    limits_near: list[str] = []
+    unmade: dict[str, str] = {}
+    kept, known = kept_in(place.path), None
     fault: str | None = None
     try:
-        episodes, projections = asyncio.run(_episodes(address))
+        episodes, projections, limits_near, unmade, known = asyncio.run(_episodes(address))
     except DatabaseError as error:
         fault = str(error)
     if as_json:
@@ -99,39 +112,101 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
                 "url": address.to_type,
                 "spool": place.path,
                 "daemon": has_daemon,
+                "fold_workers": workers,
                 "database": fault or "ok",
                 "recorders": recorders,
                 "episodes": episodes,
                 "refused": refused,
                 "projections": [each._asdict() for each in projections],
+                "warnings": limits_near,
+                "unmade": unmade,
+                "kept": kept,
+                "stored_on": None if known is None else known.stored_on._asdict(),
+                "went_back": [] if known is None else [each._asdict() for each in known.went_back],
             }
         )
     else:
         _print(place, recorders, episodes, has_daemon=has_daemon, known=fault is None)
+        _print_workers(workers)
+        print_durability(kept, known)
         for projection in projections:
             late = f"is {projection.behind} events behind" if projection.behind else "shows all that is stored"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {late}.", markup=False)
+        _warn(limits_near)
     if fault is not None:
         problem(fault)
         return 3
     stopped = [each for each in episodes if each.refused or each.parked]
     for episode in stopped:
         problem(f"episode {episode.number} ({episode.id}) is stopped: {episode.refused or episode.parked}")
-    for projection in projections:
-        if projection.fault is not None:
-            problem(projection.fault)
-        for number, reason in projection.parked.items():
-            problem(f"episode {number} is stopped in the projection {projection.name}: {reason}")
+    for dtype, reason in unmade.items():
+        problem(f"{dtype[:80]!r} has no tables: {reason}")
+    halted = _halted(projections)
+    unreadable = [each for each in recorders if each.fault]
+    for recorder in unreadable:
+        problem(f"recorder {recorder.name}: {recorder.fault}")
     given_up = [each for each in recorders if each.given_up]
     for recorder in given_up:
         problem(f"nothing more of recorder {recorder.name} is stored: {recorder.given_up}")
     for each in refused:
         problem(f"what the database refused of episode {each.episode} is kept in {each.folder}")
-    halted = any(each.parked or each.fault for each in projections)
-    return 1 if stopped or halted or given_up or refused else 0
+    return 1 if stopped or unmade or halted or given_up or refused or unreadable else 0
+
+
+def _halted(projections: Sequence[ProjectionState]) -> bool:
+    """Whether any of them is not kept up to date, after a line for each reason."""
+    for projection in projections:
+        if projection.fault is not None:
+            problem(projection.fault)
+        for number, reason in projection.parked.items():
+            problem(f"episode {number} is stopped in the projection {projection.name}: {reason}")
+    return any(each.parked or each.fault for each in projections)
+
+
+def _warn(warnings: Iterable[str]) -> None:
+    for warning in warnings:
+        note(f"warning: {warning}")
+
+
+def _workers(note: bytes | None) -> Sequence[FoldWorkerState]:
+    """The fold workers of the daemon that wrote this; none if a daemon of another version did."""
+    try:
+        return () if note is None else msgspec.json.decode(note, type=DaemonNote).fold_workers
+    except msgspec.DecodeError:
+        return ()
+
+
+def _print_workers(workers: Sequence[FoldWorkerState]) -> None:
+    if not workers:
+        return
+    now_ns = SYSTEM_CLOCK.wall_ns()
+    print_table(
+        "Fold workers of the daemon",
+        ("worker", "state", "for s", "pid", "restarts", "last death", "batches folded"),
+        [
+            (
+                each.number,
+                each.state,
+                round((now_ns - each.since_wall_ns) / 1e9),
+                each.pid,
+                each.restarts,
+                each.reason,
+                each.batches,
+            )
+            for each in workers
+        ],
+    )
 
 
 def _recorder(folder: RecorderFolder) -> RecorderState:
+    try:
+        return _state(folder)
+    except Exception as error:  # noqa: BLE001 - shown with this recorder; the others are looked at
+        fault = str(fault_in(folder.path, error))
+        return RecorderState(folder.name, folder.alive, "nobody", None, None, None, 0, None, None, {}, fault)
+
+
+def _state(folder: RecorderFolder) -> RecorderState:
     with available(folder.path):
         locked = is_locked(folder.path / DRAIN)
         spooled = _bytes(folder.path)
@@ -159,10 +234,9 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
 
 
 def _bytes(folder: Path) -> int:
-    try:
+    with suppress(OSError):  # all of it was stored and deleted since it was listed, or `_state` says why not
         return sum(_size(segment_path(folder, number)) for number in segment_numbers(folder))
-    except FileNotFoundError:  # it was all stored, and is gone since it was listed
-        return 0
+    return 0
 
 
 def _size(path: Path) -> int:
@@ -172,7 +246,9 @@ def _size(path: Path) -> int:
         return 0
 
 
-async def _episodes(address: DatabaseAddress) -> tuple[list[EpisodeState], list[ProjectionState]]:
+async def _episodes(
+    address: DatabaseAddress,
+) -> tuple[list[EpisodeState], list[ProjectionState], list[str], dict[str, str], Durability]:
     log = await EventLog.open(address, create=False)
     try:
         found = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
@@ -185,7 +261,8 @@ async def _episodes(address: DatabaseAddress) -> tuple[list[EpisodeState], list[
             found_states.append(
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
             )
-        return found_states, await states(log, installed_besides(()))
+        projections = await states(log, installed_besides(()))
+        return found_states, projections, await log.limits_near(), await unmade_types(log), await durability(log)
     finally:
         await log.close()
 

@@ -7,25 +7,34 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from socket import socket
+from types import MappingProxyType
 from typing import Annotated
 
 import typer
 
 from pycrorm_async.adoption import RecoveryReport, recover
-from pycrorm_async.apart import folding_process
 from pycrorm_async.bulk import collect_seldom
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
+from pycrorm_async.cli.options import (
+    DEFAULT_URL,
+    FileAccessOption,
+    JsonOption,
+    ProjectionOption,
+    SpoolOption,
+    UrlOption,
+)
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
+from pycrorm_async.config import Settings
 from pycrorm_async.daemon import serve
 from pycrorm_async.errors import DamageError, SpoolDamaged
+from pycrorm_async.operations.fold_process import FoldProcess, forked
+from pycrorm_async.operations.fold_workers import WORKERS
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import named
 from pycrorm_async.writer.daemon import LEAVE_S, Moved
 
-__all__ = ["writer"]
+__all__ = ["writer", "store_once"]
 
 _HANGING_S = 5.0
 """How much longer than `LEAVE_S` a database that does not answer at all may keep the process."""
@@ -38,6 +47,7 @@ def writer(
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     projection: ProjectionOption = None,
+    file_access: FileAccessOption = "owner",
     as_json: JsonOption = False,
 ) -> int:
     """Bring what is recorded below a spool into the database and its tables, as it comes.
@@ -46,15 +56,16 @@ def writer(
     is synced and exits 0 within 15 seconds. A database that goes away is waited for; one that cannot be opened at the
     start, or a spool that another `pycrorm writer` drains, is exit code 3.
 
-    With --once: exit code 0 also when an episode was lost with its process; 4 if files are damaged, 1 if an episode is
-    stopped.
+    With --once: exit code 0 also when an episode was lost with its process; 1 if the database refused events of an
+    episode, now or earlier, or they do not fit the tables; 3 if a recorder's folder cannot be read or written; 4 if
+    files are damaged. What is refused is kept in the spool, and the line names the folder.
     """
-    projections = named(projection or ())
+    projections, settings = named(projection or ()), Settings(file_access=file_access)
     collect_seldom()
     if once:
-        return _once(url, spool, projections, as_json=as_json)
-    with folding_process(url, spool=spool, projections=projections) as folding:
-        moved = asyncio.run(_until_told_to_leave(url, spool, projections, folding))
+        return store_once(url, spool, projections, settings, as_json=as_json)
+    with forked(WORKERS) as processes:
+        moved = asyncio.run(_until_told_to_leave(url, spool, projections, settings, processes))
     if as_json:
         print_json(moved._asdict())
     else:
@@ -63,7 +74,11 @@ def writer(
 
 
 async def _until_told_to_leave(
-    url: str, spool: Path | None, projections: Sequence[Projection], folding: socket
+    url: str,
+    spool: Path | None,
+    projections: Sequence[Projection],
+    settings: Settings,
+    processes: Sequence[FoldProcess],
 ) -> Moved:
     leave = asyncio.Event()
 
@@ -77,16 +92,34 @@ async def _until_told_to_leave(
 
     for each in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(each, told)
-    return await serve(url, spool=spool, leave=leave, say=note, projections=projections, folding=folding)
+    return await serve(
+        url,
+        spool=spool,
+        leave=leave,
+        say=note,
+        settings=settings,
+        projections=projections,
+        fold_workers=WORKERS,
+        forked=processes,
+    )
 
 
-def _once(url: str, spool: Path | None, projections: Sequence[Projection], *, as_json: bool) -> int:
+def store_once(
+    url: str,
+    spool: Path | None,
+    projections: Sequence[Projection],
+    settings: Settings,
+    *,
+    as_json: bool,
+    beside: Mapping[str, object] = MappingProxyType({}),
+) -> int:
+    """Append and fold all there is, and print the report (`beside` goes into the same JSON document); the exit code."""
     logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)  # the report tells all of it, once
     logging.getLogger("pycrorm_async.projections").setLevel(logging.WARNING)  # but of these nothing
     with stderr.status("recovering what dead processes left …"):
-        report = asyncio.run(recover(url, spool=spool, projections=projections))
+        report = asyncio.run(recover(url, spool=spool, settings=settings, projections=projections))
     if as_json:
-        print_json(_document(report))
+        print_json({**beside, **_document(report)})
     else:
         _print(report)
     for name, error in report.failed.items():
@@ -95,12 +128,19 @@ def _once(url: str, spool: Path | None, projections: Sequence[Projection], *, as
             mend = f"; mend it with: pycrorm spool repair {error.path.parent.parent}"
         problem(f"{name}: {error}{mend}")
     for episode, reason in report.drained.stopped.items():
-        problem(f"episode {episode} is stopped: {reason}")
+        problem(f"episode {episode} is stopped: {reason}{_kept_in(report.dead_letters.get(episode))}")
+    for episode, folder in report.dead_letters.items():
+        if episode not in report.drained.stopped:
+            problem(f"episode {episode} was refused{_kept_in(folder)}")
     if any(isinstance(error, DamageError) for error in report.failed.values()):
         return 4
     if report.failed:
         return 3
-    return 1 if report.drained.stopped else 0
+    return 1 if report.drained.stopped or report.dead_letters else 0
+
+
+def _kept_in(folder: Path | None) -> str:
+    return "" if folder is None else f"; its events are kept in {folder}"
 
 
 def _print(report: RecoveryReport) -> None:
@@ -124,4 +164,5 @@ def _document(report: RecoveryReport) -> dict[str, object]:
         "lost": report.lost,
         "failed": {name: str(error) for name, error in report.failed.items()},
         "stopped": dict(report.drained.stopped),
+        "dead_letters": {episode: str(folder) for episode, folder in report.dead_letters.items()},
     }

@@ -25,6 +25,24 @@ from pycrorm_async.cli.main import main
 main()
 """
 
+SPEAKING = """
+import asyncio, os, signal
+from pycrorm_async.cli.interrupting import Interrupting
+from pycrorm_async.cli.output import stderr
+
+class Interrupted:
+    def __rich_console__(self, console, options):
+        os.kill(os.getpid(), signal.SIGINT)
+        yield "the rest of the line"
+
+async def main():
+    with Interrupting(patience=1).heeded():
+        os.kill(os.getpid(), signal.SIGINT)
+        stderr.print(Interrupted())
+
+asyncio.run(main())
+"""
+
 PLAN = """
 import pathlib, time
 from dataclasses import dataclass
@@ -86,3 +104,11 @@ def test_interrupted_while_it_loads_it_says_so_in_a_line(tmp_path: Path) -> None
     )
     assert (done.returncode, done.stderr) == (130, "pycrorm: interrupted before anything was done\n")
     assert not list(tmp_path.iterdir())
+
+
+def test_interrupted_while_it_prints_a_line_it_leaves_with_the_last_one(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SPEAKING], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    line = "pycrorm: interrupted; what is not stored yet is safe in the spool, and the next start brings it in\n"
+    assert (done.returncode, done.stderr) == (130, line)

@@ -15,6 +15,7 @@ from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask, ask_to_change
 from tests.projections.verifying import fold_in_batches, full, opened, shown
+from tests.store.making import declaration
 
 ID = "00000000-0000-7000-8000-00000000000{}"
 
@@ -44,7 +45,7 @@ def test_a_memory_that_is_as_it_should_be(folder: Path) -> None:
     assert done.stdout == f"60 events of 3 episodes and {rows} rows: all as it should be\n"
     assert answer("verify", cwd=folder) == {
         "episodes": 3, "events": 60, "rows": rows, "behind": 0, "damage": 0, "drift": 0, "remarks": 0,
-        "damages": [], "differences": [], "not_compared": {},
+        "damages": [], "differences": [], "not_compared": {}, "stopped": [], "unmade": {}, "outdated": None,
     }  # fmt: skip
 
 
@@ -98,11 +99,6 @@ def test_what_cannot_be_verified_is_one_line(folder: Path) -> None:
     done = pycrorm("verify", "--episode", "7", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert "there is no episode '7'" in one_line_of(done)
-    ask_to_change(folder / "pycrorm.db", "UPDATE pycrorm_generation SET version = version - 1")
-    done = pycrorm("verify", cwd=folder)
-    assert (done.returncode, done.stdout) == (3, "")
-    assert one_line_of(done).endswith("run `pycrorm rebuild`")
-    ask_to_change(folder / "pycrorm.db", "UPDATE pycrorm_generation SET version = version + 1")
     ask_to_change(folder / "pycrorm.db", "DROP TABLE state_sample__1")
     done = pycrorm("verify", cwd=folder)
     assert (done.returncode, done.stdout) == (3, "")
@@ -128,6 +124,43 @@ def test_a_log_without_tables_and_what_is_no_memory_at_all_are_one_line(tmp_path
         done = pycrorm("verify", "--url", f"sqlite:///{name}.db", cwd=tmp_path)
         assert (done.returncode, done.stdout) == (3, "")
         assert reason in one_line_of(done)
+
+
+async def test_what_is_not_in_the_tables_at_all_is_told_a_line_each_and_ends_with_1(folder: Path) -> None:
+    file = folder / "pycrorm.db"
+    ask_to_change(file, "UPDATE episode SET parked = 'event 7: by hand' WHERE number = 2")
+    ask_to_change(file, "UPDATE episode SET refused = 'events 8 to 9 did not arrive' WHERE number = 3")
+    field = b'{"name":"ID","column":"ID","type":"real","slot":2}'
+    evil = b'{"kind":"action","dtype":"EvilAction","table":"evil_action","fields":[%b]}' % field
+    log = await opened(f"sqlite:///{file}")
+    await log.append([declaration(evil)])
+    await log.close()
+    lines = [
+        "parked: episode 2: event 7: by hand",
+        "refused: episode 3: events 8 to 9 did not arrive",
+        "no tables: 'EvilAction': EvilAction: field 'ID' has a reserved name (id)",
+    ]
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.splitlines()[:-1] == lines
+    assert (
+        ": 2 episodes are stopped, 1 types have no tables, and the rest is as it should be"
+        in done.stdout.splitlines()[-1]
+    )
+    assert pycrorm("verify", "--episode", "1", cwd=folder).returncode == 0
+    assert pycrorm("verify", "--episode", "2", cwd=folder).stdout.splitlines()[0] == lines[0]
+    document = answer("verify", cwd=folder, code=1)
+    assert document["stopped"] == [
+        {"episode": ID.format(2), "number": 2, "how": "parked", "reason": "event 7: by hand"},
+        {"episode": ID.format(3), "number": 3, "how": "refused", "reason": "events 8 to 9 did not arrive"},
+    ]
+    assert document["unmade"] == {"EvilAction": "EvilAction: field 'ID' has a reserved name (id)"}
+
+    ask_to_change(file, "UPDATE pycrorm_generation SET version = version - 1")
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert [each for each in done.stdout.splitlines() if each.startswith("outdated: the tables were made by version ")]
+    assert answer("verify", cwd=folder, code=1)["outdated"].endswith("run `pycrorm rebuild`")
 
 
 async def test_on_postgresql_whoever_may_read_may_verify(server: Server, tmp_path: Path) -> None:

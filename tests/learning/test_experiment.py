@@ -10,17 +10,19 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import psutil
 import pytest
 
 from pycrorm_async import Reading
 from pycrorm_async.daemon import serve
 from pycrorm_async.errors import CallerError, NotEnoughExperience
-from pycrorm_async.learning import Scene, default_policy, name_of, remembered
+from pycrorm_async.learning import Policy, Scene, default_policy, experiment, name_of, remembered
 from pycrorm_async.learning.experiment import Experiment, Learned, known, run
 from pycrorm_async.learning.kitchen import pick_up_in_kitchen
 from pycrorm_async.learning.rollouts import Tally
 from pycrorm_async.learning.study import elsewhere, study
+from pycrorm_async.learning.tree import learn
 from pycrorm_async.learning.workers import Job, Place, WorkerLost, Workers
 from pycrorm_async.orm import MoveAndPickUpAction
 from tests.databases import ask, await_events
@@ -244,6 +246,27 @@ async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Pa
     assert [each.name for each in learned.phases][:3] == ["default policy", "learned policy, round 2", "learned policy"]
     assert len(learned.successes) == learned.phases[0].tally.successes + learned.phases[1].tally.successes
     assert learned.evaluation.tally.success_rate > 0.5
+
+
+async def test_what_is_rolled_out_is_not_rolled_out_again_when_learning_from_it_had_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    twice = Experiment(rollouts=200, rounds=2, evaluate=10, held_out=10)
+    learned_from: list[int] = []
+
+    def learn_once(successes: pd.DataFrame, *, min_samples_leaf: int) -> Policy:
+        learned_from.append(len(successes))
+        if len(learned_from) == 2:
+            raise RecursionError("maximum recursion depth exceeded")
+        return learn(successes, min_samples_leaf=min_samples_leaf)
+
+    monkeypatch.setattr(experiment, "learn", learn_once)
+    with pytest.raises(RecursionError):
+        await run(twice, place)
+    learned = await run(replace(twice, resume=True), place)
+    assert [(each.tally.rollouts, each.done_now) for each in learned.phases] == [(200, 0), (200, 0), (10, 10), (10, 10)]
+    assert learned_from[2:] == learned_from[:2]
 
 
 async def test_each_rollout_may_be_an_episode(tmp_path: Path) -> None:

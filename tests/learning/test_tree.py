@@ -102,6 +102,18 @@ def test_likelihoods_are_those_of_pyjpt(learned: Policy, oracle: Any, successes:
     assert alike.all()
 
 
+def test_the_leaves_are_those_of_pyjpt_in_the_same_order_and_to_the_digit(learned: Policy, oracle: Any) -> None:
+    rows = sum(leaf.samples for leaf in oracle.leaves.values())
+    theirs = []
+    for _, leaf in sorted(oracle.leaves.items()):
+        arm, grasp, x, y = (leaf.distributions[each] for each in oracle.variables)
+        knots = [tuple(piece.upper for piece in each.cdf.intervals[:-1]) for each in (x, y)]
+        theirs.append((leaf.samples / rows, tuple(arm.probabilities), tuple(grasp.probabilities), *knots))
+    ours = [(each.weight, each.arms, each.grasps, each.x.knots, each.y.knots) for each in learned.leaves]  # type: ignore[union-attr]
+    assert len(ours) > 5
+    assert ours == theirs
+
+
 def test_probabilities_and_conditioned_ones_are_those_of_pyjpt(learned: Policy, oracle: Any) -> None:
     from jpt.base.intervals import ContinuousSet
 
