@@ -32,7 +32,20 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bench.breaking import databases, files, machine, processes, robots, simulation
+from bench.breaking import (
+    crafted,
+    databases,
+    declarations,
+    deletions,
+    disks,
+    files,
+    machine,
+    processes,
+    restores,
+    robots,
+    simulation,
+    workers,
+)
 from bench.breaking.outcome import Outcome, Step
 from bench.breaking.report import Report, Slice, summed
 from pycrorm_async.store.private import usual_place
@@ -67,12 +80,22 @@ def faults_on(server: Server) -> list[Fault]:
         Fault("kill -9 of a plan and its writer", robots.killed_plans, 6, 500, 50),
         Fault("kill -9 of the daemon, SQLite", robots.killed_daemons(None), 3, 200, 20),
         Fault("kill -9 of the daemon, PostgreSQL", robots.killed_daemons(server), 3, 200, 20),
+        Fault("killed fold workers, SQLite", workers.faulty_workers(None, signal.SIGKILL), 2, 200, 20),
+        Fault("killed fold workers, PostgreSQL", workers.faulty_workers(server, signal.SIGKILL), 2, 200, 20),
+        Fault("stopped fold workers, SQLite", workers.faulty_workers(None, signal.SIGSTOP), 2, 200, 20),
+        Fault("stopped fold workers, PostgreSQL", workers.faulty_workers(server, signal.SIGSTOP), 2, 200, 20),
         Fault("torn write at every byte", files.torn_writes, 300, 20_000, 2_000),
         Fault("flipped bit", files.flipped_bits, 150, 80_000, 80_000),
         Fault("power cut, simulated disk", files.power_cuts, 60, 5_000, 500),
         Fault("power cut, real disk", machine.power_cuts, 4, 500, 25),
         Fault("failed sync", files.failed_syncs, 20, 1_000, 1_000),
         Fault("disk full, spool", files.full_disk, 3, 100, 100),
+        Fault("disk full, ext4", disks.FullDisksOn("ext4"), 2, 200, 50),
+        Fault("disk full, XFS", disks.FullDisksOn("xfs"), 2, 200, 50),
+        Fault("disk full, btrfs", disks.FullDisksOn("btrfs"), 2, 200, 50),
+        Fault("deleted spool", disks.deleted_spools, 6, 300, 50),
+        Fault("crafted frames", crafted.crafted_folders, 2, 300, 50),
+        Fault("deleted database", deletions.deleted_databases, 3, 200, 20),
         Fault("disk full, database", databases.full_disks, 5, 500, 100),
         Fault("clock jumps", files.clock_jumps, 20, 1_000, 1_000),
         Fault("fork", processes.forks, 10, 500, 500),
@@ -84,6 +107,12 @@ def faults_on(server: Server) -> list[Fault]:
         Fault("locked database", databases.locked_files, 10, 500, 100),
         Fault("stopped server", databases.ended_servers(server, killed=False), 2, 50, 10),
         Fault("killed server", databases.ended_servers(server, killed=True), 2, 50, 10),
+        Fault("foreign declarations, SQLite", declarations.foreign_declarations(on_a_file), 3, 200, 20),
+        Fault("foreign declarations, PostgreSQL", declarations.foreign_declarations(on_the_server), 3, 200, 20),
+        Fault("failover to an asynchronous replica", restores.failovers(synchronous=False), 2, 200, 20),
+        Fault("failover to a synchronous replica", restores.failovers(synchronous=True), 2, 200, 20),
+        Fault("restored PostgreSQL", restores.restored_servers, 2, 200, 50),
+        Fault("restored SQLite file", restores.restored_files, 3, 300, 50),
         Fault("all of it at random, simulated", simulation.simulated, 15, 1_000, 100),
     ]
 
@@ -116,7 +145,7 @@ def main() -> int:
             order = [each.name for each in faults]
             report = Report(arguments.report, seed=seed, quick=arguments.quick, command=command, order=order)
             for fault in faults:
-                if arguments.only in fault.name:
+                if not arguments.only or any(word in fault.name for word in arguments.only):
                     found = _made(fault, arguments, report, Path(folder), progress)
                     outcomes[fault.name] = summed(found)
                     print(json.dumps(Slice(fault.name, 0, outcomes[fault.name]).line(seed)), flush=True)
@@ -133,7 +162,7 @@ def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--quick", action="store_true", help="less than a minute")
     parser.add_argument("--seed", type=int, default=None, help="of all random choices; printed in every line")
-    parser.add_argument("--only", default="", help="the faults whose name holds this word")
+    parser.add_argument("--only", action="append", help="the faults whose name holds this word; may be repeated")
     parser.add_argument("--slice", type=int, default=None, help="of the long version only the slice of this number")
     parser.add_argument("--report", type=Path, default=None, help="a file for the table; FILE.jsonl beside it")
     return parser.parse_args()

@@ -15,10 +15,10 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 
+from bench.breaking.images import NOT_MADE, DiskImage
 from bench.breaking.outcome import Outcome, Step
 from bench.breaking.robots import Walked, compare_steps, walk
 from bench.breaking.speaking import Speaker
@@ -26,7 +26,6 @@ from pycrorm_async.adoption import recover
 
 __all__ = ["power_cuts"]
 
-_IMAGE = "64M"
 _SHUTDOWN = 0x8004587D  # EXT4_IOC_SHUTDOWN
 _NO_LOG_FLUSH = 2
 _WRITE = 2  # SYNC_FILE_RANGE_WRITE
@@ -34,24 +33,8 @@ _PAGE = 4096
 _LONGEST_LIFE_S = 0.3
 
 
-class _Disk:
-    """An ext4 in a file."""
-
-    def __init__(self, folder: Path) -> None:
-        self._image = folder / "disk.img"
-        self.root = folder / "disk"
-        self.root.mkdir()
-        subprocess.run(["truncate", "-s", _IMAGE, self._image], check=True)
-        subprocess.run(["mkfs.ext4", "-q", "-F", self._image], check=True)
-
-    @contextmanager
-    def mounted(self) -> Iterator[None]:
-        """Mounting replays the journal."""
-        subprocess.run(["mount", "-o", "loop", self._image, self.root], check=True, capture_output=True)
-        try:
-            yield
-        finally:
-            subprocess.run(["umount", self.root], check=True)
+class _Disk(DiskImage):
+    """An ext4 that can lose its power."""
 
     def fail(self) -> None:
         """From now on nothing reaches the image, and every sync is an error."""
@@ -84,7 +67,7 @@ def power_cuts(rounds: int, rng: random.Random, folder: Path, step: Step) -> Out
         with disk.mounted():
             pass
     except (OSError, subprocess.CalledProcessError):
-        outcome.note = "not made: there is no right to mount a loop image here"
+        outcome.note = NOT_MADE
         return outcome
     outcome.note = "ext4 on a loop image, shut down under a plan, its writer and its SQLite; pages pushed out at random"
     url, spool = f"sqlite:///{disk.root}/memory.db", disk.root / "spool"

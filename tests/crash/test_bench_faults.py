@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -30,12 +31,22 @@ FAULTS = [
     "kill -9 of a plan and its writer",
     "kill -9 of the daemon, SQLite",
     "kill -9 of the daemon, PostgreSQL",
+    "killed fold workers, SQLite",
+    "killed fold workers, PostgreSQL",
+    "stopped fold workers, SQLite",
+    "stopped fold workers, PostgreSQL",
     "torn write at every byte",
     "flipped bit",
     "power cut, simulated disk",
     "power cut, real disk",
     "failed sync",
     "disk full, spool",
+    "disk full, ext4",
+    "disk full, XFS",
+    "disk full, btrfs",
+    "deleted spool",
+    "crafted frames",
+    "deleted database",
     "disk full, database",
     "clock jumps",
     "fork",
@@ -47,8 +58,20 @@ FAULTS = [
     "locked database",
     "stopped server",
     "killed server",
+    "foreign declarations, SQLite",
+    "foreign declarations, PostgreSQL",
+    "failover to an asynchronous replica",
+    "failover to a synchronous replica",
+    "restored PostgreSQL",
+    "restored SQLite file",
     "all of it at random, simulated",
 ]
+SLOW = [
+    each
+    for each in FAULTS
+    if each.startswith(("killed fold", "stopped fold", "deleted database", "foreign", "failover", "restored"))
+]
+"""A round of these starts servers or many processes."""
 COST = ("lost", "duplicated", "misordered", "changed", "broke")
 
 
@@ -59,14 +82,25 @@ def faults(*arguments: str | Path) -> tuple[int, list[dict[str, Any]], str]:
     return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
 
 
-def test_the_quick_version_makes_every_fault_and_costs_nothing() -> None:
-    code, outcomes, said = faults()
+def test_the_list_of_faults_is_whole() -> None:
+    assert re.findall(r'^ +Fault\("(.+?)"', (ROOT / "bench/faults.py").read_text(), re.MULTILINE) == FAULTS
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param([each for each in FAULTS if each not in SLOW], id="quick rows"),
+        pytest.param(SLOW, id="slow rows", marks=pytest.mark.soak),
+    ],
+)
+def test_the_quick_version_makes_every_fault_and_costs_nothing(names: list[str]) -> None:
+    code, outcomes, said = faults(*(each for name in names for each in ("--only", name)))
     bad = [each for each in outcomes if any(each[name] for name in COST)]
     assert (code, bad) == (0, []), said
-    assert [each["fault"] for each in outcomes] == FAULTS
+    assert [each["fault"] for each in outcomes] == names
     made = [each for each in outcomes if not each["note"].startswith("not made: there is no right to mount")]
     assert all(each["rounds"] >= 2 and each["events"] >= 20 for each in made)
-    assert next(each for each in outcomes if each["fault"] == "flipped bit")["told"] > 0
+    assert all(each["told"] > 0 for each in outcomes if each["fault"] == "flipped bit")
 
 
 def test_a_run_goes_on_from_its_report_and_a_loss_in_it_is_a_problem(tmp_path: Path) -> None:
@@ -144,7 +178,7 @@ def test_a_recovery_that_does_this_is_seen(
 def test_a_queue_that_calls_synced_what_it_did_not_sync_is_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def careless(queue: RecorderQueue) -> None:
+    def careless(queue: RecorderQueue, **_: object) -> None:
         span = queue._appender.begin_sync()
         queue._safe_number, queue._synced = span.segments[-1].number, span.position
         queue._bell.ring()

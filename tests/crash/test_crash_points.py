@@ -181,7 +181,8 @@ def test_a_recovery_killed_at_any_step_and_the_next_one_too_stores_every_event_o
         recover_all(url, spool)
         whole(url)
         # Killed between the folder's last file and the folder itself, it may stay, empty.
-        assert [path for folder in spool.iterdir() for path in folder.iterdir()] == []
+        left_behind = [folder for folder in spool.iterdir() if folder.name != "stored"]
+        assert [path for folder in left_behind for path in folder.iterdir()] == []
         shutil.rmtree(place)
         if ended_at is not None and first > ended_at:
             break

@@ -82,7 +82,7 @@ class Machine:
 
     def folders(self) -> list[str]:
         """Of recorders, which go when all in them is stored."""
-        return [path.name for path in self.lab.spool.iterdir() if path.is_dir()]
+        return [path.name for path in self.lab.spool.iterdir() if path.is_dir() and path.name != "stored"]
 
     def clear(self) -> None:
         for robot in self.living():

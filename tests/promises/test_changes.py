@@ -40,11 +40,18 @@ GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
 
 
 @pytest.fixture
-def golden(tmp_path: Path) -> str:
+def as_written(tmp_path: Path) -> str:
     """The URL of the golden memory, with the spool of the recorder that died beside it."""
     with tarfile.open(GOLDEN) as packed:
         packed.extractall(tmp_path, filter="data")
     return f"sqlite:///{tmp_path}/memory.db"
+
+
+@pytest.fixture
+async def golden(as_written: str) -> str:
+    """The same with the tables of this version of the fold."""
+    await rebuild_memory(as_written)
+    return as_written
 
 
 def id_of(number: int, sequence: int) -> int:
@@ -358,6 +365,12 @@ async def test_while_tables_are_those_of_an_older_fold_events_are_recorded_and_s
         ]  # fmt: skip
     after = tables_of(golden)
     assert all(after[name].items() >= rows.items() for name, rows in before.items())
+
+
+async def test_the_tables_of_the_first_version_are_asked_to_be_rebuilt(as_written: str) -> None:
+    asked = rf"by version 3 of the fold, this is version {PROJECTION_VERSION}: run `pycrorm rebuild`$"
+    with pytest.raises(TablesOutdated, match=asked):
+        await shown(as_written, "GreetAction")
 
 
 async def test_tables_of_a_newer_fold_are_refused(golden: str) -> None:

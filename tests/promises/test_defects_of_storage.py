@@ -95,7 +95,7 @@ async def test_what_is_handed_over_twice_is_stored_once(tmp_path: Path) -> None:
     report = await recover(url_of(tmp_path))
     assert (report.failed, report.lost) == ({}, ())
     assert contents(tmp_path) == before
-    assert not [each for each in spool.iterdir() if each.is_dir()]
+    assert not [each for each in spool.iterdir() if each.is_dir() and each.name != "stored"]
 
 
 def contents(folder: Path) -> dict[str, list[Any]]:
@@ -177,17 +177,10 @@ async def test_one_value_that_cannot_be_stored_loses_nothing_else(tmp_path: Path
     async with remembered(tmp_path):
         with lab():
             await NavigateActionPerformable(Pose([0.1, 0, 0])).perform()
-            with pytest.raises(Exception, match=r"NoteAction\.text cannot be recorded"):
-                await NoteActionPerformable("half a pair: \ud800").perform()
+            await NoteActionPerformable("half a pair: \ud800").perform()
             await NavigateActionPerformable(Pose([0.2, 0, 0])).perform()
-    assert (
-        statuses(await nodes_of(tmp_path))[1:]
-        == [
-            ("NavigateAction", "SUCCEEDED"),
-            ("MoveMotion", "SUCCEEDED"),
-        ]
-        * 2
-    )
+    drive = [("NavigateAction", "SUCCEEDED"), ("MoveMotion", "SUCCEEDED")]
+    assert statuses(await nodes_of(tmp_path))[1:] == [*drive, ("NoteAction", "SUCCEEDED"), *drive]
 
 
 GROWING = """

@@ -1,4 +1,4 @@
-"""A plan that suspends once in 400,000 actions: all of them stored, and the process does not grow."""
+"""A plan that suspends once in tens of thousands of actions is stored whole, and its process does not grow."""
 
 import json
 import subprocess
@@ -51,7 +51,7 @@ asyncio.run(main(sys.argv[1], int(sys.argv[2])))
 """
 
 
-@pytest.mark.parametrize("total", [400_000])
+@pytest.mark.parametrize("total", [60_000, pytest.param(400_000, marks=pytest.mark.soak)])
 def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path, total: int) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, f"sqlite:///{tmp_path}/long.db", str(total)],
@@ -66,5 +66,5 @@ def test_all_of_a_long_plan_is_stored_and_the_process_stays_flat(tmp_path: Path,
     assert found["rows"] == [total, 0, total - 1, total]
     assert found["done"] == total + 1  # the root of the episode as well
     # In KiB, over the second half: with the flush before it the largest batch of the writer has come, which on a busy
-    # machine may come late. 32 kB a node, as in the reference system, would be 6.4 GB.
+    # machine may come late. 32 kB a node, as in the reference system, would be 960 MB for the smaller plan.
     assert found["sizes"][-1] - found["sizes"][4] < 12_000, found["sizes"]

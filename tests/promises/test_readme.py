@@ -16,7 +16,7 @@ from pycrorm_async.learning import load_policy
 from tests.commands import answer, pycrorm
 
 README = (Path(__file__).parent.parent.parent / "README.md").read_text()
-PLAN, QUESTIONS, TIDY, THEN, RATE, BETTER = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+PLAN, QUESTIONS, CELLS, TIDY, THEN, RATE, BETTER = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
 def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
@@ -67,6 +67,19 @@ async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.Mo
     assert [each.whom for each in greeted] == ["Ada"]
     assert len(frame) == 0
     assert await asyncio.to_thread((tmp_path / "memory.db").exists)
+
+
+async def test_what_is_performed_after_a_memory_and_a_world_were_connected_is_remembered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(PLAN + "\nfrom pycrorm_async import Memory", names)
+    exec(f"async def cells():\n{textwrap.indent(CELLS, '    ')}", names)
+    await names["cells"]()  # type: ignore[operator]
+    with contextlib.closing(sqlite3.connect(tmp_path / "notebook.db")) as plain:
+        performed = plain.execute("SELECT dtype, status FROM task_tree_node ORDER BY id").fetchall()
+    assert performed == [(None, "SUCCEEDED"), ("NavigateAction", "SUCCEEDED"), ("MoveMotion", "SUCCEEDED")]
 
 
 def test_the_projection_of_ones_own_counts_what_was_tried(tmp_path: Path) -> None:

@@ -1,0 +1,216 @@
+"""A database that goes back: a failover that loses, one that does not, a backup that is put back.
+
+What a flush acknowledged before must be there afterwards, under the same numbers and row ids, and verify must be clean.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import sqlite3
+import tempfile
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from bench.breaking.outcome import Event, Outcome, Step
+from pycrorm_async import Memory, Settings
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.backups import Backup
+from tests.databases import Server, ask, server_in
+from tests.replicas import replicas_in
+
+__all__ = ["failovers", "restored_files", "restored_servers"]
+
+_SETTINGS: Final = Settings(sync_interval_ms=5, flush_timeout_s=120)
+_EVENTS: Final = (
+    "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY episode.number, sequence"
+)
+_ROWS: Final = (
+    "SELECT id, number FROM episode",
+    "SELECT id, dtype FROM task_tree_node",
+    "SELECT id, text FROM note_action",
+)
+_VERIFY_EVERY: Final = 20
+
+
+@dataclass
+class NoteAction(ActionAbstract):
+    """Does nothing, and is remembered."""
+
+    text: str
+
+    async def perform(self) -> None:
+        """Noted."""
+
+
+async def _record(memory: Memory, rng: random.Random) -> None:
+    for _ in range(rng.randrange(1, 4)):
+        async with memory.episode(description="an episode"):
+            await _note(rng)
+
+
+async def _note(rng: random.Random) -> None:
+    for _ in range(rng.randrange(1, 6)):
+        await NoteAction(f"{rng.random()}").perform()
+
+
+class _Truth:
+    """What the database held when a flush had returned."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self.events: list[Event] = ask(url, _EVENTS)
+        self._rows = [set(ask(url, question)) for question in _ROWS]
+
+    def compare(self, outcome: Outcome) -> None:
+        """One round: the same events are there, and the same rows under the same ids."""
+        keys = {event[:2] for event in self.events}
+        found: list[Event] = ask(self._url, _EVENTS)
+        failed = len(outcome.rounds_failed)
+        outcome.compare(self.events, found, put=[event for event in found if event[:2] not in keys])
+        gone = sum(
+            len(before - set(ask(self._url, question))) for before, question in zip(self._rows, _ROWS, strict=True)
+        )
+        outcome.changed += gone
+        if gone and len(outcome.rounds_failed) == failed:
+            outcome.rounds_failed.append(outcome.rounds)
+
+
+async def _verified(outcome: Outcome, url: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    try:
+        found = await verify(log)
+        outcome.changed += found.damage + found.drift + found.behind + len(await log.stopped())
+    finally:
+        await log.close()
+
+
+async def _went_back(memory: Memory, rng: random.Random, going_back: Callable[[], Any], url: str) -> _Truth:
+    """One round: what was acknowledged before; the memory goes on afterwards in one of three ways."""
+    way = rng.randrange(3)
+    if way == 0:  # in the middle of an episode
+        async with memory.episode(description="through it all"):
+            await _note(rng)
+            await memory.flush()
+            truth = _Truth(url)
+            await asyncio.to_thread(going_back)
+            await _note(rng)
+            await memory.flush()
+    else:
+        await _record(memory, rng)
+        await memory.flush()
+        truth = _Truth(url)
+        await asyncio.to_thread(going_back)
+        if way == 1:
+            await _record(memory, rng)
+        await memory.flush()
+    return truth
+
+
+def failovers(*, synchronous: bool) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """A primary dies after its standby had stopped receiving, or had confirmed every COMMIT; the standby takes over."""
+
+    async def through(outcome: Outcome, rounds: int, rng: random.Random, step: Step, place: Path, spool: Path) -> None:
+        with replicas_in(place, synchronous=synchronous) as replicas:
+            ask(replicas.url(), "CREATE DATABASE memory")
+            url = replicas.url("memory")
+            async with Memory.open(url, spool=spool, settings=_SETTINGS) as memory:
+                for round_ in range(rounds):
+                    await _record(memory, rng)
+                    await memory.flush()
+                    if not synchronous:
+                        await asyncio.to_thread(replicas.lag)
+                    truth = await _went_back(memory, rng, replicas.fail_over, url)
+                    truth.compare(outcome)
+                    if round_ % _VERIFY_EVERY == 0 or round_ == rounds - 1:
+                        await _verified(outcome, url)
+                    await asyncio.to_thread(replicas.follow)
+                    step()
+
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        standby = "confirms every COMMIT" if synchronous else "receives nothing any more"
+        outcome = Outcome(
+            note=f"PostgreSQL: SIGQUIT of the primary while its standby {standby}; the standby is promoted"
+        )
+        with tempfile.TemporaryDirectory(prefix="pair") as place:
+            asyncio.run(through(outcome, rounds, rng, step, Path(place), folder / "spool"))
+        return outcome
+
+    return run
+
+
+def restored_servers(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    """A database on a server is replaced by a copy of it from before, under a memory that is open."""
+
+    outcome = Outcome(note="PostgreSQL: DROP DATABASE, then CREATE DATABASE from a copy")
+
+    async def through(server: Server, url: str) -> None:
+        async with Memory.open(url, spool=folder / "spool", settings=_SETTINGS) as memory:
+            for round_ in range(rounds):
+                await _record(memory, rng)
+                await memory.flush()
+                backup = await asyncio.to_thread(Backup, url, server)
+                truth = await _went_back(memory, rng, backup.restore, url)
+                truth.compare(outcome)
+                await asyncio.to_thread(backup.drop)
+                if round_ % _VERIFY_EVERY == 0 or round_ == rounds - 1:
+                    await _verified(outcome, url)
+                step()
+
+    with (
+        tempfile.TemporaryDirectory(prefix="pg") as place,
+        server_in(Path(place), syncs=False) as server,  # to drop a database waits for a checkpoint of all of them
+    ):
+        asyncio.run(through(server, server.new_database()))
+    return outcome
+
+
+def restored_files(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    """A SQLite file is replaced by a copy from before, between two lives of a memory or while one has it open."""
+    outcome = Outcome(note="SQLite: the file is replaced between two processes, or in place under a memory")
+    url = f"sqlite:///{folder}/memory.db"
+
+    async def through() -> None:
+        for round_ in range(rounds):
+            async with Memory.open(url, settings=_SETTINGS) as memory:
+                await _record(memory, rng)
+                await memory.flush()
+                if rng.random() < 0.5:
+                    truth = await _went_back(memory, rng, Backup(url, None).restore, url)
+                else:
+                    _copy(folder / "memory.db", folder / "copy.db")
+                    await _record(memory, rng)
+                    await memory.flush()
+                    truth = _Truth(url)
+            if _replaced(folder):
+                async with Memory.open(url, settings=_SETTINGS) as memory:
+                    await _record(memory, rng)
+                    await memory.flush()
+            truth.compare(outcome)
+            if round_ % _VERIFY_EVERY == 0 or round_ == rounds - 1:
+                await _verified(outcome, url)
+            step()
+
+    asyncio.run(through())
+    return outcome
+
+
+def _copy(source: Path, target: Path) -> None:
+    with closing(sqlite3.connect(source)) as read, closing(sqlite3.connect(target)) as written:
+        read.backup(written)
+
+
+def _replaced(folder: Path) -> bool:
+    """Whether there was a copy, which is the memory now."""
+    if not (folder / "copy.db").exists():
+        return False
+    for each in ("memory.db-wal", "memory.db-shm"):
+        (folder / each).unlink(missing_ok=True)
+    (folder / "copy.db").replace(folder / "memory.db")
+    return True
