@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import AsyncExitStack
 from pathlib import Path
-from socket import socket
+
+import msgspec
 
 from pycrorm_async.adoption import open_destination, shared_address
-from pycrorm_async.apart import FoldedApart
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DatabaseForeign, PycrormError, SpoolTaken
+from pycrorm_async.errors import DatabaseForeign, SpoolTaken
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.operations.fold_process import FoldProcess
+from pycrorm_async.operations.fold_worker import Assignment
+from pycrorm_async.operations.fold_workers import DaemonNote, FoldedByWorkers, FoldWorkers, FoldWorkerState
 from pycrorm_async.projections.own import Projection
 from pycrorm_async.projections.own_found import checked
+from pycrorm_async.queue.folder import fault_in
 from pycrorm_async.queue.living import LiveQueue
+from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
 from pycrorm_async.queue.spool import RecorderFolder, Spool
+from pycrorm_async.queue.stored import StoredSegments
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, Moved
@@ -35,41 +42,68 @@ async def serve(
     say: Callable[[str], None],
     settings: Settings | None = None,
     projections: Sequence[Projection] = (),
-    folding: socket | None = None,
+    fold_workers: int = 0,
+    forked: Sequence[FoldProcess] = (),
 ) -> Moved:
     """Drains every recorder of the spool and folds, until `leave` is set; `say` gets one line for each notable thing.
 
-    `projections` of one's own are kept up to date too, with those that are installed. `folding` is the process that
-    folds (`folding_process`); without, this one does.
+    `projections` of one's own are kept up to date too, with those that are installed. `fold_workers` processes fold, of
+    which the first ones may be `forked` already; while there is none, this one does.
 
     Raises `SpoolTaken` when another daemon drains this spool, `DatabaseForeign` when a SQLite file is replaced by
     another meanwhile, and as `Memory.open` does.
     """
     address = shared_address(url)
-    place = Spool(spool or address.default_spool)
+    settings = settings or Settings()
+    place = Spool(spool or address.default_spool, settings.file_access)
     if not place.path.exists():  # the database first: where it is refused, no spool is made beside it
-        await (await EventLog.open(address, create=True)).close()
+        await (await EventLog.open(address, create=True, file_access=place.access)).close()
     lock = place.take_writer()
     if lock is None:
         raise SpoolTaken(place.path, "another `pycrorm writer` drains it already")
-    with ExitStack() as held:
+    note = _Note(lock, say)
+    async with AsyncExitStack() as held:
         held.callback(lock.release)
-        async with open_destination(
-            address, place, clock=SYSTEM_CLOCK, projections=checked(projections)
-        ) as destination:
-            say(f"draining {place.path} into {address}")
-            look = _Folders(place, destination.log_id, address)
-            shown: Shown = destination
-            if folding is not None:
-                shown = held.enter_context(closing(await FoldedApart.connect(destination, folding, say)))
-            return await Daemon(shown, look, settings=settings or Settings(), say=say).run(leave)
+        projections = checked(projections)
+        destination = await held.enter_async_context(
+            open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections, settings=settings)
+        )
+        say(f"draining {place.path} into {address}")
+        stored = StoredSegments(place.path, settings, wall_ns=SYSTEM_CLOCK.wall_ns)
+        look = _Folders(place, destination.log_id, address, stored)
+        assignment = Assignment(url, destination.log_id, projections)
+        workers = await held.enter_async_context(
+            FoldWorkers(fold_workers, assignment, settings=settings, say=say, note=note, forked=forked)
+        )
+        shown: Shown = FoldedByWorkers(destination, workers) if fold_workers else destination
+        return await Daemon(shown, look, settings=settings, say=say).run(leave)
+
+
+class _Note:
+    """Writes the states of the fold workers into the daemon's lock, where `pycrorm status` reads them."""
+
+    def __init__(self, lock: FileLock, say: Callable[[str], None]) -> None:
+        self._lock = lock
+        self._say = say
+        self._failed = False
+
+    def __call__(self, workers: Sequence[FoldWorkerState]) -> None:
+        try:
+            self._lock.write_note(msgspec.json.encode(DaemonNote(os.getpid(), workers)))
+        except OSError as error:
+            if not self._failed:
+                self._say(f"the states of the fold workers cannot be written for `pycrorm status`: {error}")
+            self._failed = True
 
 
 class _Folders:
     """Looks round in a spool, and takes hold of what can be drained. Implements the writer's `Look`."""
 
-    def __init__(self, spool: Spool, log_id: str, address: DatabaseAddress) -> None:
+    def __init__(
+        self, spool: Spool, log_id: str, address: DatabaseAddress, stored: StoredSegments | None = None
+    ) -> None:
         self._spool = spool
+        self._stored = stored
         self._log_id = log_id
         self._file = address.path if address.is_sqlite else None
         self._opened = _identity(self._file)
@@ -89,9 +123,9 @@ class _Folders:
             self._spool.bind(self._log_id)
         for folder in folders:
             try:
-                taken = _take(folder, again=folder.name in self._taken)
-            except PycrormError as error:
-                failed[folder.name] = error
+                taken = _take(folder, self._stored, again=folder.name in self._taken)
+            except Exception as error:  # noqa: BLE001 - said of this folder; the others are drained
+                failed[folder.name] = fault_in(folder.path, error)
             else:
                 if taken is not None:
                     held.append(taken)
@@ -108,10 +142,10 @@ def _identity(file: Path | None) -> tuple[int, int] | None:
     return None if status is None else (status.st_dev, status.st_ino)
 
 
-def _take(folder: RecorderFolder, *, again: bool) -> Held | None:
+def _take(folder: RecorderFolder, stored: StoredSegments | None = None, *, again: bool) -> Held | None:
     if folder.alive:
         return _Living.take(folder.path)
-    dead = open_dead(folder.path)
+    dead = open_dead(folder.path, stored=stored)
     if dead is None:
         return None
     try:

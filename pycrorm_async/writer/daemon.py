@@ -26,6 +26,8 @@ __all__ = ["Daemon", "Moved", "LEAVE_S"]
 LEAVE_S: Final = 10.0
 """How long leaving may take. What is not stored by then stays in its folder, and the next daemon finds it."""
 _LOOK_S: Final = 0.2
+_CONFIRM_S: Final = 5.0
+"""How often the database is asked whether it still holds what was stored last: one row, in a tenth of a millisecond."""
 _REST = Backoff(first_s=1.0, longest_s=60.0)
 """Before a folder is tried again that could not be drained to its end: it is damaged, or nothing can be set aside."""
 
@@ -70,6 +72,7 @@ class Daemon:
         foreign: SpoolForeign | DatabaseForeign | None = None
         async with asyncio.TaskGroup() as tasks:
             folding = tasks.create_task(self._fold_as_it_comes(), name="pycrorm fold")
+            confirming = tasks.create_task(self._confirm_now_and_then(), name="pycrorm confirm")
             served: set[asyncio.Task[None]] = set()
             while not leave.is_set() and foreign is None:
                 try:
@@ -90,6 +93,7 @@ class Daemon:
                 if late and foreign is None:
                     self._say(f"not finished after {LEAVE_S:g} s: what is left is safe in the spool")
             folding.cancel()
+            confirming.cancel()
         if foreign is not None:
             raise foreign
         return Moved(self._recorders, self._records)
@@ -199,6 +203,17 @@ class Daemon:
             else:
                 attempt = 0
                 self._said.pop("fold", None)
+
+    async def _confirm_now_and_then(self) -> None:
+        """A log that went back is healed also while no recorder appends."""
+        while True:
+            try:
+                await self._destination.confirm()
+                self._said.pop("confirm", None)
+            except Exception as error:  # noqa: BLE001 - told, and tried again
+                if not isinstance(error, DatabaseUnavailable):
+                    self._say_news(f"what was stored cannot be confirmed: {_in_a_line(error)}", "confirm")
+            await asyncio.sleep(_CONFIRM_S)
 
     async def _tell_what_shows(self) -> None:
         before = [(each, each.appended) for each in self._serving.values()]

@@ -85,6 +85,8 @@ class Drain:
         self._appended = self._acknowledged = 0
         self._ceiling: int | None = None  # no position above it is acknowledged any more
         self._refused: dict[str, str] = {}
+        self.stuck: FilesError | DamageError | None = None
+        """Why refused records could not be set aside, so that nothing from them on is acknowledged any more."""
         self._moved = asyncio.Condition()
         self._over = False
 
@@ -173,7 +175,7 @@ class Drain:
         try:
             aside = await to_the_end(asyncio.to_thread(self._source.set_aside, records))
         except (FilesError, DamageError) as error:
-            self._ceiling = records[0].position - 1
+            self._ceiling, self.stuck = records[0].position - 1, error
             episode, reason = next(iter(refused.items()))
             refusal = f"episode {episode} was refused: {reason}; its events cannot be set aside: {error}"
             self._say(f"nothing more is acknowledged to recorder {self._source.name}: {refusal}")

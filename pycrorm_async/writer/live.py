@@ -16,6 +16,7 @@ from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeou
 from pycrorm_async.writer.asking import answer_of
 from pycrorm_async.writer.backoff import PATIENT
 from pycrorm_async.writer.drain import Drain, DrainState, to_the_end
+from pycrorm_async.writer.patience import Patience
 from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["LiveWriter", "WriterState"]
@@ -99,19 +100,31 @@ class LiveWriter:
         """Returns when everything up to this position is stored and the tables show all that is stored.
 
         Raises what stopped the appending, `EpisodeParked` for episodes that stopped since `run` began, and
-        `FlushTimeout` after `flush_timeout_s`.
+        `FlushTimeout` after `flush_timeout_s` without progress.
         """
         timeout_s = self._settings.flush_timeout_s
+        flushing = asyncio.create_task(self._flush(position), name="pycrorm flush")
         try:
-            async with asyncio.timeout(timeout_s):
-                reached = await self._drain.reached(position)
-                self._raise_failure()
-                if not reached:
-                    raise InternalError(f"the queue ended before position {position}")
-                await self._fold()
-                await self._raise_stopped()
-        except TimeoutError:
-            raise FlushTimeout(self._not_in_time(timeout_s)) from None
+            if not await Patience(timeout_s, progress=lambda: self.progress).wait(flushing):
+                raise FlushTimeout(self._not_in_time(timeout_s))
+            flushing.result()
+        finally:
+            if not flushing.done():
+                flushing.cancel()
+                await asyncio.wait([flushing])
+
+    async def _flush(self, position: int) -> None:
+        reached = await self._drain.reached(position)
+        self._raise_failure()
+        if not reached:
+            raise InternalError(f"the queue ended before position {position}")
+        await self._fold()
+        await self._raise_stopped()
+
+    @property
+    def progress(self) -> tuple[int, int]:
+        """Grows while the database takes what it is given; from any thread."""
+        return self._drain.appended, self._destination.writes
 
     @property
     def state(self) -> WriterState:
@@ -144,6 +157,7 @@ class LiveWriter:
 
     async def _fold(self) -> None:
         async with self._folding:
+            await self._patiently(self._destination.confirm)
             await self._patiently(self._destination.fold)
 
     async def _patiently(self, ask: Callable[[], Awaitable[_T]]) -> _T:

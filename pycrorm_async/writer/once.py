@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DamageError, FilesError, PycrormError
+from pycrorm_async.errors import DatabaseError, InternalError, PycrormError
 from pycrorm_async.writer.asking import answer_of
 from pycrorm_async.writer.backoff import BRIEF
 from pycrorm_async.writer.drain import Drain, DrainState
@@ -21,9 +21,9 @@ class Recovered:
 
     Attributes:
         drained: one state for each source, in the order they were drained.
-        failed: by the source's name, why it could not be drained to its end.
+        failed: by the source's name, why it could not be drained to its end or its refused records not be set aside.
         folded: events folded.
-        stopped: by episode id, why it is refused or parked.
+        stopped: by episode id, why it is refused or parked; also one that was refused whole and has no row.
     """
 
     drained: tuple[DrainState, ...]
@@ -43,9 +43,17 @@ async def drain_once(sources: Iterable[Source], destination: Destination, *, set
         drain = Drain(source, destination, settings=settings, backoff=BRIEF)
         try:
             await drain.run()
-        except (DamageError, FilesError) as error:
+        except DatabaseError:
+            raise
+        except PycrormError as error:
             failed[source.name] = error
+        except Exception as error:  # noqa: BLE001 - reported of this source; the next may be in order
+            failed[source.name] = InternalError(f"recorder {source.name} cannot be drained: {error!r}")
+        if drain.stuck is not None:
+            failed[source.name] = drain.stuck
         drained.append(drain.state)
+    await answer_of(destination.confirm, backoff=BRIEF)
     folded = await answer_of(destination.fold, backoff=BRIEF)
     stopped = await answer_of(destination.stopped, backoff=BRIEF)
-    return Recovered(drained=tuple(drained), failed=failed, folded=folded, stopped=dict(stopped))
+    refused = {episode: reason for each in drained for episode, reason in each.refused.items()}
+    return Recovered(drained=tuple(drained), failed=failed, folded=folded, stopped={**refused, **stopped})

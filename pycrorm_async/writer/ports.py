@@ -60,6 +60,15 @@ class Destination(Protocol):
         """
         ...
 
+    async def confirm(self) -> None:
+        """Looks whether the log still holds what it confirmed, and offers it again what it lost. Raises as `append`."""
+        ...
+
+    @property
+    def writes(self) -> int:
+        """How many transactions that write were committed: while it grows the database gets on."""
+        return 0
+
     async def fold(self) -> int:
         """Brings the tables up to date with the log; gives the number of events folded.
 

@@ -14,6 +14,7 @@ from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable, FlushTimeout
 from pycrorm_async.writer.live import LiveWriter, WriterState
+from pycrorm_async.writer.patience import Patience
 from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["WriterThread"]
@@ -76,14 +77,11 @@ class WriterThread:
         flush = self._begin_flush(self._opened.result(timeout=0), position)
         waited_for = asyncio.wrap_future(self._ended if flush is None else flush)
         try:
-            async with asyncio.timeout(None if flush else self._settings.flush_timeout_s):
-                await asyncio.shield(waited_for)
+            if flush is None and not await self._patience.wait(waited_for):
+                raise self._too_late()
+            await asyncio.shield(waited_for)
         except asyncio.CancelledError:
             if not waited_for.cancelled():
-                raise
-            raise self._too_late() from None
-        except TimeoutError:
-            if waited_for.done():
                 raise
             raise self._too_late() from None
 
@@ -107,12 +105,11 @@ class WriterThread:
     async def close(self) -> None:
         """Waits until the queue, which the caller closed, is drained and folded. The thread is gone afterwards.
 
-        Raises what stopped the appending, `EpisodeParked`, or `FlushTimeout` after `flush_timeout_s`.
+        Raises what stopped the appending, `EpisodeParked`, or `FlushTimeout` after `flush_timeout_s` without progress.
         """
         self._ask_to_leave(cancel=False)
         ended = asyncio.wrap_future(self._ended)
-        await asyncio.wait([ended], timeout=self._settings.flush_timeout_s)
-        if not ended.done():
+        if not await self._patience.wait(ended):
             late = self._too_late()
             self._ask_to_leave(cancel=True)
             await asyncio.wait([ended], timeout=_LEAVE_S)
@@ -126,6 +123,11 @@ class WriterThread:
     def state(self) -> WriterState:
         """What the writer does; from any thread, once started."""
         return self._opened.result(timeout=0).state
+
+    @property
+    def _patience(self) -> Patience:
+        writer = self._opened.result(timeout=0)
+        return Patience(self._settings.flush_timeout_s, progress=lambda: writer.progress)
 
     def _too_late(self) -> FlushTimeout:
         reason = self.state.queue.away or "there was too much to store and fold"

@@ -46,6 +46,9 @@ class Watched(Shown):
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         return await self._answered(self._destination.append(records))
 
+    async def confirm(self) -> None:
+        await self._answered(self._destination.confirm())
+
     async def fold(self) -> int:
         return await self._answered(self._destination.fold())
 

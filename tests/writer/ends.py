@@ -116,6 +116,9 @@ class CountingFold(Destination):
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         return await self.log.append(records)
 
+    async def confirm(self) -> None:
+        """What was stored is there."""
+
     async def fold(self) -> int:
         behind = await self.log.behind()
         if behind:
@@ -136,6 +139,9 @@ class Passing(Destination):
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         return await self._destination.append(records)
+
+    async def confirm(self) -> None:
+        await self._destination.confirm()
 
     async def fold(self) -> int:
         return await self._destination.fold()

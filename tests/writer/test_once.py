@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.config import Settings
-from pycrorm_async.errors import DatabaseUnavailable, SpoolDamaged
+from pycrorm_async.errors import DatabaseUnavailable, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.once import drain_once
@@ -63,6 +63,21 @@ async def test_a_gap_is_reported_with_its_reason(log: EventLog) -> None:
     recovered = await drain_once([source], CountingFold(log), settings=SETTINGS)
     assert recovered.stopped == {"00000000-0000-0000-0000-000000000001": "event 4 did not arrive before event 5"}
     assert recovered.folded == 3
+
+
+async def test_what_is_refused_and_cannot_be_set_aside_is_a_failure_of_its_source(log: EventLog) -> None:
+    class Full(KeptSource):
+        def set_aside(self, records: Sequence[Record]) -> bool:
+            raise SpoolUnavailable(Path("/spool/1.refused"), "No space left on device")
+
+    full = Full([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True, name="robot 1")
+    healthy = KeptSource(run_of(episode(2), 1, 3), closed=True, name="robot 2")
+    recovered = await drain_once([full, healthy], CountingFold(log), settings=SETTINGS)
+    assert {source: str(error) for source, error in recovered.failed.items()} == {
+        "robot 1": "spool /spool/1.refused: No space left on device"
+    }
+    assert list(recovered.stopped.values()) == ["event 4 did not arrive before event 5"]
+    assert (full.kept, healthy.kept) == ([1, 2, 3, 5, 6], [])
 
 
 async def test_a_database_that_stays_away_is_raised(log: EventLog) -> None:

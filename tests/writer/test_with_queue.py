@@ -58,7 +58,9 @@ async def test_what_is_put_into_the_queue_is_in_the_log_byte_for_byte(tmp_path: 
     await queue.synced_to(queue.written)
     await writer.flush(queue.written)
     assert ask(address.path, STORED) == [(1, 2000, 1, 2000), (2, 200, 1, 200)]
-    assert queue.stored == queue.written == 2201
+    repeated = queue._appender._current.number - 1  # the declaration begins each segment after the first
+    assert repeated > 1
+    assert queue.stored == queue.written == 2201 + repeated
     queue.put_nowait(Heading(episode(1), "EpisodeEnded", 1), b'{"status":"SUCCEEDED"}')
     queue.close()
     await writer.close()
@@ -139,7 +141,7 @@ async def test_a_refused_episode_that_cannot_be_set_aside_ends_the_waiting_for_r
     queue.put_nowait(kind(episode(2), 1), payload(1))
     put = 1
     with pytest.raises(
-        SpoolStuck, match=r"events 2 to 3 did not arrive .* cannot be set aside: .*refused: File exists"
+        SpoolStuck, match=r"events 2 to 3 did not arrive .* cannot be set aside: .*refused/alive: Not a directory"
     ):
         async with asyncio.timeout(60):
             while True:

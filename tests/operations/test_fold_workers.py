@@ -1,0 +1,197 @@
+"""The fold workers of `pycrorm writer`: shown by `status`, started again, and gone with their daemon."""
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cli.notes import NOTES_PLAN
+from tests.commands import COMMAND, answer, environment, pycrorm
+from tests.databases import ask, ask_to_change
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "notes.py").write_text(NOTES_PLAN)
+    return tmp_path
+
+
+@contextmanager
+def started(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    command = [*COMMAND, "writer"]
+    process = subprocess.Popen(command, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
+    assert process.stderr.readline().startswith("draining")
+    yield process
+    process.kill()
+    process.communicate()
+
+
+@pytest.fixture
+def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    with started(folder) as process:
+        yield process
+
+
+def is_gone(process: int) -> bool:
+    """Within some seconds."""
+    for _ in range(500):
+        status = Path(f"/proc/{process}/stat")
+        if not status.exists() or status.read_text().rpartition(")")[2].split()[0] == "Z":
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def noted(folder: Path) -> int:
+    """How many notes a plan beside the daemon left in the tables when it was over."""
+    answer("run", "notes.py", "--writer", "daemon", cwd=folder)
+    return int(ask(f"sqlite:///{folder}/pycrorm.db", "SELECT count(*) FROM note_action")[0][0])
+
+
+def workers(folder: Path) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = answer("status", cwd=folder)["fold_workers"]
+    return found
+
+
+def wait_for_workers(folder: Path, count: int) -> list[int]:
+    """Until so many run; their processes."""
+    for _ in range(200):
+        pids = [each["pid"] for each in workers(folder) if each["state"] == "running"]
+        if len(pids) == count:
+            return pids
+        time.sleep(0.1)
+    raise AssertionError(workers(folder))
+
+
+def test_another_process_folds_and_its_death_is_said_and_shown_and_it_is_started_again(
+    folder: Path, daemon: subprocess.Popen[str]
+) -> None:
+    first, other = wait_for_workers(folder, 2)
+    assert noted(folder) == 3
+    assert noted(folder) == 6
+    assert workers(folder)[0]["batches"] > 0
+    os.kill(first, signal.SIGKILL)
+    assert is_gone(first)
+    assert noted(folder) == 9
+    second, _ = wait_for_workers(folder, 2)
+    state = workers(folder)[0]
+    assert (state["pid"], state["restarts"], state["reason"]) == (second, 1, "exited with signal 9")
+    shown = pycrorm("status", cwd=folder).stdout
+    assert "Fold workers of the daemon" in shown
+    assert "exited with signal 9" in shown
+    daemon.send_signal(signal.SIGTERM)
+    _, said = daemon.communicate(timeout=15)
+    assert daemon.returncode == 0
+    assert said.count(f"fold worker 1 (pid {first}) exited with signal 9; restarting it in 1 s\n") == 1
+    assert "Traceback" not in said
+    assert is_gone(second)
+    assert is_gone(other)
+    assert workers(folder) == []
+
+
+def test_a_stopped_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon: subprocess.Popen[str]) -> None:
+    assert noted(folder) == 3
+    stopped, idle = wait_for_workers(folder, 2)
+    os.kill(stopped, signal.SIGSTOP)
+    daemon.kill()
+    daemon.communicate(timeout=15)
+    assert is_gone(stopped)
+    assert is_gone(idle)
+
+
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT])
+def test_what_a_terminal_sends_to_both_ends_it_with_the_daemon_and_no_sooner(
+    folder: Path, daemon: subprocess.Popen[str], end: signal.Signals
+) -> None:
+    pids = wait_for_workers(folder, 2)
+    for each in pids:
+        os.kill(each, end)
+    assert noted(folder) == 3
+    assert wait_for_workers(folder, 2) == pids
+    for each in pids:
+        os.kill(each, end)
+    daemon.send_signal(end)
+    _, said = daemon.communicate(timeout=15)
+    assert daemon.returncode == 0
+    assert "exited" not in said
+    assert "Traceback" not in said
+    assert all(map(is_gone, pids))
+
+
+def test_what_keeps_it_from_folding_is_told(folder: Path, daemon: subprocess.Popen[str]) -> None:
+    assert noted(folder) == 3
+    ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE task_tree_node__1")
+    plan = subprocess.Popen([*COMMAND, "run", "notes.py", "--writer", "daemon"], cwd=folder, env=environment())
+    assert daemon.stderr is not None
+    said = ""
+    while "cannot be brought" not in said:
+        said = daemon.stderr.readline()
+        assert said, "the daemon has ended"
+    ended = "SELECT count(*) FROM event WHERE type = 'NodeEnded'"
+    while ask(f"sqlite:///{folder}/pycrorm.db", ended) != [(8,)]:  # appending goes on
+        time.sleep(0.01)
+    plan.kill()
+    plan.wait()
+    assert "no such table: task_tree_node__1" in said
+
+
+MANY = 12_000
+LONG_PLAN = NOTES_PLAN.replace('in "abc"', f"in map(str, range({MANY}))") + "    os.kill(os.getpid(), 9)\n"
+
+
+def leave_many_notes(folder: Path) -> str:
+    """A plan takes many notes and is killed before anybody drains it; the database that they will be in."""
+    (folder / "long.py").write_text(f"import os\n{LONG_PLAN}")
+    done = subprocess.run(
+        [*COMMAND, "run", "long.py", "--writer", "daemon"], cwd=folder, env=environment(), check=False
+    )
+    assert done.returncode == -signal.SIGKILL
+    return f"sqlite:///{folder}/pycrorm.db"
+
+
+def wait_for(url: str, question: str) -> None:
+    """Until its answer is yes."""
+    for _ in range(6_000):
+        if ask(url, question)[0][0]:
+            return
+        time.sleep(0.01)
+    raise AssertionError(question)
+
+
+ALL = "SELECT coalesce(sum(head - folded), 1) = 0 AND count(ended_wall_ns) = 1 FROM episode"
+
+
+def prove_that_each_note_is_there(folder: Path, url: str) -> None:
+    notes = ask(url, "SELECT text FROM note_action ORDER BY id")
+    assert notes == [(str(number),) for number in range(len(notes))]
+    assert len(notes) >= MANY - 1_000  # what it did last may not have been handed over
+    running = ask(url, "SELECT count(*) FROM task_tree_node WHERE status = 'RUNNING'")
+    assert running == [(0,)]
+    assert answer("verify", cwd=folder)["differences"] == []
+
+
+def test_when_both_workers_are_killed_on_a_long_way_the_daemon_goes_on(folder: Path) -> None:
+    url = leave_many_notes(folder)
+    with started(folder) as process:
+        pids = wait_for_workers(folder, 2)
+        for each in pids:
+            os.kill(each, signal.SIGKILL)
+        while not all(each["reason"] for each in workers(folder)):
+            time.sleep(0.05)
+        wait_for(url, ALL)
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=15)
+    assert process.returncode == 0
+    lines = [line for line in said.splitlines() if not line.startswith(("recorder ", "left after"))]
+    assert sorted(lines) == [
+        f"fold worker {number} (pid {pid}) exited with signal 9; restarting it in 1 s"
+        for number, pid in enumerate(pids, start=1)
+    ]
+    prove_that_each_note_is_there(folder, url)

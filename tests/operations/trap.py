@@ -1,0 +1,64 @@
+"""A trap in a fold worker: at the next batch that it has written, and not committed, something happens to it.
+
+A daemon gives its workers the projection `Trapped`, so that they import this module. Its own process stays as it is.
+The word in the file that PYCRORM_TRAP names is taken out before the trap goes off, so that it does so once.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pycrorm_async.projections import folding
+from pycrorm_async.projections.own import Changes, Event, Projection
+
+TRAP = "PYCRORM_TRAP"
+
+
+class Trapped(Projection):
+    name = "trapped"
+    version = 1
+    tables: ClassVar = {"trapped": {"what": "text"}}
+
+    def fold(self, event: Event, rows: Changes) -> None:
+        """Folds nothing: it is here to be imported."""
+
+
+def arm(trap: Path, word: str) -> None:
+    """A signal's name, `exit`, `raise` or `hang`."""
+    trap.with_suffix(".making").write_text(word)
+    trap.with_suffix(".making").rename(trap)
+
+
+def _spring() -> None:
+    trap = Path(os.environ[TRAP])
+    try:
+        word = trap.read_text()
+        trap.unlink()
+    except FileNotFoundError:
+        return
+    match word:
+        case "exit":
+            os._exit(3)
+        case "raise":
+            raise MemoryError("no memory left")
+        case "hang":
+            time.sleep(3600)
+        case _:
+            os.kill(os.getpid(), signal.Signals[word])
+
+
+def _trapped(write_rows: Callable[..., Any]) -> Callable[..., Any]:
+    async def write(*values: Any) -> None:
+        await write_rows(*values)
+        _spring()
+
+    return write
+
+
+if TRAP in os.environ and os.environ[TRAP + "_DAEMON"] != str(os.getpid()):
+    vars(folding)["write_rows"] = _trapped(vars(folding)["write_rows"])
