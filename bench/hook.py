@@ -39,8 +39,8 @@ from bench.breaking.speaking import Speaker
 from bench.daemon import start_daemon, stop
 from bench.material.turns import InTurns, NothingActionPerformable, nothing_action
 from pycrorm_async import Memory, Settings
-from pycrorm_async.config import Writer
 from pycrorm_async.errors import FlushTimeout
+from pycrorm_async.settings import Writer
 from pycrorm_async.world import BulletWorld
 from tests.crash.walking import say
 from tests.databases import Server, server_in

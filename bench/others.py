@@ -47,14 +47,14 @@ from sqlalchemy.ext.asyncio import create_async_engine
 from bench.material.rollouts import tree
 from bench.material.spooled import Recording, spool_tree
 from bench.reporting.figures import MISSING, console, spread
-from pycrorm_async.adoption import open_destination
-from pycrorm_async.bulk import collect_seldom
+from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.config import Settings
 from pycrorm_async.events.codec import decode, encode
 from pycrorm_async.events.envelope import Heading, Record
-from pycrorm_async.events.happenings import Happening
+from pycrorm_async.events.types import Happening
+from pycrorm_async.operations.destination import open_destination
 from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain

@@ -32,11 +32,11 @@ from rich.console import Console
 from rich.table import Table
 
 from bench.rebuild_beside import Company
-from pycrorm_async.bulk import collect_seldom
+from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.rebuilding import rebuild_memory
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import server_in

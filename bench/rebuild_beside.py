@@ -17,8 +17,8 @@ from pathlib import Path
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.config import Settings
 from pycrorm_async.orm import Action, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
+from pycrorm_async.settings import Settings
 from tests.crash.forked import Forked
 from tests.memory.notes import NoteActionPerformable
 

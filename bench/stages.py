@@ -33,13 +33,13 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.happenings import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.hooks.declaration import Declarations
-from pycrorm_async.hooks.recorder import current_episode
-from pycrorm_async.hooks.values import written
+from pycrorm_async.hooks.plan_recorder import current_episode
+from pycrorm_async.hooks.values.value_snapshot import written
 from pycrorm_async.plan import BaseMotion
-from pycrorm_async.plan.ports import recorder
+from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.world import BulletWorld

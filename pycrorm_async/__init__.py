@@ -15,13 +15,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pycrorm_async.adoption import recover
-    from pycrorm_async.config import Settings
     from pycrorm_async.errors import PycrormError
     from pycrorm_async.memory import Memory, MemoryStatus
-    from pycrorm_async.projections.own import Projection
-    from pycrorm_async.projections.views import UserView
+    from pycrorm_async.operations.destination import recover
+    from pycrorm_async.projections.custom.projection import Projection
+    from pycrorm_async.projections.schema.user_views import UserView
     from pycrorm_async.query.reading import Reading
+    from pycrorm_async.settings import Settings
 
 __version__ = "0.1.0"
 

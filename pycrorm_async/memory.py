@@ -32,32 +32,32 @@ from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async import __version__
-from pycrorm_async.adoption import dead_queues, expected_log, open_destination
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.config import Settings, Writer
-from pycrorm_async.connected import set_inside
+from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesForeign
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
-from pycrorm_async.hooks.recorder import Recorder, current_episode
+from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.memory_parts import Parts
 from pycrorm_async.memory_status import MemoryStatus
-from pycrorm_async.plan.unawaited import called_performs
-from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.own_found import checked
-from pycrorm_async.projections.views import UserView
+from pycrorm_async.operations.destination import dead_queues, expected_log, open_destination
+from pycrorm_async.plan.execution.unawaited_performs import called_performs
+from pycrorm_async.projections.custom.discovery import checked
+from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.experience import PickUpExperience
-from pycrorm_async.query.moment import Moment
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.queue.handed_over import HandedOver
-from pycrorm_async.queue.locks import in_forked_child
-from pycrorm_async.queue.recorder import RecorderQueue
-from pycrorm_async.queue.spool import Spool
+from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.queue.files.locks import in_forked_child
+from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.thread import WriterThread
+from pycrorm_async.writer.delegated_writer import HandedOver
+from pycrorm_async.writer.writer_thread import WriterThread
 
 if TYPE_CHECKING:
     from pandas import DataFrame

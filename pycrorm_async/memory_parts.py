@@ -6,18 +6,18 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
-from pycrorm_async.connected import ConnectedVar, set_inside
+from pycrorm_async.connected_var import ConnectedVar, set_inside
 from pycrorm_async.hooks.emitter import Emitter
-from pycrorm_async.hooks.recorder import Recorder
+from pycrorm_async.hooks.plan_recorder import Recorder
+from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.plan.experience import experience
-from pycrorm_async.plan.ports import recorder
-from pycrorm_async.plan.unawaited import called_performs
 from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.queue.handed_over import HandedOver
-from pycrorm_async.queue.recorder import RecorderQueue
-from pycrorm_async.world.watch import watcher
-from pycrorm_async.writer.thread import WriterThread
+from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.world.observers import watcher
+from pycrorm_async.writer.delegated_writer import HandedOver
+from pycrorm_async.writer.writer_thread import WriterThread
 
 __all__ = ["Parts"]
 

@@ -7,10 +7,10 @@ from typing import NamedTuple, Self
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.hooks.emitter import Faults
-from pycrorm_async.hooks.missing import Missing
+from pycrorm_async.hooks.values.missing_values import Missing
 from pycrorm_async.memory_parts import Parts
-from pycrorm_async.writer.live import WriterState
-from pycrorm_async.writer.thread import WriterThread
+from pycrorm_async.writer.background_writer import WriterState
+from pycrorm_async.writer.writer_thread import WriterThread
 
 __all__ = ["MemoryStatus"]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     JointsMoved,

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from bench.breaking.files import ROOMY, events_of
 from bench.breaking.outcome import Outcome, Step
-from pycrorm_async.adoption import recover
 from pycrorm_async.errors import PycrormError
+from pycrorm_async.operations.destination import recover
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.inspection import inspect_spool
-from pycrorm_async.queue.repair import repair_folder
+from pycrorm_async.queue.maintenance.inspection import inspect_spool
+from pycrorm_async.queue.maintenance.repair import repair_folder
 from tests.databases import ask
 from tests.queue.crafting import change_a_frame, change_the_header
 from tests.queue.writing import Author, ended, episode, node, started

@@ -17,10 +17,10 @@ import asyncpg
 
 from bench.breaking.files import small_disk
 from bench.breaking.outcome import Event, Outcome, Step
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import episode_text
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.backoff import Backoff

@@ -19,9 +19,9 @@ from bench.breaking.databases import start_again
 from bench.breaking.outcome import Event, Outcome, Step
 from bench.breaking.speaking import Speaker
 from pycrorm_async import Memory
-from pycrorm_async.adoption import recover
-from pycrorm_async.config import Writer
-from pycrorm_async.daemon import serve
+from pycrorm_async.operations.daemon import serve
+from pycrorm_async.operations.destination import recover
+from pycrorm_async.settings import Writer
 from tests.crash.walking import SETTINGS, StepActionPerformable, say
 from tests.databases import Server, ask
 

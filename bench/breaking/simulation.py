@@ -18,11 +18,11 @@ from pathlib import Path
 
 from bench.breaking.files import events_of
 from bench.breaking.outcome import Event, Outcome, Step
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import LOST, Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.queue import open_dead
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.backoff import Backoff

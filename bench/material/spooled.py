@@ -12,9 +12,9 @@ from typing import Any
 from bench.material.rollouts import MILK, SHARES, Node, Place, Robot, Thing, Tree, tree_of
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.config import Settings
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
@@ -27,18 +27,18 @@ from pycrorm_async.events.happenings import (
     PoseValue,
     RobotValue,
 )
-from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.hooks.declaration import DeclaredType, declared_type
 from pycrorm_async.hooks.emitter import Emitter
-from pycrorm_async.plan.actions import (
+from pycrorm_async.plan.actions.basic import (
     FaceAtPerformable,
     LookAtActionPerformable,
     NavigateActionPerformable,
     PickUpActionPerformable,
 )
 from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
+from pycrorm_async.plan.motions.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
 from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.settings import Settings
 
 __all__ = ["spool_tree", "spool_rollouts", "Recording", "DECLARED"]
 

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.bulk import collect_seldom
+from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption
 from pycrorm_async.cli.output import print_json, print_table, problem
-from pycrorm_async.cli.waiting import note_what_waits
-from pycrorm_async.copying import Copied, copy_episodes
-from pycrorm_async.watching import watched
+from pycrorm_async.cli.pending_events import note_what_waits
+from pycrorm_async.operations.copy import Copied, copy_episodes
+from pycrorm_async.progress_bar import watched
 
 __all__ = ["copy"]
 

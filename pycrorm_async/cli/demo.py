@@ -40,7 +40,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan import (
     PlaceAction as Place,
 )
-from pycrorm_async.query.questions import NodeSummary
+from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject

@@ -7,11 +7,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pycrorm_async.cli.output import stdout
-from pycrorm_async.queue.folder import available
-from pycrorm_async.queue.stored import kept_segments
+from pycrorm_async.queue.files.recorder_folder import available
+from pycrorm_async.queue.retention.stored_segments import kept_segments
 from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Incarnation
+from pycrorm_async.store.stored import Incarnation
 
 __all__ = ["Durability", "Kept", "durability", "kept_in", "print_durability"]
 

@@ -10,9 +10,9 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_json, print_table
+from pycrorm_async.cli.pending_events import note_what_waits
 from pycrorm_async.cli.tree import thinker_text
-from pycrorm_async.cli.waiting import note_what_waits
-from pycrorm_async.query.questions import EpisodeSummary
+from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 

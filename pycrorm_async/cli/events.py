@@ -11,14 +11,14 @@ from typing import Annotated
 import msgspec
 import typer
 
-from pycrorm_async.adoption import shared_address
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.waiting import note_what_waits
+from pycrorm_async.cli.pending_events import note_what_waits
 from pycrorm_async.errors import CallerError, LogDamaged
-from pycrorm_async.events.happenings import EVENT_TYPES
+from pycrorm_async.events.types import EVENT_TYPES
+from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.naming import episode_named
-from pycrorm_async.store.rows import StoredEvent
+from pycrorm_async.store.stored import StoredEvent
 
 __all__ = ["events"]
 

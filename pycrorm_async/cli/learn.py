@@ -14,23 +14,23 @@ from typing import Annotated, Any
 
 import typer
 
-from pycrorm_async.cli.interrupting import Interrupting
+from pycrorm_async.cli.interruption import Interrupting
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_facts, print_json, print_table
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
-from pycrorm_async.learning.default_policy import default_policy
+from pycrorm_async.learning.evaluation import Study, study
 from pycrorm_async.learning.experiment import Experiment, Learned, Phase
-from pycrorm_async.learning.figure import draw_policies
-from pycrorm_async.learning.kitchen import KITCHEN, InKitchen, pick_up_in_kitchen
-from pycrorm_async.learning.policy_file import name_of, save_policy
-from pycrorm_async.learning.rollouts import Tally
-from pycrorm_async.learning.scene import Scene
-from pycrorm_async.learning.study import Study, study
-from pycrorm_async.learning.workers import Place
+from pycrorm_async.learning.policies.default_policy import default_policy
+from pycrorm_async.learning.policies.policy_file import name_of, save_policy
+from pycrorm_async.learning.policies.policy_plot import draw_policies
+from pycrorm_async.learning.rollouts.kitchen_trial import KITCHEN, InKitchen, pick_up_in_kitchen
+from pycrorm_async.learning.rollouts.rollout_pool import Place
+from pycrorm_async.learning.rollouts.rollouts import Tally
+from pycrorm_async.learning.rollouts.scene import Scene
+from pycrorm_async.progress_bar import watched
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.watching import watched
-from pycrorm_async.world.robot import Limits
+from pycrorm_async.world.robots.robot_description import Limits
 
 __all__ = ["learn"]
 

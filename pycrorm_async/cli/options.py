@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.config import FileAccess, Writer
+from pycrorm_async.settings import FileAccess, Writer
 
 __all__ = [
     "UrlOption",

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from pycrorm_async.watching import stderr
+from pycrorm_async.progress_bar import stderr
 
 __all__ = [
     "stdout",

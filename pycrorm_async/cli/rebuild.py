@@ -8,15 +8,15 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.bulk import collect_seldom
+from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, note, print_json, stdout
-from pycrorm_async.cli.waiting import note_what_waits
+from pycrorm_async.cli.pending_events import note_what_waits
 from pycrorm_async.errors import CallerError
-from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.own_found import installed_besides, named
-from pycrorm_async.rebuilding import Rebuilt, projections_of, rebuild_memory, rebuild_projection
-from pycrorm_async.watching import watched
+from pycrorm_async.operations.rebuild import Rebuilt, projections_of, rebuild_memory, rebuild_projection
+from pycrorm_async.progress_bar import watched
+from pycrorm_async.projections.custom.discovery import installed_besides, named
+from pycrorm_async.projections.custom.projection import Projection
 
 __all__ = ["rebuild"]
 

@@ -14,8 +14,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.interrupting import Interrupting
-from pycrorm_async.cli.loading import LoadedPlan, load_plan
+from pycrorm_async.cli.interruption import Interrupting
 from pycrorm_async.cli.options import (
     DEFAULT_URL,
     FileAccessOption,
@@ -26,12 +25,13 @@ from pycrorm_async.cli.options import (
     WriterOption,
 )
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
-from pycrorm_async.config import Settings
+from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
 from pycrorm_async.errors import EpisodeParked
-from pycrorm_async.hooks.texts import message_of
+from pycrorm_async.hooks.values.texts import message_of
 from pycrorm_async.memory import Memory
-from pycrorm_async.projections.own_found import named
-from pycrorm_async.query.questions import EpisodeSummary
+from pycrorm_async.projections.custom.discovery import named
+from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.settings import Settings
 
 __all__ = ["run"]
 

@@ -8,14 +8,14 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.moment import asked_moment, print_moment
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_facts, print_json
+from pycrorm_async.cli.pending_events import note_what_waits
+from pycrorm_async.cli.snapshot_view import asked_moment, print_moment
 from pycrorm_async.cli.tree import print_tree, thinker_text
-from pycrorm_async.cli.waiting import note_what_waits
-from pycrorm_async.query.moment import Moment
-from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.snapshot import Moment
 
 __all__ = ["show"]
 

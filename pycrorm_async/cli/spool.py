@@ -11,8 +11,6 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async import adoption
-from pycrorm_async.adoption import Rebinding
 from pycrorm_async.cli.options import (
     DEFAULT_URL,
     FileAccessOption,
@@ -23,13 +21,15 @@ from pycrorm_async.cli.options import (
 )
 from pycrorm_async.cli.output import moment, note, print_facts, print_json, print_table, problem, stdout
 from pycrorm_async.cli.writer import store_once
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.projections.own_found import named
-from pycrorm_async.queue.folder import REFUSED, fault_in
-from pycrorm_async.queue.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
-from pycrorm_async.queue.repair import RepairReport, finish_repairs, repair_folder
-from pycrorm_async.queue.rescue import Range
+from pycrorm_async.operations import destination
+from pycrorm_async.operations.destination import Rebinding
+from pycrorm_async.projections.custom.discovery import named
+from pycrorm_async.queue.files.recorder_folder import REFUSED, fault_in
+from pycrorm_async.queue.maintenance.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
+from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
+from pycrorm_async.queue.maintenance.salvage import Range
+from pycrorm_async.settings import Settings
 
 __all__ = ["inspect", "repair", "rebind"]
 
@@ -113,7 +113,7 @@ def rebind(
     --once`.
     """
     projections, settings = named(projection or ()), Settings(file_access=file_access)
-    done = asyncio.run(adoption.rebind(url, spool=spool, settings=settings, say=_say_rebinding))
+    done = asyncio.run(destination.rebind(url, spool=spool, settings=settings, say=_say_rebinding))
     beside = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
     return store_once(url, spool, projections, settings, as_json=as_json, beside=beside)
 

@@ -10,21 +10,21 @@ from pathlib import Path
 
 import msgspec
 
-from pycrorm_async.adoption import shared_address
 from pycrorm_async.cli.durability import Durability, durability, kept_in, print_durability
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stdout
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError
+from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
-from pycrorm_async.projections.own_found import installed_besides
-from pycrorm_async.projections.own_tables import ProjectionState, states
-from pycrorm_async.projections.unmade import unmade_types
-from pycrorm_async.queue.folder import DRAIN, available, fault_in
-from pycrorm_async.queue.locks import is_locked
-from pycrorm_async.queue.progress import Progress
-from pycrorm_async.queue.segment import segment_numbers, segment_path
-from pycrorm_async.queue.spool import RecorderFolder, Spool
+from pycrorm_async.projections.custom.discovery import installed_besides
+from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
+from pycrorm_async.projections.schema.unmade_types import unmade_types
+from pycrorm_async.queue.files.drain_status import Progress
+from pycrorm_async.queue.files.locks import is_locked
+from pycrorm_async.queue.files.recorder_folder import DRAIN, available, fault_in
+from pycrorm_async.queue.files.segment import segment_numbers, segment_path
+from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 

@@ -10,7 +10,7 @@ from rich.text import Text
 from rich.tree import Tree
 
 from pycrorm_async.cli.output import duration, stdout
-from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 
 __all__ = ["print_tree", "parameters_text", "thinker_text"]
 

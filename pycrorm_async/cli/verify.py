@@ -8,18 +8,18 @@ from typing import Annotated, Any
 
 import typer
 
-from pycrorm_async.adoption import shared_address
-from pycrorm_async.bulk import collect_seldom
+from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, stdout
-from pycrorm_async.cli.waiting import note_what_waits
-from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.own_found import installed_besides, named
-from pycrorm_async.projections.verify import Verified
-from pycrorm_async.projections.verify import verify as verify_log
+from pycrorm_async.cli.pending_events import note_what_waits
+from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.progress_bar import watched
+from pycrorm_async.projections.custom.discovery import installed_besides, named
+from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.verify.verify import Verified
+from pycrorm_async.projections.verify.verify import verify as verify_log
+from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.naming import episode_named
-from pycrorm_async.watching import watched
 
 __all__ = ["verify"]
 

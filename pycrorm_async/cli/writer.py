@@ -14,8 +14,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.adoption import RecoveryReport, recover
-from pycrorm_async.bulk import collect_seldom
+from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import (
     DEFAULT_URL,
     FileAccessOption,
@@ -25,13 +24,14 @@ from pycrorm_async.cli.options import (
     UrlOption,
 )
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
-from pycrorm_async.config import Settings
-from pycrorm_async.daemon import serve
 from pycrorm_async.errors import DamageError, SpoolDamaged
+from pycrorm_async.operations.daemon import serve
+from pycrorm_async.operations.destination import RecoveryReport, recover
 from pycrorm_async.operations.fold_process import FoldProcess, forked
 from pycrorm_async.operations.fold_workers import WORKERS
-from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.own_found import named
+from pycrorm_async.projections.custom.discovery import named
+from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.settings import Settings
 from pycrorm_async.writer.daemon import LEAVE_S, Moved
 
 __all__ = ["writer", "store_once"]

@@ -14,7 +14,7 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async.events.happenings import EVENT_TYPES, DesignatorTypeDeclared, Happening
+from pycrorm_async.events.types import EVENT_TYPES, DesignatorTypeDeclared, Happening
 from pycrorm_async.events.upcasters import UPCASTERS, Upcaster
 
 __all__ = [

@@ -32,7 +32,7 @@ class Record(NamedTuple):
         position: 1, 2, 3 … over everything this recorder wrote.
         episode: 16 bytes of a UUIDv7, or None.
         sequence: 1, 2, 3 … inside the episode, without gaps; 0 without an episode.
-        type: name of the event's type, as in `pycrorm_async.events.happenings`.
+        type: name of the event's type, as in `pycrorm_async.events.types`.
         version: of that type's shape.
         wall_ns: UTC, ns since 1970.
         monotonic_ns: ns, comparable inside one process life only.

@@ -24,8 +24,8 @@ from collections.abc import Iterable, Sequence
 
 import msgspec
 
-from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared, FieldType
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD, SLOT_MAX
+from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
 
 __all__ = [
     "RESERVED_COLUMNS",

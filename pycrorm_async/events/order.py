@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     Happening,

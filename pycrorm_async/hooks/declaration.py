@@ -26,9 +26,9 @@ from pycrorm_async.events.fields import (
     fault_in_table,
     table_name,
 )
-from pycrorm_async.events.happenings import DesignatorTypeDeclared, FieldDeclared
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
-from pycrorm_async.hooks.parameter_types import (
+from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared
+from pycrorm_async.hooks.values.parameter_types import (
     OUR_PACKAGE,
     Parameter,
     Shape,
@@ -38,7 +38,7 @@ from pycrorm_async.hooks.parameter_types import (
     parameters_of,
     shape_of,
 )
-from pycrorm_async.hooks.texts import clean, cut, message_of
+from pycrorm_async.hooks.values.texts import clean, cut, message_of
 from pycrorm_async.plan.designator import Designator
 
 __all__ = ["DeclaredType", "Field", "Undeclared", "Declarations", "declared_type"]

@@ -6,15 +6,15 @@ import logging
 import threading
 from typing import NamedTuple
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import SpoolFull
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.happenings import Happening
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.hooks.missing import MissingValues
-from pycrorm_async.hooks.ports import EventSink
-from pycrorm_async.hooks.texts import clean, cut, message_of
+from pycrorm_async.events.types import Happening
+from pycrorm_async.hooks.event_sink import EventSink
+from pycrorm_async.hooks.values.missing_values import MissingValues
+from pycrorm_async.hooks.values.texts import clean, cut, message_of
+from pycrorm_async.settings import Settings
 
 __all__ = ["Emitter", "Faults"]
 

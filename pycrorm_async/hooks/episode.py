@@ -24,7 +24,8 @@ from typing import Any, Final, Literal, NamedTuple
 
 from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.codec import NotEncodable
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
@@ -40,29 +41,28 @@ from pycrorm_async.events.happenings import (
     RobotValue,
     SeenValue,
 )
-from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.emitter import UNAWAITED_MAX, Emitter
-from pycrorm_async.hooks.fitting import (
+from pycrorm_async.hooks.values.event_fitting import (
     detection_that_fits,
     episode_end_that_fits,
     episode_that_fits,
     node_end_that_fits,
     resolution_that_fits,
 )
-from pycrorm_async.hooks.parameters import ROBOT, parameters_of, start_that_fits
-from pycrorm_async.hooks.texts import clean
-from pycrorm_async.hooks.values import failure_value, missing_in, pose_value, written_or_missing
-from pycrorm_async.hooks.world import WorldRecorder
+from pycrorm_async.hooks.values.parameters import ROBOT, parameters_of, start_that_fits
+from pycrorm_async.hooks.values.texts import clean
+from pycrorm_async.hooks.values.value_snapshot import failure_value, missing_in, pose_value, written_or_missing
+from pycrorm_async.hooks.world_recorder import WorldRecorder
 from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.execution.observer import Candidate, Seen
+from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.failures import is_plan_failure
-from pycrorm_async.plan.ports import Candidate, Seen
 from pycrorm_async.plan.task_tree import TaskTreeNode
-from pycrorm_async.plan.unawaited import CalledPerforms
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
-from pycrorm_async.world.watch import current_world
+from pycrorm_async.world.observers import current_world
 
 __all__ = ["Episode", "NodeRecord", "EpisodeOpening", "CONTINUED", "current_task"]
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 from pycrorm_async.errors import SpoolFull, SpoolStuck
-from pycrorm_async.events.happenings import StateSampled
+from pycrorm_async.events.types import StateSampled
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.world.objects import Object

@@ -4,16 +4,16 @@
 >>> await Retry(MoveAndPickUp(milk, policy=policy), max_tries=20).perform()
 """
 
-from pycrorm_async.learning.default_policy import default_policy
-from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.figure import draw_policies
-from pycrorm_async.learning.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.learning.policy import PickUpChoice, Policy
-from pycrorm_async.learning.policy_file import load_policy, name_of, save_policy
-from pycrorm_async.learning.remembered import rollouts_question
-from pycrorm_async.learning.rollouts import Tally, batch_rollout
-from pycrorm_async.learning.scene import Scene, Stage
-from pycrorm_async.learning.tree import learn
+from pycrorm_async.learning.policies.default_policy import default_policy
+from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policies.policy_file import load_policy, name_of, save_policy
+from pycrorm_async.learning.policies.policy_plot import draw_policies
+from pycrorm_async.learning.policies.tree import learn
+from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.rollouts.recorded_rollouts import rollouts_question
+from pycrorm_async.learning.rollouts.rollouts import Tally, batch_rollout
+from pycrorm_async.learning.rollouts.scene import Scene, Stage
 
 __all__ = [
     "MoveAndPickUp",

@@ -12,16 +12,17 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from pycrorm_async.adoption import recover
 from pycrorm_async.errors import CallerError, InternalError
-from pycrorm_async.learning import remembered
-from pycrorm_async.learning.default_policy import default_policy
-from pycrorm_async.learning.policy import PickUpChoice, Policy
-from pycrorm_async.learning.policy_file import name_of
-from pycrorm_async.learning.rollouts import Tally
-from pycrorm_async.learning.scene import Scene
-from pycrorm_async.learning.tree import check_leaf, learn
-from pycrorm_async.learning.workers import AT_ONCE, Job, Place, Workers
+from pycrorm_async.learning.policies.default_policy import default_policy
+from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policies.policy_file import name_of
+from pycrorm_async.learning.policies.tree import check_leaf, learn
+from pycrorm_async.learning.rollouts import recorded_rollouts
+from pycrorm_async.learning.rollouts.recorded_rollouts import tally_of
+from pycrorm_async.learning.rollouts.rollout_pool import AT_ONCE, Job, Place, Workers
+from pycrorm_async.learning.rollouts.rollouts import Tally
+from pycrorm_async.learning.rollouts.scene import Scene
+from pycrorm_async.operations.destination import recover
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.world.enums import Arms, Grasp
 
@@ -151,18 +152,18 @@ class _Rolling:
                 f"{len(before):,} rollouts of this experiment are remembered already (seed {experiment.seed},"
                 f" {experiment.scene}): go on with --resume, or take another --seed or --url"
             )
-        began, already, counted = time.monotonic(), remembered.tally_of(before), Tally()
+        began, already, counted = time.monotonic(), recorded_rollouts.tally_of(before), Tally()
         frame = before
         if len(before) < count:
             job = Job(experiment.scene, policy, seed, episode_each=experiment.episode_each)
-            runs = remembered.missing(before["index"], count, at_once=AT_ONCE)
+            runs = recorded_rollouts.missing(before["index"], count, at_once=AT_ONCE)
             counted = await self._workers.roll_out(
                 job, runs, lambda tally: self._watch(name, len(before) + tally.rollouts, count, already + tally)
             )
         seconds = time.monotonic() - began
         if counted.rollouts:
             frame = await known(self._reading, experiment.scene, name_of(policy), seed, count)
-        tally = remembered.tally_of(frame)
+        tally = tally_of(frame)
         if tally != already + counted or tally.rollouts != count:
             raise InternalError(f"{name}: {already + counted} was counted, {tally} is remembered")
         self.phases.append(
@@ -171,9 +172,12 @@ class _Rolling:
                 name_of(policy),
                 seed,
                 tally,
-                remembered.stages_of(frame),
-                {each.name: remembered.tally_of(frame[frame.arm == each.name]) for each in (Arms.LEFT, Arms.RIGHT)},
-                {each.name: remembered.tally_of(frame[frame.grasp == each.name]) for each in Grasp},
+                recorded_rollouts.stages_of(frame),
+                {
+                    each.name: recorded_rollouts.tally_of(frame[frame.arm == each.name])
+                    for each in (Arms.LEFT, Arms.RIGHT)
+                },
+                {each.name: recorded_rollouts.tally_of(frame[frame.grasp == each.name]) for each in Grasp},
                 counted.rollouts,
                 seconds,
             )
@@ -195,7 +199,7 @@ async def run(experiment: Experiment, place: Place, watch: Watch = lambda *_: No
         for number in range(experiment.rounds):
             name = "default policy" if number == 0 else f"learned policy, round {number + 1}"
             frame = await rolling.phase(name, policy, experiment.seed + number, experiment.rollouts)
-            frames.append(remembered.successes(frame))
+            frames.append(recorded_rollouts.successes(frame))
             policy = _learned(frames, experiment)
         await rolling.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
         held_out_seed = experiment.seed + HELD_OUT_SEED
@@ -223,14 +227,14 @@ def _learned(frames: Sequence[pd.DataFrame], experiment: Experiment) -> Policy:
 
 async def known(reading: Reading, scene: Scene, policy: str, seed: int, count: int) -> pd.DataFrame:
     """Those of the rollouts 0 to `count` that are remembered, each once."""
-    question = remembered.rollouts_question(scene=str(scene), seed=seed, policy=policy)
-    frame = remembered.once(await reading.dataframe(question))
+    question = recorded_rollouts.rollouts_question(scene=str(scene), seed=seed, policy=policy)
+    frame = recorded_rollouts.once(await reading.dataframe(question))
     return frame[frame["index"] < count]
 
 
 def coverage_of(held_out: pd.DataFrame, policy: Policy) -> float | None:
     """The share of these rollouts' successes that the policy could have made; None if there is none."""
-    choices = choices_of(remembered.successes(held_out))
+    choices = choices_of(recorded_rollouts.successes(held_out))
     return policy.coverage(choices) if choices else None
 
 

@@ -21,16 +21,16 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Final, NamedTuple, TypeAlias
 
-from pycrorm_async.bulk import collect_seldom
+from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
-from pycrorm_async.projections.folding import Prepared
-from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.own_found import installed_besides
-from pycrorm_async.projections.pipeline import Outlook
+from pycrorm_async.projections.custom.discovery import installed_besides
+from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.run.batch_fold import Prepared
+from pycrorm_async.projections.run.pipeline import Outlook
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span
+from pycrorm_async.store.stored import Span
 
 __all__ = ["Assignment", "Prepare", "Write", "FoldRest", "Failure", "Request", "Answer", "READY", "IGNORED", "main"]
 

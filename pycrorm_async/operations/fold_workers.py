@@ -28,16 +28,16 @@ from typing import Any, Final, Literal, Self
 
 import msgspec
 
-from pycrorm_async.adoption import LogAndTables
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseError, DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.operations.fold_process import FoldProcess
 from pycrorm_async.operations.fold_worker import Assignment, Failure, FoldRest, Prepare, Request, Write
-from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPipeline, Outlook
-from pycrorm_async.store.rows import Span
+from pycrorm_async.projections.run.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPipeline, Outlook
+from pycrorm_async.settings import Settings
+from pycrorm_async.store.stored import Span
 from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.ports import Shown
 

@@ -1,4 +1,4 @@
-"""Views that join what learning asks for; users register more of them, see `pycrorm_async.projections.views`."""
+"""Views that join what learning asks for; users register more of them, as `projections.schema.user_views` says."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
 """What a robot does: designators, the actions and motions that are there, and the tree of what was performed.
 
-Runs without a memory; `pycrorm_async.plan.ports` is what a memory implements to be told. Importing this loads neither
-Bullet nor a database. The kinds of `PlanFailure` are in `pycrorm_async.plan.failures`.
+Runs without a memory; a memory implements the observer of `pycrorm_async.plan.execution.observer`. Importing this
+loads neither Bullet nor a database. The kinds of `PlanFailure` are in `pycrorm_async.plan.failures`.
 
 >>> with BulletWorld() as world, simulated_robot:
 ...     robot = Object("pr2", ObjectType.ROBOT)
 ...     await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
 """
 
-from pycrorm_async.plan.actions import (
+from pycrorm_async.plan.actions.basic import (
     FaceAtPerformable,
     LookAtActionPerformable,
     MoveAndPickUpPerformable,
@@ -19,7 +19,7 @@ from pycrorm_async.plan.actions import (
     PlaceActionPerformable,
     SetGripperActionPerformable,
 )
-from pycrorm_async.plan.descriptions import (
+from pycrorm_async.plan.actions.descriptions import (
     ActionDescription,
     CloseAction,
     DetectAction,
@@ -36,12 +36,24 @@ from pycrorm_async.plan.descriptions import (
     SetGripperAction,
     TransportAction,
 )
+from pycrorm_async.plan.actions.manipulation import (
+    CloseActionPerformable,
+    GraspingActionPerformable,
+    GripActionPerformable,
+    OpenActionPerformable,
+    ReleaseActionPerformable,
+)
+from pycrorm_async.plan.actions.transport import DetectActionPerformable, TransportActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract, BaseMotion, Designator
 from pycrorm_async.plan.errors import NoRobotChosen, NoRobotHere, PerformNotAsync, ResolutionError
+from pycrorm_async.plan.execution.simulation import SimulatedTaskTree
 from pycrorm_async.plan.failures import IKError, PlanFailure, PlanFailures
-from pycrorm_async.plan.fetching import DetectActionPerformable, TransportActionPerformable
-from pycrorm_async.plan.language import Code, Parallel, Repeat, Sequential, TryAll, TryInOrder
-from pycrorm_async.plan.locations import (
+from pycrorm_async.plan.language.expressions import Code, Parallel, Repeat, Sequential, TryAll, TryInOrder
+from pycrorm_async.plan.language.monitor import Monitor
+from pycrorm_async.plan.language.outcome import Outcome
+from pycrorm_async.plan.language.resources import Resource
+from pycrorm_async.plan.language.retry import Retry
+from pycrorm_async.plan.locations.designators import (
     AccessingLocation,
     CostmapLocation,
     Location,
@@ -49,15 +61,8 @@ from pycrorm_async.plan.locations import (
     ObjectRelativeLocation,
     SemanticCostmapLocation,
 )
-from pycrorm_async.plan.manipulation import (
-    CloseActionPerformable,
-    GraspingActionPerformable,
-    GripActionPerformable,
-    OpenActionPerformable,
-    ReleaseActionPerformable,
-)
-from pycrorm_async.plan.monitoring import Monitor
-from pycrorm_async.plan.motions import (
+from pycrorm_async.plan.locations.from_experience import DatabaseCostmapLocation
+from pycrorm_async.plan.motions.motions import (
     AccessingMotion,
     ClosingMotion,
     DetectingMotion,
@@ -70,7 +75,14 @@ from pycrorm_async.plan.motions import (
     OpeningMotion,
     WorldStateDetectingMotion,
 )
-from pycrorm_async.plan.objects import (
+from pycrorm_async.plan.motions.process_modules import (
+    ChosenRobot,
+    MovingModules,
+    ProcessModules,
+    simulated_robot,
+    simulated_robot_within,
+)
+from pycrorm_async.plan.object_designators import (
     BelieveObject,
     LocatedObject,
     LocatedObjectDescription,
@@ -78,19 +90,7 @@ from pycrorm_async.plan.objects import (
     ObjectDesignatorDescription,
     ObjectPart,
 )
-from pycrorm_async.plan.outcome import Outcome
-from pycrorm_async.plan.process_modules import (
-    ChosenRobot,
-    MovingModules,
-    ProcessModules,
-    simulated_robot,
-    simulated_robot_within,
-)
-from pycrorm_async.plan.remembered_places import DatabaseCostmapLocation
-from pycrorm_async.plan.resources import Resource
-from pycrorm_async.plan.retrying import Retry
 from pycrorm_async.plan.task_tree import CollectedTree, TaskStatus, TaskTreeNode, collected_tree
-from pycrorm_async.plan.thinking import SimulatedTaskTree
 
 __all__ = [
     "Designator",

@@ -17,12 +17,12 @@ import inspect
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
-from pycrorm_async.plan.composing import Composable
-from pycrorm_async.plan.constructor import keeping_arguments
+from pycrorm_async.plan.constructor_arguments import keeping_arguments
 from pycrorm_async.plan.errors import PerformNotAsync, ResourcesNotAMethod
-from pycrorm_async.plan.performing import as_node, is_node
-from pycrorm_async.plan.properties import check_properties
-from pycrorm_async.plan.resources import NOTHING, Resource
+from pycrorm_async.plan.execution.node_execution import as_node, is_node
+from pycrorm_async.plan.field_types import check_properties
+from pycrorm_async.plan.language.operators import Composable
+from pycrorm_async.plan.language.resources import NOTHING, Resource
 from pycrorm_async.plan.task_tree import NodeKind
 
 __all__ = ["Designator", "ActionAbstract", "BaseMotion"]

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pycrorm_async.connected import ConnectedVar
+from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Self
 
-from pycrorm_async.plan.resources import Resource
+from pycrorm_async.plan.language.resources import Resource
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
 

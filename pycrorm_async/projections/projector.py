@@ -13,9 +13,11 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
-from pycrorm_async.projections.classes import mapped_leaves
-from pycrorm_async.projections.folding import Folding, Prepared
-from pycrorm_async.projections.generations import (
+from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.custom.projection_tables import OwnTables
+from pycrorm_async.projections.run.batch_fold import Folding, Prepared
+from pycrorm_async.projections.run.parked_release import release_parked
+from pycrorm_async.projections.schema.generations import (
     Generation,
     Hold,
     current_generation,
@@ -23,17 +25,15 @@ from pycrorm_async.projections.generations import (
     make_generation,
     show,
 )
-from pycrorm_async.projections.layout import Layout
-from pycrorm_async.projections.materialised import refresh_some
-from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.own_tables import OwnTables
-from pycrorm_async.projections.releasing import release_parked
-from pycrorm_async.projections.views import UserView, with_user_views
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
+from pycrorm_async.projections.schema.materialised_views import refresh_some
+from pycrorm_async.projections.schema.user_views import UserView, with_user_views
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.folded_progress import advance_folded, park
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.progress import advance_folded, park
-from pycrorm_async.store.rows import Span
+from pycrorm_async.store.stored import Span
 
 __all__ = ["Projector"]
 

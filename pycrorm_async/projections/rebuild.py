@@ -23,11 +23,12 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError
-from pycrorm_async.projections import progress
-from pycrorm_async.projections.beside import WHOLE, Beside, CatchUp, Share
-from pycrorm_async.projections.classes import mapped_leaves
-from pycrorm_async.projections.folding import TABLES
-from pycrorm_async.projections.generations import (
+from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.custom.projection_tables import OwnMeaning, layout_of, make_own, refuse_taken
+from pycrorm_async.projections.run import checkpoints
+from pycrorm_async.projections.run.batch_fold import TABLES
+from pycrorm_async.projections.run.catch_up import WHOLE, Beside, CatchUp, Share
+from pycrorm_async.projections.schema.generations import (
     MAKING,
     PROJECTION,
     PROJECTION_VERSION,
@@ -44,18 +45,17 @@ from pycrorm_async.projections.generations import (
     projections_in,
     show,
 )
-from pycrorm_async.projections.growth import grow
-from pycrorm_async.projections.materialised import kept_tables, refresh_some
-from pycrorm_async.projections.own import Projection
-from pycrorm_async.projections.own_tables import OwnMeaning, layout_of, make_own, refuse_taken
-from pycrorm_async.projections.public import public_views
-from pycrorm_async.projections.shadowing import with_views
-from pycrorm_async.projections.tables import CORE, physical_name
-from pycrorm_async.projections.views import UserView, view_text, with_user_views
+from pycrorm_async.projections.schema.growth import grow
+from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
+from pycrorm_async.projections.schema.materialised_views import kept_tables, refresh_some
+from pycrorm_async.projections.schema.public_views import public_views
+from pycrorm_async.projections.schema.session_views import with_views
+from pycrorm_async.projections.schema.tables import CORE, physical_name
+from pycrorm_async.projections.schema.user_views import UserView, view_text, with_user_views
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span
+from pycrorm_async.store.stored import Span
 
 __all__ = ["Rebuild", "Share", "claimed", "clear", "recorded"]
 
@@ -111,7 +111,7 @@ class Rebuild:
         self._projection = projection
         self._key = SHOWN if projection is None else f"{PROJECTION}{projection.name}"
         name = None if projection is None else projection.name
-        self._place = progress.place_of(generation.number, name)
+        self._place = checkpoints.place_of(generation.number, name)
         self._making = Beside(f"{self._key}{_MAKING}", name, generation.version, number=generation.number)
         self._catch_up = CatchUp(
             log,
@@ -146,7 +146,7 @@ class Rebuild:
                 if making is None:
                     numbers = [each.number for key, each in there.items() if not key.startswith(PROJECTION)]
                     making = await make_generation(connection, 1 + max(numbers, default=0))
-                    await make_empty(connection, {progress.TABLE: progress.COLUMNS}, making.number)
+                    await make_empty(connection, {checkpoints.TABLE: checkpoints.COLUMNS}, making.number)
                 making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
                 await note(connection, MAKING, making)
             goal = Beside(MAKING, None, making.version, number=making.number)
@@ -175,14 +175,14 @@ class Rebuild:
     async def left(self) -> int:
         """How many events of the log are not in the new tables yet."""
         async with self._log.reading() as connection:
-            done = await progress.total(connection, self._place)
+            done = await checkpoints.total(connection, self._place)
         _, events = await recorded(self._log)
         return events - done
 
     async def parked(self) -> dict[int, str]:
         """By episode number, why not all of it could be folded."""
         async with self._log.reading() as connection:
-            return await progress.parked(connection, self._place)
+            return await checkpoints.parked(connection, self._place)
 
     async def fold_some(self) -> int | None:
         """Folds a batch; the number of events, None when none is left of this share."""
@@ -215,7 +215,9 @@ class Rebuild:
         async with with_views(self._log.engine, views | making.layout.user_views) as connection:
             more = True
             while more:
-                more = await refresh_some(connection, making.layout, self.number, folded=progress.folded(self._place))
+                more = await refresh_some(
+                    connection, making.layout, self.number, folded=checkpoints.folded(self._place)
+                )
                 await connection.commit()
 
     async def _show_if_complete(self) -> bool:
@@ -225,10 +227,12 @@ class Rebuild:
             # Whoever folds holds the note that is changed here: from now on nobody does, until this is over.
             old = await noted(connection, self._key, hold="change")
             new = await self._making.generation(connection, "change")
-            seen = progress.SEEN
+            seen = checkpoints.SEEN
             if self._projection is not None:
-                seen = progress.folded(progress.place_of(old.number, self._projection.name) if old else self._place)
-            late = await progress.late(connection, self._place, seen=seen, limit=_LATE_EVENTS_MAX + 1)
+                seen = checkpoints.folded(
+                    checkpoints.place_of(old.number, self._projection.name) if old else self._place
+                )
+            late = await checkpoints.late(connection, self._place, seen=seen, limit=_LATE_EVENTS_MAX + 1)
             if sum(each.head - each.folded for each in late) > _LATE_EVENTS_MAX:
                 return False
             if late:
@@ -258,7 +262,7 @@ class Rebuild:
             new = await grow_tables(connection, new, layout)
             new = replace(new, revision=max(new.revision, old.revision) + 1)
         new = await show(connection, new)
-        await progress.carry_over(connection, self._place)
+        await checkpoints.carry_over(connection, self._place)
         while await refresh_some(connection, new.layout, new.number):
             pass
 
@@ -313,7 +317,7 @@ async def clear(log: EventLog) -> list[str]:
         await _sweep(log)
         for key, generation in there.items():
             if key == SHOWN:
-                await _drop(log, progress.place_of(generation.number))
+                await _drop(log, checkpoints.place_of(generation.number))
             of, gone, _ = key.partition(_GONE)
             if not gone:
                 continue
@@ -322,7 +326,7 @@ async def clear(log: EventLog) -> list[str]:
                 *(CORE if ours else ()),
                 *generation.layout.leaves,
                 *kept_tables(generation.layout),
-                progress.TABLE if ours else f"{progress.TABLE}_{of.removeprefix(PROJECTION)}",
+                checkpoints.TABLE if ours else f"{checkpoints.TABLE}_{of.removeprefix(PROJECTION)}",
             ]
             named = [physical_name(each, generation.number) for each in tables]
             kept = await _drop_all(log, named)

@@ -15,14 +15,14 @@ import msgspec
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, PycrormError, UnknownEpisode
 from pycrorm_async.events.codec import fingerprint
-from pycrorm_async.events.happenings import EVENT_TYPES
-from pycrorm_async.projections.fold import CannotFold
-from pycrorm_async.query.moment import Moment
-from pycrorm_async.query.moment_fold import MomentFold
-from pycrorm_async.query.questions import EpisodeSummary
+from pycrorm_async.events.types import EVENT_TYPES
+from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.query.snapshot_fold import MomentFold
+from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.naming import episode_named
-from pycrorm_async.store.rows import StoredEvent
+from pycrorm_async.store.stored import StoredEvent
 
 if TYPE_CHECKING:
     from pycrorm_async.hooks.episode import Episode

@@ -21,14 +21,14 @@ from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.projections.generations import Generation, current_generation
-from pycrorm_async.projections.shadowing import with_views
-from pycrorm_async.projections.union import unite
-from pycrorm_async.query import questions
+from pycrorm_async.projections.schema.generations import Generation, current_generation
+from pycrorm_async.projections.schema.session_views import with_views
+from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.query import named_queries
 from pycrorm_async.query.as_of import AnyEpisode, as_of
-from pycrorm_async.query.frames import dataframe
-from pycrorm_async.query.moment import Moment
-from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
+from pycrorm_async.query.dataframes import dataframe
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.thoughts import all_views
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -119,7 +119,7 @@ class Reading:
             yield session
 
     async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> pd.DataFrame:
-        """The answer as a pandas DataFrame, see `pycrorm_async.query.frames`. Raises `MissingExtra`."""
+        """The answer as a pandas DataFrame, see `pycrorm_async.query.dataframes`. Raises `MissingExtra`."""
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
@@ -139,7 +139,7 @@ class Reading:
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
-                return await questions.episodes(connection)
+                return await named_queries.episodes(connection)
 
     async def episode(self, name: str) -> EpisodeSummary:
         """The episode of that number, or id, or first digits of its id, also one that was only thought through.
@@ -149,14 +149,14 @@ class Reading:
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
-                return await questions.episode_named(connection, name)
+                return await named_queries.episode_named(connection, name)
 
     async def tree(self, number: int) -> list[NodeSummary]:
         """The task tree of an episode, also of one that was only thought through; each node before its children."""
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
-                return await questions.task_tree(connection, number)
+                return await named_queries.task_tree(connection, number)
 
     async def as_of(
         self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.projections.generations import Generation, all_noted, projections_in, view_texts_of
+from pycrorm_async.projections.schema.generations import Generation, all_noted, projections_in, view_texts_of
 
 __all__ = ["all_views"]
 

@@ -58,10 +58,9 @@ if its base is the next position. The oldest segment's header knows the open epi
 when the segments that began them are gone: a segment goes only after the next one's header is safe.
 """
 
-from pycrorm_async.queue.handed_over import HandedOver
-from pycrorm_async.queue.living import LiveQueue
-from pycrorm_async.queue.recorder import RecorderQueue
-from pycrorm_async.queue.recovery import RecoveredQueue, open_dead
-from pycrorm_async.queue.spool import RecorderFolder, Spool
+from pycrorm_async.queue.files.spool import RecorderFolder, Spool
+from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.queue.sources.dead_source import RecoveredQueue, open_dead
+from pycrorm_async.queue.sources.live_source import LiveQueue
 
-__all__ = ["RecorderQueue", "HandedOver", "LiveQueue", "RecoveredQueue", "open_dead", "Spool", "RecorderFolder"]
+__all__ = ["RecorderQueue", "LiveQueue", "RecoveredQueue", "open_dead", "Spool", "RecorderFolder"]

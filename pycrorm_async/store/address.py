@@ -21,8 +21,8 @@ from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.errors import UnknownUrl
 from pycrorm_async.store.postgresql import engine as postgresql
-from pycrorm_async.store.private import private_folder, usual_place
 from pycrorm_async.store.sqlite import engine as sqlite
+from pycrorm_async.store.temporary_database import private_folder, usual_place
 
 __all__ = ["DatabaseAddress", "BUSY_TIMEOUT_S"]
 

@@ -19,10 +19,10 @@ from pycrorm_async.errors import LogDamaged, LogWentBack
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.store.batch import NoNumber, Sorted, Step, differing, new_episode, sort, step
+from pycrorm_async.store.append_rules import NoNumber, Sorted, Step, differing, new_episode, sort, step
 from pycrorm_async.store.dialect import Dialect, Insertion
 from pycrorm_async.store.limits import warnings_of
-from pycrorm_async.store.rows import NOTHING_KNOWN, Basis, EpisodeRow, Stored, StoredEvent
+from pycrorm_async.store.stored import NOTHING_KNOWN, Basis, EpisodeRow, Stored, StoredEvent
 
 __all__ = ["Appending"]
 

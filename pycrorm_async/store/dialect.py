@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.store.rows import EpisodeRow, Incarnation, Span, StoredEvent
+from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
 
 __all__ = [
     "Dialect",

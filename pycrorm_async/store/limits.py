@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
-from pycrorm_async.store.rows import EpisodeRow
+from pycrorm_async.store.stored import EpisodeRow
 
 __all__ = ["EPISODES_MANY", "EVENTS_MANY", "number_warning", "events_warning", "warnings_of"]
 

@@ -20,16 +20,18 @@ from types import MappingProxyType
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.config import FileAccess
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, PycrormError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
+from pycrorm_async.settings import FileAccess
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialect import Dialect, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.limits import EVENTS_MANY, events_warning, number_warning
-from pycrorm_async.store.rows import (
+from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
+from pycrorm_async.store.sqlite.engine import BEGIN
+from pycrorm_async.store.stored import (
     NOTHING_KNOWN,
     Basis,
     EpisodeRow,
@@ -40,8 +42,6 @@ from pycrorm_async.store.rows import (
     beyond,
     share_out,
 )
-from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
-from pycrorm_async.store.sqlite.engine import BEGIN
 
 __all__ = ["EventLog"]
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.config import FILE_MODES, FileAccess
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
+from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store.dialect import Birth, Dialect, Found, Migrations
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.sqlite.leftovers import move_leftovers

@@ -14,22 +14,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pycrorm_async.world.boxes import BoundingBox
     from pycrorm_async.world.bullet import BulletWorld
-    from pycrorm_async.world.copying import copied
-    from pycrorm_async.world.costmaps import (
+    from pycrorm_async.world.enums import Arms, Grasp, GripperState, JointType, ObjectType, WorldMode
+    from pycrorm_async.world.objects import Object
+    from pycrorm_async.world.observers import WorldObserver, WorldWatcher, current_world, watcher
+    from pycrorm_async.world.pose import Pose, Quaternion, Vector
+    from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+    from pycrorm_async.world.queries.costmaps import (
         Costmap,
         GaussianCostmap,
         OccupancyCostmap,
         SemanticCostmap,
         VisibilityCostmap,
     )
-    from pycrorm_async.world.enums import Arms, Grasp, GripperState, JointType, ObjectType, WorldMode
-    from pycrorm_async.world.objects import Object
-    from pycrorm_async.world.pose import Pose, Quaternion, Vector
-    from pycrorm_async.world.robot import Limits, RobotDescription, robot_description
+    from pycrorm_async.world.robots.robot_description import Limits, RobotDescription, robot_description
     from pycrorm_async.world.state import WorldState
-    from pycrorm_async.world.watch import WorldObserver, WorldWatcher, current_world, watcher
+    from pycrorm_async.world.world_copy import copied
 
 __all__ = [
     "BulletWorld",

@@ -11,14 +11,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Self
 
-from pycrorm_async.world import sight, state
+from pycrorm_async.world import state
 from pycrorm_async.world.attachments import Attachments
-from pycrorm_async.world.engine import engine
+from pycrorm_async.world.bullet_loader import engine
 from pycrorm_async.world.enums import ObjectType, WorldMode
 from pycrorm_async.world.errors import ObjectNotInWorld, WorldClosed, WorldUnavailable
 from pycrorm_async.world.objects import Object
+from pycrorm_async.world.observers import WorldObserver, WorldWatcher, current_world, watcher
+from pycrorm_async.world.queries import visibility
 from pycrorm_async.world.state import WorldState
-from pycrorm_async.world.watch import WorldObserver, WorldWatcher, current_world, watcher
 
 __all__ = ["BulletWorld"]
 
@@ -215,14 +216,14 @@ class BulletWorld:
 
         Objects in `ignore` are looked through. A ray does not meet the shape it starts in. Points in "map", metres.
         """
-        return sight.first_met(self, starts, ends, ignore=frozenset(ignore))
+        return visibility.first_met(self, starts, ends, ignore=frozenset(ignore))
 
     def visible(self, thing: Object, eye: Sequence[float], *, ignore: Iterable[Object] = ()) -> float:
         """The share of `thing` that is seen from the point `eye`, 0 to 1; nothing of it is beyond a field of view.
 
         Rays go to points spread through its shapes; those that meet another object or the floor first are hidden.
         """
-        return sight.visible_share(self, thing, eye, ignore=frozenset(ignore))
+        return visibility.visible_share(self, thing, eye, ignore=frozenset(ignore))
 
     # --- who is told ------------------------------------------------------------------------------------------
 

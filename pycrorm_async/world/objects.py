@@ -13,9 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pycrorm_async.world.body import Body, Color
-from pycrorm_async.world.boxes import BoundingBox
-from pycrorm_async.world.description import urdf_text
+from pycrorm_async.world.bullet_body import Body, Color
 from pycrorm_async.world.enums import JointType, ObjectType
 from pycrorm_async.world.errors import (
     AttachmentRefused,
@@ -28,10 +26,12 @@ from pycrorm_async.world.errors import (
     UnknownJoint,
     UnknownLink,
 )
+from pycrorm_async.world.models.primitives import built_in_urdf
+from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.pose import COORDINATE_MAX, Pose
-from pycrorm_async.world.robot import RobotDescription, robot_description
-from pycrorm_async.world.shapes import built_in_urdf
-from pycrorm_async.world.watch import current_world
+from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+from pycrorm_async.world.robots.robot_description import RobotDescription, robot_description
+from pycrorm_async.world.urdf_checks import urdf_text
 
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld

@@ -13,13 +13,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final, NamedTuple
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
+from pycrorm_async.settings import Settings
+from pycrorm_async.writer.availability import Watched
 from pycrorm_async.writer.backoff import PATIENT, Backoff
 from pycrorm_async.writer.drain import to_the_end
 from pycrorm_async.writer.ports import Found, Held, Look, Shown
-from pycrorm_async.writer.serving import Serving
-from pycrorm_async.writer.watched import Watched
+from pycrorm_async.writer.visibility import Serving
 
 __all__ = ["Daemon", "Moved", "LEAVE_S"]
 

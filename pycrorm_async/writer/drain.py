@@ -16,13 +16,13 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple, TypeVar
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, FilesError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.writer.asking import answer_of
+from pycrorm_async.settings import Settings
 from pycrorm_async.writer.backoff import PATIENT, Backoff
 from pycrorm_async.writer.ports import Destination, Source
+from pycrorm_async.writer.retry import answer_of
 
 __all__ = ["Drain", "DrainState", "to_the_end"]
 

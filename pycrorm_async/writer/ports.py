@@ -6,12 +6,24 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = ["Source", "Destination", "Held", "LetGo", "Look", "Found", "Shown"]
+__all__ = [
+    "Source",
+    "Destination",
+    "Held",
+    "LetGo",
+    "Look",
+    "Found",
+    "Shown",
+    "OfferedQueue",
+    "DrainProgress",
+    "DrainRemarks",
+]
 
 
 class Source(Protocol):
@@ -139,4 +151,70 @@ class Shown(Destination, Protocol):
 
     async def behind(self) -> Mapping[str, int]:
         """By id, how far the tables show each episode of which they do not show all that they ever will."""
+        ...
+
+
+class DrainRemarks(Protocol):
+    """Reasons that the drainer of a queue gives in words."""
+
+    @property
+    def given_up(self) -> str | None:
+        """Why the drainer acknowledges nothing more."""
+        ...
+
+    @property
+    def away(self) -> str | None:
+        """Why the database takes nothing at this moment."""
+        ...
+
+    @property
+    def stopped(self) -> Mapping[str, str]:
+        """By episode id, why it is refused or parked."""
+        ...
+
+
+class DrainProgress(Protocol):
+    """Positions that the drainer of a queue has reached."""
+
+    @property
+    def stored(self) -> int:
+        """Everything up to this position is in the log."""
+        ...
+
+    @property
+    def folded(self) -> int:
+        """Everything up to this position is visible in the tables."""
+        ...
+
+    @property
+    def note(self) -> DrainRemarks:
+        """What hinders the drainer."""
+        ...
+
+
+class OfferedQueue(Protocol):
+    """A recorder's queue that another process drains."""
+
+    @property
+    def folder(self) -> Path:
+        """The recorder's folder, below the spool."""
+        ...
+
+    @property
+    def written(self) -> int:
+        """The position of the last record."""
+        ...
+
+    @property
+    def is_drained(self) -> bool:
+        """Whether a process drains the queue at this moment."""
+        ...
+
+    @property
+    def drained_outside(self) -> DrainProgress | None:
+        """How far the other process has got; None for a queue that is drained in this process."""
+        ...
+
+    async def synced_to(self) -> None:
+        """Returns when every record is safe on the disk. Raises `SpoolUnavailable`."""
         ...

@@ -27,7 +27,7 @@ main()
 
 SPEAKING = """
 import asyncio, os, signal
-from pycrorm_async.cli.interrupting import Interrupting
+from pycrorm_async.cli.interruption import Interrupting
 from pycrorm_async.cli.output import stderr
 
 class Interrupted:

@@ -8,8 +8,8 @@ import pytest
 
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, parse_episode_id
-from pycrorm_async.queue.folder import make_folder
-from pycrorm_async.queue.refused import RefusedRecords
+from pycrorm_async.queue.files.recorder_folder import make_folder
+from pycrorm_async.queue.sources.dead_letters import RefusedRecords
 from tests.cli.notes import NOTES_PLAN
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change

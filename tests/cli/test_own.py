@@ -31,8 +31,8 @@ async def plan():
     await WeighActionPerformable("water", 2.5).perform()
 '''
 LAB = """
-from pycrorm_async.events.happenings import NodeEnded
-from pycrorm_async.projections.own import Projection
+from pycrorm_async.events.types import NodeEnded
+from pycrorm_async.projections.custom.projection import Projection
 
 class Weighed(Projection):
     name = "weighed"

@@ -7,11 +7,11 @@ import threading
 from collections.abc import Iterable
 
 from pycrorm_async import Memory
-from pycrorm_async.config import Settings
 from pycrorm_async.events.envelope import LOST, Record
-from pycrorm_async.events.happenings import EpisodeEnded
+from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.plan import NavigateAction, ParkArmsAction, SimulatedTaskTree
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import Arms, Pose

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.config import Settings
-from pycrorm_async.copying import Copied, copy_episodes
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.operations.copy import Copied, copy_episodes
+from pycrorm_async.settings import Settings
 from tests.copying.memories import (
     PATIENT,
     append,

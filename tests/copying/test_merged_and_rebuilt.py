@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from itertools import pairwise
 
-from pycrorm_async.copying import copy_episodes
-from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.rebuild import rebuild_memory
 from tests.copying.memories import assert_merged, everything, lost, random_plans
 from tests.databases import ask, ask_to_change
 from tests.projections.remade import traces

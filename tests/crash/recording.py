@@ -15,10 +15,10 @@ import time
 from pathlib import Path
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.config import Settings
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.settings import Settings
 
 SETTINGS = Settings(
     sync_interval_ms=2, segment_bytes=2**14, spool_bytes_max=2**26, spool_reserve_bytes=1, record_bytes_max=2**12

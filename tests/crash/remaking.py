@@ -13,10 +13,10 @@ from sqlalchemy import event, func, select
 from sqlalchemy.engine import Engine
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.config import Settings
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, PickUpWithContextView, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
-from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.settings import Settings
 from tests.memory.notes import NoteActionPerformable
 
 __all__ = ["rebuild_until", "record_until_told", "read_until_told"]

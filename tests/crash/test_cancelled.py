@@ -14,17 +14,17 @@ from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any
 
-from pycrorm_async.adoption import LogAndTables, open_destination, recover
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.config import Settings
-from pycrorm_async.daemon import _Folders, _Living
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.happenings import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.events.ids import episode_text
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
+from pycrorm_async.operations.daemon import _Folders, _Living
+from pycrorm_async.operations.destination import LogAndTables, open_destination, recover
 from pycrorm_async.queue import Spool
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.writer.background_writer import LiveWriter
 from pycrorm_async.writer.daemon import Daemon
-from pycrorm_async.writer.live import LiveWriter
 from pycrorm_async.writer.ports import Found, Held
 from tests.databases import ask
 from tests.projections.script import SAYING, Script, declarations, name_of

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import SpoolFull, SpoolUnavailable
 from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.settings import Settings
 from tests.queue.writing import RECORDER, SMALL, drain, lost, make, node, record, recover, started
 
 SLOW = Settings(

@@ -19,10 +19,10 @@ from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue import RecorderQueue, open_dead
-from pycrorm_async.queue.appender import Appender, Span
-from pycrorm_async.queue.frame import EVENT
-from pycrorm_async.queue.segment import Segment, salt_of
-from pycrorm_async.queue.syncer import Syncer
+from pycrorm_async.queue.files.frame import EVENT
+from pycrorm_async.queue.files.segment import Segment, salt_of
+from pycrorm_async.queue.live.appender import Appender, Span
+from pycrorm_async.queue.live.sync_thread import Syncer
 from tests.queue.writing import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
 
 SECTOR = 512

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.operations.rebuild import rebuild_memory
 from tests.crash.forked import Forked
 from tests.crash.remaking import read_until_told, rebuild_until, record_until_told
 from tests.databases import ask

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pycrorm_async.events.codec import NotEncodable, UnknownShape, decode, encode, fingerprint
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EVENT_TYPES,
     NodeEnded,
     NodeStarted,

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.events.codec import decode, encode
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EVENT_TYPES,
     DesignatorTypeDeclared,
     EpisodeEnded,

@@ -2,7 +2,8 @@
 
 import pytest
 
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.order import Finding, OrderCheck
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     Happening,
@@ -13,7 +14,6 @@ from pycrorm_async.events.happenings import (
     ObjectMoved,
     PoseValue,
 )
-from pycrorm_async.events.order import Finding, OrderCheck
 
 START = EpisodeStarted("d", "me", "here", "0", "3")
 POSE = PoseValue((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 0)

@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from pycrorm_async.events.codec import Decoder, UnknownShape, encode, fingerprint
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EVENT_TYPES,
     DesignatorTypeDeclared,
     FieldDeclared,
@@ -18,8 +18,8 @@ from pycrorm_async.events.happenings import (
     PoseValue,
 )
 from pycrorm_async.events.upcasters import UPCASTERS
-from pycrorm_async.projections.layout import Layout
-from pycrorm_async.projections.union import unite
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.union import unite
 
 LINES = (Path(__file__).parent.parent / "golden" / "events_v1.jsonl").read_text().splitlines()
 GOLDEN = [(kind, payload.encode()) for kind, _, payload in (line.partition(" ") for line in LINES)]

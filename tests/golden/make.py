@@ -18,16 +18,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from pycrorm_async.adoption import LogAndTables
 from pycrorm_async.clock import Clock
-from pycrorm_async.config import Settings
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.hooks.declaration import DeclaredType, declared_type
+from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.queue.recorder import RecorderQueue
-from pycrorm_async.queue.spool import Spool
+from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import Arms

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import DeclarationRefused
-from pycrorm_async.events.happenings import FieldDeclared
+from pycrorm_async.events.types import FieldDeclared
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType, declared_type
-from pycrorm_async.plan.actions import PickUpActionPerformable
+from pycrorm_async.plan.actions.basic import PickUpActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId, episode_text
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     Happening,
@@ -27,14 +27,14 @@ from pycrorm_async.events.happenings import (
     ObjectRemoved,
     StateSampled,
 )
-from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId, episode_text
-from pycrorm_async.hooks.recorder import current_episode
+from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import ChosenRobot, MoveMotion, SimulatedTaskTree
-from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable
+from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
+from pycrorm_async.plan.current_robot import robot_here
 from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.here import robot_here
-from pycrorm_async.plan.objects import ObjectDesignator
-from pycrorm_async.plan.process_modules import simulated_robot
+from pycrorm_async.plan.motions.process_modules import simulated_robot
+from pycrorm_async.plan.object_designators import ObjectDesignator
+from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.hooks.rig import CarryActionPerformable, ListSink, NoteActionPerformable, Rig, findings, rigged
 

@@ -17,13 +17,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pycrorm_async.config import Settings
-from pycrorm_async.events.happenings import EpisodeEnded, EpisodeStarted, Happening, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.hooks import missing
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, Happening, NodeEnded, NodeStarted, ObjectAdded
+from pycrorm_async.hooks.values import missing_values
 from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.plan.object_designators import ObjectDesignator
+from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.shapes import built_in_urdf
+from pycrorm_async.world.models.primitives import built_in_urdf
 from tests.hooks.rig import NoteActionPerformable, findings, rigged
 
 
@@ -291,13 +291,13 @@ async def test_nodes_of_a_class_that_cannot_be_declared_are_recorded_without_a_t
 
 
 def test_warnings_are_bounded_by_a_number_of_fields(caplog: pytest.LogCaptureFixture) -> None:
-    values = missing.MissingValues()
-    for number in range(missing.WARNED_MAX + 50):
+    values = missing_values.MissingValues()
+    for number in range(missing_values.WARNED_MAX + 50):
         values.note("AnAction", f"field_{number}", "it is odd")
-    assert values.count.total == missing.WARNED_MAX + 50
-    assert len(caplog.records) == missing.WARNED_MAX + 1
+    assert values.count.total == missing_values.WARNED_MAX + 50
+    assert len(caplog.records) == missing_values.WARNED_MAX + 1
     assert caplog.records[-1].getMessage() == "values of more than 1000 fields are missing; the others are only counted"
-    assert len(values._warned) == missing.WARNED_MAX + 1
+    assert len(values._warned) == missing_values.WARNED_MAX + 1
 
 
 async def test_texts_of_an_episode_that_are_too_long_are_cut_and_marked() -> None:

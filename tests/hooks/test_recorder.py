@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import Unrecordable
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     JointsMoved,
@@ -23,12 +22,13 @@ from pycrorm_async.events.happenings import (
     ObjectRemoved,
     PoseValue,
 )
-from pycrorm_async.hooks.recorder import current_episode
-from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable
+from pycrorm_async.hooks.plan_recorder import current_episode
+from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
-from pycrorm_async.plan.ports import Candidate
-from pycrorm_async.plan.process_modules import simulated_robot
+from pycrorm_async.plan.execution.observer import Candidate
+from pycrorm_async.plan.motions.process_modules import simulated_robot
+from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
+from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from tests.hooks.rig import CarryActionPerformable, NoteActionPerformable, findings, kinds, rigged
 

@@ -8,9 +8,8 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import EpisodeRefused, SpoolFull, Unrecordable
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EpisodeEnded,
     NodeEnded,
     NodeStarted,
@@ -19,6 +18,7 @@ from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from tests.hooks.rig import NoteActionPerformable, Rig, findings, kinds, rigged
 

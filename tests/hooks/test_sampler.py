@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import Happening, NodeEnded, NodeStarted, StateSampled
+from pycrorm_async.events.types import Happening, NodeEnded, NodeStarted, StateSampled
 from pycrorm_async.plan import (
     ActionAbstract,
     ChosenRobot,
@@ -24,7 +23,8 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.here import robot_here
+from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.hooks.rig import Rig, findings, rigged

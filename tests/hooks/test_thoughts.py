@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import EpisodeRefused
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     Happening,
@@ -21,8 +22,7 @@ from pycrorm_async.events.happenings import (
     ObjectMoved,
     ObjectReference,
 )
-from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.hooks.recorder import current_episode
+from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import (
     ActionAbstract,
     NavigateActionPerformable,
@@ -30,7 +30,7 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.objects import ObjectDesignator, designator_of, in_world
+from pycrorm_async.plan.object_designators import ObjectDesignator, designator_of, in_world
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.hooks.rig import CarryActionPerformable, NoteActionPerformable, Rig, findings, kinds, rigged
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     FieldDeclared,
     FieldType,
     MissingValue,
@@ -16,11 +16,11 @@ from pycrorm_async.events.happenings import (
     ObjectValue,
     PoseValue,
 )
-from pycrorm_async.hooks.texts import clean_repr
-from pycrorm_async.hooks.values import Unwritable, failure_value, written, written_or_missing
+from pycrorm_async.hooks.values.texts import clean_repr
+from pycrorm_async.hooks.values.value_snapshot import Unwritable, failure_value, written, written_or_missing
 from pycrorm_async.plan.failures import ObjectLost, PlanFailure, PlanFailures
-from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator
-from pycrorm_async.plan.outcome import Outcome
+from pycrorm_async.plan.language.outcome import Outcome
+from pycrorm_async.plan.object_designators import BelieveObject, ObjectDesignator
 from pycrorm_async.world.enums import Arms, ObjectType
 from pycrorm_async.world.pose import Pose
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import get_args
 
-from pycrorm_async.events import happenings
+from pycrorm_async.events import types as happenings
 from pycrorm_async.plan import task_tree
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import ImpossibleCondition
-from pycrorm_async.learning.default_policy import AROUND_OBJECT, default_policy
-from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policies.default_policy import AROUND_OBJECT, default_policy
+from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.world.enums import Arms, Grasp
 
 RETAINED = 0.94107

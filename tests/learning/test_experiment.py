@@ -15,15 +15,16 @@ import psutil
 import pytest
 
 from pycrorm_async import Reading
-from pycrorm_async.daemon import serve
 from pycrorm_async.errors import CallerError, NotEnoughExperience
-from pycrorm_async.learning import Policy, Scene, default_policy, experiment, name_of, remembered
+from pycrorm_async.learning import Policy, Scene, default_policy, experiment, name_of
+from pycrorm_async.learning.evaluation import elsewhere, study
 from pycrorm_async.learning.experiment import Experiment, Learned, known, run
-from pycrorm_async.learning.kitchen import pick_up_in_kitchen
-from pycrorm_async.learning.rollouts import Tally
-from pycrorm_async.learning.study import elsewhere, study
-from pycrorm_async.learning.tree import learn
-from pycrorm_async.learning.workers import Job, Place, WorkerLost, Workers
+from pycrorm_async.learning.policies.tree import learn
+from pycrorm_async.learning.rollouts import recorded_rollouts
+from pycrorm_async.learning.rollouts.kitchen_trial import pick_up_in_kitchen
+from pycrorm_async.learning.rollouts.rollout_pool import Job, Place, WorkerLost, Workers
+from pycrorm_async.learning.rollouts.rollouts import Tally
+from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import MoveAndPickUpAction
 from tests.databases import ask, await_events
 
@@ -213,7 +214,7 @@ async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There are 500 here, but of the first 500 not all."""
-    monkeypatch.setattr("pycrorm_async.learning.study.elsewhere", lambda _scene: ())
+    monkeypatch.setattr("pycrorm_async.learning.evaluation.elsewhere", lambda _scene: ())
     place = Place(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
         await workers.roll_out(Job(Scene(), default_policy(), 69), [(400, 200)])
@@ -277,7 +278,7 @@ async def test_each_rollout_may_be_an_episode(tmp_path: Path) -> None:
         assert ask(place.url, "SELECT count(*) FROM process_metadata") == [(30,)]
     async with Reading.open(place.url) as reading:
         frame = await known(reading, Scene(), name_of(default_policy()), 5, 30)
-    assert remembered.tally_of(frame) == tally
+    assert recorded_rollouts.tally_of(frame) == tally
 
 
 async def test_what_is_not_to_be_remembered_leaves_no_trace_beside_what_is(tmp_path: Path) -> None:

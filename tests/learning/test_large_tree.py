@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pycrorm_async.learning.default_policy import default_policy
-from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policy import PickUpChoice, Policy
-from pycrorm_async.learning.policy_file import load_policy, name_of, save_policy
-from pycrorm_async.learning.tree import learn
+from pycrorm_async.learning.policies.default_policy import default_policy
+from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policies.policy_file import load_policy, name_of, save_policy
+from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.world.enums import Arms
 from tests.learning.rollouts import frame_of
 

@@ -11,16 +11,16 @@ from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition
 from pycrorm_async.learning import MoveAndPickUp, Policy, Rectangle, Region, Scene, default_policy
-from pycrorm_async.learning.grounding import free_and_visible, rectangles
-from pycrorm_async.learning.marginals import Linear
-from pycrorm_async.learning.policy import GRASPS, Leaf, PickUpChoice
-from pycrorm_async.learning.scene import Stage
+from pycrorm_async.learning.policies.marginals import Linear
+from pycrorm_async.learning.policies.policy import GRASPS, Leaf, PickUpChoice
+from pycrorm_async.learning.rollouts.feasible_places import free_and_visible, rectangles
+from pycrorm_async.learning.rollouts.scene import Stage
 from pycrorm_async.plan import MoveTCPMotion, Retry
+from pycrorm_async.plan.current_robot import robot_here
 from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.failures import ManipulationGoalInCollision, ObjectUnreachable
-from pycrorm_async.plan.here import robot_here
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.engine import engine
+from pycrorm_async.world.bullet_loader import engine
 
 IN_KITCHEN = Scene(kitchen=True, torso_height=0.3)
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import PolicyDamaged, PolicyFileRefused
-from pycrorm_async.learning.default_policy import default_policy
-from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.marginals import Linear, Normal
-from pycrorm_async.learning.policy import Leaf, Policy
-from pycrorm_async.learning.policy_file import load_policy, save_policy
+from pycrorm_async.learning.policies.default_policy import default_policy
+from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.policies.marginals import Linear, Normal
+from pycrorm_async.learning.policies.policy import Leaf, Policy
+from pycrorm_async.learning.policies.policy_file import load_policy, save_policy
 from pycrorm_async.world.enums import Arms, Grasp
 
 LEARNED = Policy(
@@ -39,7 +39,7 @@ for name in ("jpt", "pandas", "scipy", "matplotlib"):
     sys.modules[name] = None
 from pathlib import Path
 import numpy as np
-from pycrorm_async.learning.policy_file import load_policy
+from pycrorm_async.learning.policies.policy_file import load_policy
 policy = load_policy(Path(sys.argv[1]))
 choices = policy.sample(np.random.default_rng(8), 500)
 print(policy.likelihood(choices).tolist())

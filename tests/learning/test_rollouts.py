@@ -23,14 +23,14 @@ from pycrorm_async.learning import (
     default_policy,
     learn,
     name_of,
-    remembered,
     rollouts_question,
 )
-from pycrorm_async.learning.rollouts import BatchRolloutActionPerformable, randomness
+from pycrorm_async.learning.rollouts import recorded_rollouts
+from pycrorm_async.learning.rollouts.rollouts import BatchRolloutActionPerformable, randomness
 from pycrorm_async.orm import BatchRolloutAction, PickUpAction, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import collected_tree
 from pycrorm_async.world import Grasp, ObjectType
-from pycrorm_async.world.robot import Limits
+from pycrorm_async.world.robots.robot_description import Limits
 from tests.learning.rollouts import works
 
 PATIENT = Settings(flush_timeout_s=60)
@@ -109,7 +109,7 @@ async def test_what_is_remembered_is_what_was_counted_with_the_stage_each_failed
         await rolled_out(50, first=150)  # in an episode of its own
         await rolled_out(30, seed=1)  # other ones
         frame = await frame_of(memory)
-        assert remembered.tally_of(frame) == counted[0] + again(150, 50)
+        assert recorded_rollouts.tally_of(frame) == counted[0] + again(150, 50)
         assert frame["index"].tolist() == list(range(200))
         assert set(frame.policy) == {name_of(default_policy())}
         choices = [default_policy().sample(randomness(69, index))[0] for index in range(200)]
@@ -118,7 +118,7 @@ async def test_what_is_remembered_is_what_was_counted_with_the_stage_each_failed
         np.testing.assert_allclose(frame.object_x, [each.relative_x for each in choices], atol=1e-9)
         np.testing.assert_allclose(frame.object_y, [each.relative_y for each in choices], atol=1e-9)
         np.testing.assert_allclose(frame.height, 0.9, atol=1e-9)
-        stages = remembered.stages_of(frame)
+        stages = recorded_rollouts.stages_of(frame)
         assert stages == await by_node_arithmetic(memory, frame)
         assert sum(stages.values()) == sum(frame.status == "FAILED")
         async with memory.session() as session:
@@ -163,7 +163,7 @@ async def test_each_rollout_can_be_an_episode_of_its_own(tmp_path: Path) -> None
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         tally = await rolled_out(12, each_in=memory)
         frame = await frame_of(memory)
-        assert remembered.tally_of(frame) == tally
+        assert recorded_rollouts.tally_of(frame) == tally
         assert frame["index"].tolist() == list(range(12))
         episodes = await memory.reading.episodes()
         assert [each.description.split(" under")[0] for each in episodes] == [f"rollout {index}" for index in range(12)]
@@ -176,7 +176,7 @@ async def test_told_to_stop_it_ends_before_the_next_one(tmp_path: Path) -> None:
         assert tally.rollouts == 7
         frame = await frame_of(memory)
         assert frame["index"].tolist() == list(range(7))
-        left = list(remembered.missing(frame["index"], 12, at_once=3))
+        left = list(recorded_rollouts.missing(frame["index"], 12, at_once=3))
         assert left == [(7, 3), (10, 2)]
         assert (await rolled_out(5, stop=lambda: True)).rollouts == 0
 
@@ -199,7 +199,7 @@ async def test_what_is_interrupted_in_the_middle_does_not_count_and_is_done_agai
                 attempts += 1
                 stage.reset()
                 if attempts == 4:
-                    monkeypatch.setattr("pycrorm_async.plan.simulated.solve", raising)
+                    monkeypatch.setattr("pycrorm_async.plan.motions.simulated_robot.solve", raising)
 
             def raising(*_: object, **__: object) -> None:
                 raise Enough
@@ -220,7 +220,7 @@ async def test_rollouts_that_were_done_twice_count_once(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         for first, count in ((0, 20), (10, 20)):
             await rolled_out(count, first=first)
-        frame = remembered.once(await frame_of(memory))
+        frame = recorded_rollouts.once(await frame_of(memory))
         assert frame["index"].tolist() == list(range(30))
 
 
@@ -290,7 +290,7 @@ def test_rates_come_with_an_interval() -> None:
 
 
 def test_what_is_missing_comes_in_runs() -> None:
-    assert list(remembered.missing([], 5, at_once=2)) == [(0, 2), (2, 2), (4, 1)]
-    assert list(remembered.missing([0, 1, 5], 8, at_once=10)) == [(2, 3), (6, 2)]
-    assert list(remembered.missing(range(8), 8, at_once=10)) == []
-    assert list(remembered.missing([9], 3, at_once=10)) == [(0, 3)]
+    assert list(recorded_rollouts.missing([], 5, at_once=2)) == [(0, 2), (2, 2), (4, 1)]
+    assert list(recorded_rollouts.missing([0, 1, 5], 8, at_once=10)) == [(2, 3), (6, 2)]
+    assert list(recorded_rollouts.missing(range(8), 8, at_once=10)) == []
+    assert list(recorded_rollouts.missing([9], 3, at_once=10)) == [(0, 3)]

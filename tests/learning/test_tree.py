@@ -15,11 +15,11 @@ import pandas as pd
 import pytest
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra, NotEnoughExperience
-from pycrorm_async.learning.default_policy import default_policy
-from pycrorm_async.learning.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policy import PickUpChoice, Policy
-from pycrorm_async.learning.policy_file import save_policy
-from pycrorm_async.learning.tree import learn
+from pycrorm_async.learning.policies.default_policy import default_policy
+from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policies.policy_file import save_policy
+from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.world.enums import Arms, Grasp
 from tests.learning.rollouts import frame_of, works
 
@@ -174,7 +174,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def state():
     generators = random.getstate(), repr(numpy.random.get_state(legacy=False))
     return generators, list(warnings.filters), signal.getsignal(signal.SIGINT), threading.enumerate(), sys.excepthook
-from pycrorm_async.learning.tree import learn
+from pycrorm_async.learning.policies.tree import learn
 assert "jpt" not in sys.modules
 before = state()
 numbers = [number / 30 for number in range(30)]

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from pycrorm_async import Settings
-from pycrorm_async.daemon import serve
+from pycrorm_async.operations.daemon import serve
 
 QUICK = Settings(sync_interval_ms=5, flush_timeout_s=60)
 

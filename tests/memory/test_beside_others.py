@@ -15,8 +15,8 @@ from pycrorm_async.errors import (
     UnknownEpisode,
 )
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.plan.ports import recorder
-from pycrorm_async.world.watch import watcher
+from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.world.observers import watcher
 from tests.commands import environment
 from tests.memory.notes import NoteActionPerformable, texts, url_of
 

@@ -14,7 +14,6 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, UserView, recover
-from pycrorm_async.daemon import _take, serve
 from pycrorm_async.errors import (
     CallerError,
     DatabaseForeign,
@@ -24,11 +23,12 @@ from pycrorm_async.errors import (
     SpoolForeign,
     SpoolUnavailable,
 )
+from pycrorm_async.operations.daemon import _take, serve
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.living import LiveQueue
-from pycrorm_async.queue.spool import RecorderFolder
-from pycrorm_async.queue.stored import StoredSegments
+from pycrorm_async.queue.files.spool import RecorderFolder
+from pycrorm_async.queue.retention.stored_segments import StoredSegments
+from pycrorm_async.queue.sources.live_source import LiveQueue
 from pycrorm_async.writer.ports import Held
 from tests.databases import ask, ask_to_change
 from tests.memory.daemons import QUICK, Daemon
@@ -307,7 +307,7 @@ async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folder
     async with memory_at(database_url, spool) as memory:
         await NoteActionPerformable("a").perform()
         with monkeypatch.context() as patch:
-            patch.setattr("pycrorm_async.daemon._take", take)
+            patch.setattr("pycrorm_async.operations.daemon._take", take)
             first = Daemon(database_url, spool)
             assert await asyncio.to_thread(looking.wait, 60)
             first.task.cancel()

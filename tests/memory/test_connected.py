@@ -17,7 +17,7 @@ from sqlalchemy import select
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import NavigateAction, ProcessMetaData
-from pycrorm_async.plan.ports import recorder
+from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.errors import NoWorld, WorldClosed
 from tests.commands import pycrorm

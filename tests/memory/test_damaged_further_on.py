@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory, recover
-from pycrorm_async.daemon import _Folders
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.happenings import EpisodeStarted, ObjectAdded, PoseValue
+from pycrorm_async.events.types import EpisodeStarted, ObjectAdded, PoseValue
+from pycrorm_async.operations.daemon import _Folders
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.repair import repair_folder
+from pycrorm_async.queue.maintenance.repair import repair_folder
 from pycrorm_async.store.address import DatabaseAddress
 from tests.databases import ask
 from tests.memory.daemons import QUICK, Daemon

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory
-from pycrorm_async.config import Writer
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue import Spool
+from pycrorm_async.settings import Writer
 from tests.databases import ask
 from tests.memory.daemons import QUICK, Daemon
 from tests.memory.notes import NoteActionPerformable, texts

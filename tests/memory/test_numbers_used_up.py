@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.adoption import recover
-from pycrorm_async.copying import copy_episodes
 from pycrorm_async.errors import EpisodeParked
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
-from pycrorm_async.queue.spool import Spool
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.destination import recover
+from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import answer, pycrorm

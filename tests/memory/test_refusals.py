@@ -22,9 +22,9 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.events.codec import encode, fingerprint
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.happenings import NodeStarted
+from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.plan.ports import recorder
+from pycrorm_async.plan.execution.observer import recorder
 from tests.commands import answer
 from tests.memory.notes import NoteActionPerformable, texts, url_of
 

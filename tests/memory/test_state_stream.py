@@ -21,7 +21,7 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     simulated_robot,
 )
-from pycrorm_async.plan.here import robot_here
+from pycrorm_async.plan.current_robot import robot_here
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.commands import environment
 from tests.memory.notes import url_of
@@ -152,7 +152,7 @@ def test_a_forked_child_goes_on_without_sampling_and_the_parent_with_it(tmp_path
         "from pycrorm_async import Memory, Settings\n"
         "from pycrorm_async.orm import StateSample\n"
         "from pycrorm_async.plan import *\n"
-        "from pycrorm_async.plan.here import robot_here\n"
+        "from pycrorm_async.plan.current_robot import robot_here\n"
         "from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose\n"
         "from tests.memory.test_state_stream import Driving\n"
         "class Forking(Driving):\n"

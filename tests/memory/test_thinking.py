@@ -13,7 +13,7 @@ from pathlib import Path
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.adoption import recover
+from pycrorm_async.operations.destination import recover
 from pycrorm_async.orm import (
     Action,
     Attachment,
@@ -33,7 +33,7 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.plan.object_designators import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from pycrorm_async.world.pose import yaw_quaternion

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Mapped, mapped_column, undefer
 from pycrorm_async import Memory, UserView
 from pycrorm_async.orm import Action, Designator, PickUpAction, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
-from pycrorm_async.plan.objects import BelieveObject
+from pycrorm_async.plan.object_designators import BelieveObject
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from tests.commands import environment
 from tests.memory.notes import NoteActionPerformable, url_of

@@ -18,11 +18,11 @@ import msgspec
 import pytest
 
 from pycrorm_async import Memory, Settings
-from pycrorm_async.daemon import serve
+from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.fold_worker import Assignment, Failure, Write, _Fold
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.queue.spool import Spool
+from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pycrorm_async.projections import folding
-from pycrorm_async.projections.own import Changes, Event, Projection
+from pycrorm_async.projections.custom.projection import Changes, Event, Projection
+from pycrorm_async.projections.run import batch_fold
 
 TRAP = "PYCRORM_TRAP"
 
@@ -61,4 +61,4 @@ def _trapped(write_rows: Callable[..., Any]) -> Callable[..., Any]:
 
 
 if TRAP in os.environ and os.environ[TRAP + "_DAEMON"] != str(os.getpid()):
-    vars(folding)["write_rows"] = _trapped(vars(folding)["write_rows"])
+    vars(batch_fold)["write_rows"] = _trapped(vars(batch_fold)["write_rows"])

@@ -11,7 +11,7 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from sqlalchemy.orm import selectinload, undefer
 
 import pycrorm_async.orm
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
     EpisodeStarted,

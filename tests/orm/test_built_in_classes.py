@@ -8,11 +8,12 @@ from sqlalchemy import Table, inspect
 import pycrorm_async.orm
 from pycrorm_async.hooks.declaration import declared_type
 from pycrorm_async.orm import Action, Designator, Motion
-from pycrorm_async.plan import actions, fetching, manipulation, motions
-from pycrorm_async.projections.classes import mapped_leaves
-from pycrorm_async.projections.layout import Layout
+from pycrorm_async.plan.actions import basic, manipulation, transport
+from pycrorm_async.plan.motions import motions
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 
-MODULES = (actions, manipulation, fetching, motions)
+MODULES = (basic, manipulation, transport, motions)
 PERFORMABLES = [getattr(module, name) for module in MODULES for name in module.__all__]
 
 

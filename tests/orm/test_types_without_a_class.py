@@ -17,7 +17,7 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from sqlalchemy.orm import Mapped, mapped_column
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     NodeStarted,
     ObjectAdded,
@@ -26,9 +26,9 @@ from pycrorm_async.events.happenings import (
 )
 from pycrorm_async.orm import Action, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.projections.layout import Layout
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.union import unite
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms

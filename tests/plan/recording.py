@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-from pycrorm_async.plan.ports import Candidate, Seen, Thought, recorder, thinking
+from pycrorm_async.plan.execution.observer import Candidate, Seen, Thought, recorder, thinking
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, current_node
 from pycrorm_async.world import ObjectType
 

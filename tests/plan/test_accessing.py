@@ -18,12 +18,12 @@ from pycrorm_async.plan import (
     OpenActionPerformable,
     ParkArmsActionPerformable,
 )
+from pycrorm_async.plan.execution.observer import Candidate
 from pycrorm_async.plan.failures import (
     EnvironmentManipulationImpossible,
     EnvironmentUnreachable,
     PerceptionObjectNotInWorld,
 )
-from pycrorm_async.plan.ports import Candidate
 from pycrorm_async.world import Arms, Pose
 from pycrorm_async.world.errors import UnknownLink
 from tests.plan.conftest import Scene

@@ -40,7 +40,7 @@ from pycrorm_async.plan.failures import (
     PerceptionObjectNotInWorld,
     TorsoGoalUnreachable,
 )
-from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.plan.object_designators import designator_of
 from pycrorm_async.plan.task_tree import CollectedTree
 from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose
 from pycrorm_async.world.pose import rotated, yaw_quaternion

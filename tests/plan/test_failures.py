@@ -17,7 +17,7 @@ from pycrorm_async.plan.failures import (
     in_words,
     is_plan_failure,
 )
-from pycrorm_async.plan.resources import Resource
+from pycrorm_async.plan.language.resources import Resource
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pycrorm_async.plan import ObjectDesignator, ObjectPart
-from pycrorm_async.plan.accessing import (
+from pycrorm_async.plan.failures import EnvironmentManipulationImpossible, PerceptionObjectNotInWorld
+from pycrorm_async.plan.geometry.articulation import (
     Handle,
     closed_position,
     grasp_pose,
@@ -17,7 +18,6 @@ from pycrorm_async.plan.accessing import (
     handle_poses,
     opened_position,
 )
-from pycrorm_async.plan.failures import EnvironmentManipulationImpossible, PerceptionObjectNotInWorld
 from pycrorm_async.world import Object, ObjectType, Pose
 from pycrorm_async.world.errors import UnknownLink
 from tests.plan.conftest import Scene

@@ -27,7 +27,6 @@ from pycrorm_async.plan import (
     TryInOrder,
     collected_tree,
 )
-from pycrorm_async.plan.composing import Composable
 from pycrorm_async.plan.failures import (
     IllPosedGoalFailure,
     NotALanguageExpression,
@@ -35,7 +34,8 @@ from pycrorm_async.plan.failures import (
     ObjectUnreachable,
     TorsoGoalUnreachable,
 )
-from pycrorm_async.plan.outcome import Attempt
+from pycrorm_async.plan.language.operators import Composable
+from pycrorm_async.plan.language.outcome import Attempt
 from pycrorm_async.world import Arms, GripperState
 from tests.plan.conftest import Scene
 from tests.plan.told import Around, Step, drawn, failing

@@ -25,7 +25,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose, WorldMode
-from pycrorm_async.world.watch import current_world
+from pycrorm_async.world.observers import current_world
 from tests.plan.conftest import Scene
 from tests.plan.recording import Recording
 from tests.plan.told import Around, Step, drawn

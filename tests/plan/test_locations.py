@@ -27,6 +27,7 @@ from pycrorm_async.plan import (
     ResolutionError,
     SemanticCostmapLocation,
 )
+from pycrorm_async.plan.execution.observer import Candidate
 from pycrorm_async.plan.failures import (
     LookingHighLevelFailure,
     ObjectUnavailable,
@@ -34,12 +35,11 @@ from pycrorm_async.plan.failures import (
     PerceptionObjectNotInWorld,
     ReachabilityFailure,
 )
-from pycrorm_async.plan.objects import designator_of
-from pycrorm_async.plan.ports import Candidate
+from pycrorm_async.plan.object_designators import designator_of
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.errors import UnknownLink
+from pycrorm_async.world.models.primitives import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.shapes import box_urdf
 from tests.plan.conftest import Scene
 from tests.plan.recording import Recording
 

@@ -18,8 +18,8 @@ from pycrorm_async.plan import (
     TaskStatus,
     collected_tree,
 )
+from pycrorm_async.plan.execution.observer import thinking
 from pycrorm_async.plan.failures import NotALanguageExpression
-from pycrorm_async.plan.ports import thinking
 from pycrorm_async.world import Pose, current_world
 from tests.plan.conftest import Scene
 from tests.plan.told import Step

@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
-from pycrorm_async.plan.ports import recorder
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collected_tree, current_node
 from tests.plan.recording import Recording
 

@@ -30,7 +30,7 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
 )
 from pycrorm_async.plan.errors import ResourcesNotAMethod
-from pycrorm_async.plan.resources import Resource
+from pycrorm_async.plan.language.resources import Resource
 from pycrorm_async.world import Arms, Grasp, GripperState, Pose
 from tests.plan.conftest import Scene
 

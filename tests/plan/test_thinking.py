@@ -29,9 +29,9 @@ from pycrorm_async.plan import (
     collected_tree,
     simulated_robot,
 )
+from pycrorm_async.plan.execution.observer import thinking
 from pycrorm_async.plan.failures import PerceptionObjectNotInWorld
-from pycrorm_async.plan.objects import designator_of, in_world
-from pycrorm_async.plan.ports import thinking
+from pycrorm_async.plan.object_designators import designator_of, in_world
 from pycrorm_async.plan.task_tree import TaskStatus, current_node
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.errors import WorldClosed

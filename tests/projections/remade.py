@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pycrorm_async.events.envelope import LOST, Record
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import parse_episode_id
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     FailureValue,
@@ -17,7 +18,6 @@ from pycrorm_async.events.happenings import (
     ObjectReference,
     RobotValue,
 )
-from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

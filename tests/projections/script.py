@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from pycrorm_async.events.codec import encode, fingerprint
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     FieldDeclared,
     FieldType,
@@ -15,8 +16,7 @@ from pycrorm_async.events.happenings import (
     NodeKind,
     PoseValue,
 )
-from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.store.rows import StoredEvent
+from pycrorm_async.store.stored import StoredEvent
 
 T0_NS = 1_700_000_000_000_000_000
 """2023-11-14 22:13:20 UTC: event n of an episode happens n seconds later."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     CandidateValue,
     DesignatorTypeDeclared,
     EpisodeEnded,
@@ -31,10 +31,10 @@ from pycrorm_async.events.happenings import (
     SeenValue,
     StateSampled,
 )
-from pycrorm_async.projections.fold import CannotFold, fold
-from pycrorm_async.projections.parameters import Designators
-from pycrorm_async.projections.rows import Rows
-from pycrorm_async.projections.tables import COLUMNS
+from pycrorm_async.projections.fold.fold import CannotFold, fold
+from pycrorm_async.projections.fold.parameters import Designators
+from pycrorm_async.projections.fold.row_batch import Rows
+from pycrorm_async.projections.schema.tables import COLUMNS
 from tests.projections.script import (
     NAVIGATE,
     PICK_UP,

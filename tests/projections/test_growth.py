@@ -11,23 +11,23 @@ import msgspec
 import pytest
 from sqlalchemy import text
 
-from pycrorm_async.copying import copy_episodes
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.fields import column_name, table_name
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import SLOT_FIRST_FIELD
+from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeStarted,
     FieldDeclared,
     FieldType,
     NodeStarted,
 )
-from pycrorm_async.events.ids import SLOT_FIRST_FIELD
-from pycrorm_async.projections import growth, layout
+from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.tables import index_name, physical_name
-from pycrorm_async.projections.verify import Verified, verify
+from pycrorm_async.projections.schema import growth, layout
+from pycrorm_async.projections.schema.tables import index_name, physical_name
+from pycrorm_async.projections.verify.verify import Verified, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server

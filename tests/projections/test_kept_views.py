@@ -6,11 +6,11 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import EpisodeEnded, NodeEnded, NodeStarted
+from pycrorm_async.events.types import EpisodeEnded, NodeEnded, NodeStarted
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.views import UserView
-from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.log import EventLog
 from tests.projections.asking import ask, names
 from tests.projections.script import SAYING, Script, declarations, mixed, name_of

@@ -7,8 +7,8 @@ from itertools import permutations
 import pytest
 from msgspec.structs import replace
 
-from pycrorm_async.events.happenings import DesignatorTypeDeclared
-from pycrorm_async.projections.layout import Contradictory, Layout, Leaf
+from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.projections.schema.layout import Contradictory, Layout, Leaf
 from tests.projections.script import PICK_UP, SAYING, declared, field
 
 

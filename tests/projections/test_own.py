@@ -15,17 +15,17 @@ from sqlalchemy import column, func, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import EpisodeStarted, NodeEnded, NodeStarted
+from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.memory import Memory
-from pycrorm_async.projections.comparing import Difference
-from pycrorm_async.projections.fold import CannotFold
-from pycrorm_async.projections.own import Changes, Event, Projection
-from pycrorm_async.projections.own_rows import OwnRows
-from pycrorm_async.projections.own_tables import states
+from pycrorm_async.projections.custom.projection import Changes, Event, Projection
+from pycrorm_async.projections.custom.projection_rows import OwnRows
+from pycrorm_async.projections.custom.projection_tables import states
+from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
-from pycrorm_async.projections.verify import verify
-from pycrorm_async.projections.views import UserView
+from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.projections.verify.row_comparison import Difference
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -373,7 +373,7 @@ def test_a_projection_that_cannot_be_is_refused_at_once(attributes: dict[str, An
 async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pycrorm_async.projections.own_verify._PART_EVENTS", 10)  # several parts
+    monkeypatch.setattr("pycrorm_async.projections.verify.verify_custom._PART_EVENTS", 10)  # several parts
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 5)))]
     await folded(log, [*records, *tries(5).records[:6]], GraspRate())
     found = await verify(log, projections=[GraspRate()])

@@ -9,7 +9,8 @@ import pytest
 
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     FieldDeclared,
@@ -17,13 +18,12 @@ from pycrorm_async.events.happenings import (
     NodeEnded,
     NodeStarted,
 )
-from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.projections import pipeline as pipelines
-from pycrorm_async.projections.folding import Prepared
-from pycrorm_async.projections.pipeline import FoldPipeline, Outlook
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.run import pipeline
+from pycrorm_async.projections.run.batch_fold import Prepared
+from pycrorm_async.projections.run.pipeline import FoldPipeline, Outlook
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span
+from pycrorm_async.store.stored import Span
 from tests.projections.asking import ask
 from tests.projections.script import SAYING, Script, declarations, declared, field, mixed, name_of, row
 
@@ -101,7 +101,7 @@ class Eager(InLoop):
 
 @pytest.fixture(autouse=True)
 def _any_batch_is_prepared_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipelines, "LOOKAHEAD_EVENTS_MIN", 1)
+    monkeypatch.setattr(pipeline, "LOOKAHEAD_EVENTS_MIN", 1)
 
 
 @pytest.fixture

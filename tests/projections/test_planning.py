@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory
-from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.operations.rebuild import rebuild_memory
 from tests.databases import Server, ask, ask_to_change
 
 VIEW = 'SELECT arm, relative_x FROM "PickUpWithContextView" WHERE {}'

@@ -8,7 +8,7 @@ import random
 import pytest
 
 from pycrorm_async.errors import DatabaseForeign
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
@@ -25,8 +25,8 @@ from pycrorm_async.events.happenings import (
     PoseValue,
     RobotValue,
 )
-from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
 from pycrorm_async.store.log import EventLog
 from tests.projections.asking import all_rows, ask, names, stored_and_folded
 from tests.projections.script import (

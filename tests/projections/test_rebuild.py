@@ -15,19 +15,20 @@ import pytest
 from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async import Memory, Reading, rebuilding
-from pycrorm_async.config import Settings
+from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
+from pycrorm_async.operations import rebuild as rebuilding
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
-from pycrorm_async.projections.folding import _fold_all
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.views import UserView
-from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.projections.run.batch_fold import _fold_all
+from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.rows import Span, StoredEvent
+from pycrorm_async.store.stored import Span, StoredEvent
 from tests.databases import Server, ask, ask_to_change
 from tests.projections.remade import TYPES, folded_elsewhere, lost, parking, picking, store, str_of, traces, whispering
 from tests.promises.test_random_plans import play

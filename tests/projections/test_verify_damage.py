@@ -12,7 +12,7 @@ import pytest
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.codec import encode
-from pycrorm_async.projections.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import Verified, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change

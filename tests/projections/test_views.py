@@ -13,7 +13,7 @@ from sqlalchemy.dialects import sqlite
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     FailureValue,
     NodeEnded,
@@ -26,10 +26,10 @@ from pycrorm_async.events.happenings import (
 )
 from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextView, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
-from pycrorm_async.projections.generations import current_generation
-from pycrorm_async.projections.layout import Contradictory
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.views import UserView, view_texts
+from pycrorm_async.projections.schema.generations import current_generation
+from pycrorm_async.projections.schema.layout import Contradictory
+from pycrorm_async.projections.schema.user_views import UserView, view_texts
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.projections.asking import ask, names, stored_and_folded

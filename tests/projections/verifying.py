@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import pytest
 
 from pycrorm_async.events.envelope import LOST
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
@@ -33,10 +33,10 @@ from pycrorm_async.events.happenings import (
     SeenValue,
     StateSampled,
 )
-from pycrorm_async.projections import verify as verifying
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
-from pycrorm_async.projections.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import verify as verifying
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change

@@ -15,18 +15,18 @@ import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.adoption import recover
-from pycrorm_async.copying import copy_episodes
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
 from pycrorm_async.events.codec import Decoder
-from pycrorm_async.events.happenings import EVENT_TYPES, ObjectAdded
+from pycrorm_async.events.types import EVENT_TYPES, ObjectAdded
 from pycrorm_async.events.upcasters import Upcaster
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections import fold
-from pycrorm_async.projections.generations import PROJECTION_VERSION
-from pycrorm_async.projections.verify import verify
-from pycrorm_async.rebuilding import rebuild_memory
+from pycrorm_async.projections.fold.fold import fold
+from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog

@@ -33,7 +33,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan import MoveTorsoAction as MoveTorso
 from pycrorm_async.plan import NavigateAction as Navigate
-from pycrorm_async.plan.ports import PlanObserver, recorder
+from pycrorm_async.plan.execution.observer import PlanObserver, recorder
 from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, Pose
 from tests.memory.notes import NoteActionPerformable

@@ -27,7 +27,7 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import ActionAbstract, PlaceActionPerformable
-from pycrorm_async.plan.ports import PlanObserver, Thought, recorder
+from pycrorm_async.plan.execution.observer import PlanObserver, Thought, recorder
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
@@ -242,7 +242,7 @@ async def test_the_same_plan_runs_without_a_memory_and_records_nothing(tmp_path:
 
 
 async def test_the_plan_runs_on_the_mesh_model_as_well(tmp_path: Path) -> None:
-    from pycrorm_async.world.robot_urdf import pr2_mesh_urdf_path
+    from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path
 
     async with Memory.open(f"sqlite:///{tmp_path}/demo.db") as memory:
         async with memory.episode(description="mesh") as episode:

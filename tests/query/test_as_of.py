@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, UnknownEpisode
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
@@ -37,9 +37,9 @@ from pycrorm_async.events.happenings import (
     StateSampled,
 )
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.query.moment import AttachmentThen, Moment, NodeThen, RobotThen
-from pycrorm_async.query.questions import NodeSummary
+from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.snapshot import AttachmentThen, Moment, NodeThen, RobotThen
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.pose import Pose
 from tests.projections.asking import stored_and_folded

@@ -9,7 +9,7 @@ from sqlalchemy import ForeignKey, select
 from sqlalchemy.orm import Mapped, mapped_column
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import DesignatorTypeDeclared, NodeStarted
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.orm import Action, Designator, Motion, TaskTreeNode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog

@@ -9,7 +9,7 @@ import pytest
 from sqlalchemy import Connection, event
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EpisodeStarted,
     FailureValue,
     NodeEnded,

@@ -14,7 +14,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, MissingExtra, UnknownEpisode
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     FailureValue,
@@ -26,7 +26,7 @@ from pycrorm_async.events.happenings import (
 )
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, PickUpWithContextView, Pose, TaskTreeNode
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.query.questions import EpisodeSummary, NodeSummary
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms

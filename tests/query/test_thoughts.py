@@ -9,7 +9,8 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import DBAPIError
 
 from pycrorm_async.errors import UnknownEpisode
-from pycrorm_async.events.happenings import (
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
@@ -30,13 +31,12 @@ from pycrorm_async.events.happenings import (
     SeenValue,
     StateSampled,
 )
-from pycrorm_async.events.ids import episode_text
 from pycrorm_async.orm import Action, Motion, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.tables import COLUMNS
-from pycrorm_async.projections.views import UserView
-from pycrorm_async.query.questions import Thinker
+from pycrorm_async.projections.schema.tables import COLUMNS
+from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.query.named_queries import Thinker
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from tests.projections.asking import ask, names

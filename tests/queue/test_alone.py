@@ -11,8 +11,8 @@ import pytest
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import InternalError, SpoolFull
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.queue.bell import Bell
-from pycrorm_async.queue.segment import Segment
+from pycrorm_async.queue.files.segment import Segment
+from pycrorm_async.queue.live.notifier import Bell
 from tests.queue.writing import DECLARED, MONOTONIC_NS, WALL_NS, drain, make, node, started
 
 PATIENCE_S = 20.0

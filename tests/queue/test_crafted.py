@@ -19,12 +19,12 @@ from pycrorm_async.errors import (
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.capacity import Capacity
-from pycrorm_async.queue.inspection import inspect_recorder, inspect_spool
-from pycrorm_async.queue.progress import PROGRESS, Progress
-from pycrorm_async.queue.repair import repair_folder
-from pycrorm_async.queue.scan import scan
-from pycrorm_async.queue.segment import SEGMENT_BYTES_MAX, read_segment, segment_numbers
+from pycrorm_async.queue.files.drain_status import PROGRESS, Progress
+from pycrorm_async.queue.files.scan import scan
+from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, read_segment, segment_numbers
+from pycrorm_async.queue.live.capacity import Capacity
+from pycrorm_async.queue.maintenance.inspection import inspect_recorder, inspect_spool
+from pycrorm_async.queue.maintenance.repair import repair_folder
 from tests.queue.crafting import change_a_frame, change_the_header
 from tests.queue.writing import DECLARED, RECORDER, SMALL, Author, node, recover, started
 

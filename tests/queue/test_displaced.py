@@ -16,8 +16,8 @@ import pytest
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.queue import LiveQueue, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.folder import finish_folder
-from pycrorm_async.queue.inspection import inspect_spool
+from pycrorm_async.queue.files.recorder_folder import finish_folder
+from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from tests.crash.test_queue_disk import SLOW
 from tests.queue.writing import SMALL, copy_beside_recording, drain, ended, make, node, recover, started
 
@@ -183,7 +183,7 @@ async def test_losses_are_named_also_when_the_new_folder_goes_before_it_has_its_
             delete(unfinished)
         return finish_folder(unfinished, instead_of=instead_of)
 
-    monkeypatch.setattr("pycrorm_async.queue.relocation.finish_folder", finish)
+    monkeypatch.setattr("pycrorm_async.queue.live.relocation.finish_folder", finish)
     delete_the_folder(queue)
     raised: list[str] = []
     while not raised or queue.synced < queue.written or "goes on in" not in (queue.setback or ""):

@@ -11,13 +11,13 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.config import FileAccess
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.queue.file_access import open_file
-from pycrorm_async.queue.refused import RefusedRecords
-from pycrorm_async.queue.spool import Spool
-from pycrorm_async.queue.stored import StoredSegments
+from pycrorm_async.queue.files.file_access import open_file
+from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.retention.stored_segments import StoredSegments
+from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.settings import FileAccess
 from tests.memory.notes import NoteActionPerformable
 
 EPISODE = parse_episode_id("0190a000-0000-7000-8000-000000000002")

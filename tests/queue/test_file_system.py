@@ -9,8 +9,8 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import SpoolUnavailable
-from pycrorm_async.queue import file_system
-from pycrorm_async.queue.file_system import check_file_system, file_system_type
+from pycrorm_async.queue.files import file_system
+from pycrorm_async.queue.files.file_system import check_file_system, file_system_type
 from tests.memory.notes import NoteActionPerformable, texts
 from tests.queue.writing import make
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.queue import heads as module
-from pycrorm_async.queue.heads import AcknowledgedHeads
+from pycrorm_async.queue.retention import acknowledged_heads
+from pycrorm_async.queue.retention.acknowledged_heads import AcknowledgedHeads
 from tests.queue.writing import WALL_NS, episode
 
 
@@ -68,8 +68,8 @@ def test_a_line_with_any_one_bit_flipped_is_left_out(tmp_path: Path) -> None:
 def test_a_large_file_is_compacted_and_no_line_of_another_process_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_FILE_BYTES_MAX", 4_000)
-    monkeypatch.setattr(module, "_EPISODES_MAX", 20)
+    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 4_000)
+    monkeypatch.setattr(acknowledged_heads, "_EPISODES_MAX", 20)
 
     def run(first: int) -> None:
         heads = heads_in(tmp_path)
@@ -94,7 +94,7 @@ def test_a_file_with_the_inode_of_the_one_it_replaced_is_read_from_its_beginning
     for head in range(3):
         mine.note({episode(1): (1, head)})
     mine.refresh()
-    monkeypatch.setattr(module, "_FILE_BYTES_MAX", 0)  # each note compacts
+    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 0)  # each note compacts
     for number in range(2, 6):
         other.note({episode(number): (number, 1)})
     mine._inode = (tmp_path / "heads").stat().st_ino  # as ext4 gives it, sooner or later
@@ -105,8 +105,8 @@ def test_a_file_with_the_inode_of_the_one_it_replaced_is_read_from_its_beginning
 def test_what_is_too_old_or_too_much_is_forgotten_but_for_the_highest_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_FILE_BYTES_MAX", 1_000)
-    monkeypatch.setattr(module, "_EPISODES_MAX", 5)
+    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 1_000)
+    monkeypatch.setattr(acknowledged_heads, "_EPISODES_MAX", 5)
     heads_in(tmp_path).note({episode(1): (4_000, 9), episode(2): (2, 9)})
     later = heads_in(tmp_path, wall_ns=WALL_NS + 3601 * 10**9)
     for number in range(3, 24):

@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.inspection import OpenEpisode, inspect_spool
-from pycrorm_async.queue.repair import repair_folder
+from pycrorm_async.queue.maintenance.inspection import OpenEpisode, inspect_spool
+from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.settings import Settings
 from tests.queue.writing import DECLARED, RECORDER, WALL_NS, Author, ended, episode, node, overwrite, started
 
 

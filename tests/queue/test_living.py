@@ -17,7 +17,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue import LiveQueue, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.progress import Drained, Progress, Recorded
+from pycrorm_async.queue.files.drain_status import Drained, Progress, Recorded
 from tests.queue.test_room import ALL, ORDINARY, PAYLOAD, fill
 from tests.queue.writing import (
     DECLARED,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.queue.locks import FileLock, is_locked
+from pycrorm_async.queue.files.locks import FileLock, is_locked
 
 
 def test_a_lock_has_one_holder_and_can_be_taken_when_it_was_let_go(tmp_path: Path) -> None:
@@ -34,7 +34,7 @@ def test_a_lock_that_is_not_there_is_not_made_unless_asked_for(tmp_path: Path) -
 def test_the_kernel_lets_go_when_the_holder_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "alive"
     program = (
-        "import sys, pathlib; from pycrorm_async.queue.locks import FileLock;"
+        "import sys, pathlib; from pycrorm_async.queue.files.locks import FileLock;"
         "lock = FileLock.take(pathlib.Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen([sys.executable, "-c", program, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.queue.progress import Drained, Note, Progress, Recorded
+from pycrorm_async.queue.files.drain_status import Drained, Note, Progress, Recorded
 
 SAID = Drained(7, 5, Note(given_up="refused", away="locked", stopped={"an episode": "why"}))
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import EpisodeRefused, InternalError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
-from pycrorm_async.hooks.ports import EventSink
+from pycrorm_async.hooks.event_sink import EventSink
 from pycrorm_async.queue import RecorderQueue, Spool
-from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.settings import Settings
 from pycrorm_async.writer.ports import Source
 from tests.queue.writing import (
     DECLARED,

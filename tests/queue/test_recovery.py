@@ -9,12 +9,12 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.folder import held_by
-from pycrorm_async.queue.frame import CHECKSUM, EVENT, encode
-from pycrorm_async.queue.locks import FileLock
-from pycrorm_async.queue.scan import scan
-from pycrorm_async.queue.sealing import seal, tails
-from pycrorm_async.queue.segment import salt_of
+from pycrorm_async.queue.files.frame import CHECKSUM, EVENT, encode
+from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.recorder_folder import held_by
+from pycrorm_async.queue.files.scan import scan
+from pycrorm_async.queue.files.sealing import seal, tails
+from pycrorm_async.queue.files.segment import salt_of
 from tests.queue.writing import (
     DECLARED,
     RECORDER,

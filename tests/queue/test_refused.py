@@ -9,9 +9,9 @@ from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import LiveQueue, Spool, open_dead
-from pycrorm_async.queue.inspection import inspect_spool
-from pycrorm_async.queue.refused import RefusedRecords
-from pycrorm_async.queue.repair import finish_repairs, repair_folder
+from pycrorm_async.queue.maintenance.inspection import inspect_spool
+from pycrorm_async.queue.maintenance.repair import finish_repairs, repair_folder
+from pycrorm_async.queue.sources.dead_letters import RefusedRecords
 from tests.queue.writing import (
     DECLARED,
     RECORDER,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.queue.segment import (
+from pycrorm_async.queue.files.segment import (
     Last,
     Segment,
     SegmentHeader,

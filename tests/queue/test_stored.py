@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.config import Settings
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from pycrorm_async.queue import stored as stored_module
-from pycrorm_async.queue.inspection import inspect_spool
-from pycrorm_async.queue.offering import stored_recorders, stored_records
-from pycrorm_async.queue.scan import scan
-from pycrorm_async.queue.segment import Segment
-from pycrorm_async.queue.stored import StoredSegments, kept_segments
+from pycrorm_async.queue.files.scan import scan
+from pycrorm_async.queue.files.segment import Segment
+from pycrorm_async.queue.maintenance.inspection import inspect_spool
+from pycrorm_async.queue.retention import stored_segments
+from pycrorm_async.queue.retention.stored_records import stored_recorders, stored_records
+from pycrorm_async.queue.retention.stored_segments import StoredSegments, kept_segments
+from pycrorm_async.settings import Settings
 from tests.queue.writing import (
     DECLARED,
     MONOTONIC_NS,
@@ -120,7 +120,7 @@ async def test_the_oldest_go_when_they_are_too_old_or_too_much(bound: Path, monk
 
     StoredSegments(bound, replace(SMALL, keep_stored_bytes=4 * 4096), wall_ns=hours.wall_ns).prune()
     assert [name for name, _ in kept(bound)] == names[2:]
-    monkeypatch.setattr(stored_module, "FILES_MAX", 2)
+    monkeypatch.setattr(stored_segments, "FILES_MAX", 2)
     StoredSegments(bound, SMALL, wall_ns=hours.wall_ns).prune()
     assert [name for name, _ in kept(bound)] == names[4:]
 

@@ -6,13 +6,13 @@ import shutil
 from pathlib import Path
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.config import Settings
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.queue import LiveQueue, RecorderQueue, RecoveredQueue, open_dead
-from pycrorm_async.queue.appender import Appender
-from pycrorm_async.queue.capacity import Capacity
-from pycrorm_async.queue.folder import MAKING
+from pycrorm_async.queue.files.recorder_folder import MAKING
+from pycrorm_async.queue.live.appender import Appender
+from pycrorm_async.queue.live.capacity import Capacity
+from pycrorm_async.settings import Settings
 
 WALL_NS = 1_700_000_000_123_456_789
 MONOTONIC_NS = 987_654_321

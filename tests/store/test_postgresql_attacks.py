@@ -15,12 +15,12 @@ import pytest
 from sqlalchemy import text
 
 from pycrorm_async import Memory
-from pycrorm_async.adoption import recover
 from pycrorm_async.errors import PycrormError, TablesUntrusted
+from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.verify import verify
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.rebuilding import rebuild_memory
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS

@@ -17,9 +17,9 @@ from urllib.parse import urlsplit
 import pytest
 from sqlalchemy import text
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import engine

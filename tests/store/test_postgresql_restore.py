@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 import pytest
 
 from pycrorm_async import Memory
-from pycrorm_async.adoption import recover
 from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.operations.destination import recover
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.verify import verify
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.backoff import Backoff

@@ -11,12 +11,12 @@ import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.private import private_folder
+from pycrorm_async.store.temporary_database import private_folder
 
 HOLD_ONE = """
 import sys
 from pathlib import Path
-from pycrorm_async.store.private import private_folder
+from pycrorm_async.store.temporary_database import private_folder
 with private_folder(Path(sys.argv[1])) as folder:
     print(folder, flush=True)
     sys.stdin.read()
@@ -107,7 +107,7 @@ def test_many_processes_that_make_and_sweep_at_once_each_have_a_folder(tmp_path:
     script = """
 import sys
 from pathlib import Path
-from pycrorm_async.store.private import private_folder
+from pycrorm_async.store.temporary_database import private_folder
 for _ in range(200):
     with private_folder(Path(sys.argv[1])) as folder:
         (folder / "memory.db").touch(exist_ok=False)
@@ -123,7 +123,7 @@ def test_a_forked_child_that_leaves_the_context_leaves_its_parents_folder(tmp_pa
     script = """
 import os, sys
 from pathlib import Path
-from pycrorm_async.store.private import private_folder
+from pycrorm_async.store.temporary_database import private_folder
 with private_folder(Path(sys.argv[1])) as folder:
     child = os.fork()
     if child:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pycrorm_async.world import Pose
-from pycrorm_async.world.copying import copied, counterpart
+from pycrorm_async.world.world_copy import copied, counterpart
 from tests.plan.conftest import Scene
 
 

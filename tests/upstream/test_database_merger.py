@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory
-from pycrorm_async.copying import copy_episodes
+from pycrorm_async.operations.copy import copy_episodes
 from tests.commands import pycrorm
 from tests.databases import Server, ask
 from tests.plan.conftest import kitchen

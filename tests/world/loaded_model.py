@@ -11,7 +11,7 @@ import pybullet
 
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, product
-from pycrorm_async.world.robot import PR2, Limits
+from pycrorm_async.world.robots.robot_description import PR2, Limits
 
 LINK_WORLD_POSITION, LINK_WORLD_ORIENTATION = 4, 5
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, current_world, watcher
-from pycrorm_async.world.copying import copied, counterpart, original, related
 from pycrorm_async.world.errors import WorldClosed
 from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.world_copy import copied, counterpart, original, related
 from tests.world.witness import CRANE, Witness, crane_links, matrix
 
 TURNED = {"turning": 2.5, "lifting": 0.8, "reaching": 0.3}

@@ -17,10 +17,10 @@ import pycrorm_async
 from pycrorm_async.errors import CallerError, PycrormError
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.enums import Arms, Grasp
-from pycrorm_async.world.kinematics import Unreachable, forward, solve, solve_from
+from pycrorm_async.world.models.pr2 import pr2_urdf
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated, yaw_quaternion
-from pycrorm_async.world.robot import GRASP_ORIENTATIONS, PR2, Limits
-from pycrorm_async.world.robot_urdf import pr2_urdf
+from pycrorm_async.world.robots.kinematics import Unreachable, forward, solve, solve_from
+from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS, PR2, Limits
 from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_stand
 
 ARMS = (Arms.LEFT, Arms.RIGHT)
@@ -198,10 +198,10 @@ def test_a_question_that_makes_no_sense_is_the_callers_error(arm: Arms, target: 
 
 FINGERPRINT = """
 import hashlib, random
-from pycrorm_async.world.kinematics import Unreachable, solve_from
+from pycrorm_async.world.robots.kinematics import Unreachable, solve_from
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
-from pycrorm_async.world.robot import PR2
+from pycrorm_async.world.robots.robot_description import PR2
 rng, seen = random.Random(36), hashlib.sha256()
 for _ in range(400):
     target = Pose([rng.uniform(0, 0.9), rng.uniform(-0.3, 0.8), rng.uniform(0.3, 1.2)],

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.kinematics import solve
-from pycrorm_async.world.sight import met_towards
+from pycrorm_async.world.queries.visibility import met_towards
+from pycrorm_async.world.robots.kinematics import solve
 
 
 def test_a_hand_before_a_thing_is_looked_through_all_the_way(world: BulletWorld) -> None:

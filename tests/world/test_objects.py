@@ -288,7 +288,7 @@ def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, witness:
 
 
 def test_a_colour_is_seen_on_every_link(world: BulletWorld) -> None:
-    from pycrorm_async.world.engine import engine
+    from pycrorm_async.world.bullet_loader import engine
 
     milk = Object("milk", ObjectType.MILK, color=(1.0, 0.0, 0.5, 1.0))
     shapes = engine().getVisualShapeData(milk.body.number, physicsClientId=world.client)

@@ -10,8 +10,8 @@ import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.errors import DescriptionNotLoadable
-from pycrorm_async.world.robot import PR2
-from pycrorm_async.world.robot_urdf import pr2_mesh_urdf_path, pr2_urdf
+from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path, pr2_urdf
+from pycrorm_async.world.robots.robot_description import PR2
 from tests.world.witness import CRANE
 
 WEDGE = """v 0 0 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.touching import touched_at
+from pycrorm_async.world.queries.collision_queries import touched_at
 from tests.world.witness import Witness
 
 BOX = """<robot name="box"><link name="box">

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.drain import Drain, to_the_end

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import DatabaseUnavailable, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.once import drain_once
+from pycrorm_async.writer.drain_once import drain_once
 from tests.databases import ask
 from tests.store.making import episode, run_of
 from tests.writer.ends import CountingFold, KeptSource, Passing

@@ -8,7 +8,6 @@ from collections.abc import Callable, Coroutine, Mapping, Sequence
 
 import pytest
 
-from pycrorm_async.config import Settings
 from pycrorm_async.errors import (
     DatabaseForeign,
     DatabaseUnavailable,
@@ -18,11 +17,12 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.folded_progress import park
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.progress import park
 from pycrorm_async.writer.ports import Destination
-from pycrorm_async.writer.thread import WriterThread
+from pycrorm_async.writer.writer_thread import WriterThread
 from tests.databases import ask
 from tests.store.making import declaration, episode, record, run_of
 from tests.writer.ends import KeptSource, LosesReplies, Passing, opener

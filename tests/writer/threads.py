@@ -7,10 +7,10 @@ import threading
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from pycrorm_async.config import Settings
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.writer.ports import Source
-from pycrorm_async.writer.thread import WriterThread
+from pycrorm_async.writer.writer_thread import WriterThread
 from tests.databases import ask
 from tests.writer.ends import opener
 

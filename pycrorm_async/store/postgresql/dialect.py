@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.bulk import make
+from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError, TablesUntrusted
 from pycrorm_async.store.dialect import (
     Birth,
@@ -22,11 +22,11 @@ from pycrorm_async.store.dialect import (
     RowsByTable,
     StoredOn,
 )
-from pycrorm_async.store.postgresql import faults, tables
+from pycrorm_async.store.postgresql import errors, tables
 from pycrorm_async.store.postgresql import statements as sql
 from pycrorm_async.store.postgresql.engine import WARNING
-from pycrorm_async.store.postgresql.path import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
-from pycrorm_async.store.rows import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
+from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
+from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
 
 __all__ = ["PostgreSQL"]
 
@@ -38,7 +38,7 @@ class PostgreSQL:
     """Implements `Dialect`. Events go by COPY; whoever appends to an episode holds its row until COMMIT."""
 
     migrations: Migrations = tables.MIGRATIONS
-    faults: tuple[type[Exception], ...] = faults.FAULTS
+    faults: tuple[type[Exception], ...] = errors.FAULTS
 
     # --- making -------------------------------------------------------------------------------------------------
 
@@ -155,7 +155,7 @@ class PostgreSQL:
         connected.pop(WARNING, None)
         await connection.commit()
         if WARNING in connected:
-            raise faults.CommitInDoubt(connected[WARNING])
+            raise errors.CommitInDoubt(connected[WARNING])
 
     async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_STORED_AGAIN, *_arrays(keys, 2))
@@ -204,7 +204,7 @@ class PostgreSQL:
         try:
             await connection.exec_driver_sql(f"LOCK TABLE {named} IN ACCESS SHARE MODE")
         except DBAPIError as error:
-            if faults.is_missing_table(error):
+            if errors.is_missing_table(error):
                 return False
             raise
         return True
@@ -331,10 +331,10 @@ class PostgreSQL:
     # --- faults -------------------------------------------------------------------------------------------------
 
     def refusal(self, error: Exception) -> str | None:
-        return faults.refusal(error)
+        return errors.refusal(error)
 
     def ours(self, error: Exception, name: str) -> PycrormError:
-        return faults.ours(error, name)
+        return errors.ours(error, name)
 
 
 def _confirming(configured: str) -> int:
@@ -377,7 +377,7 @@ def _rows_refused() -> Iterator[None]:
         if isinstance(error, DataError | IntegrityError):
             raise RowRefused(str(error.orig)) from error
         raise
-    except faults.ROW_FAULTS as error:
+    except errors.ROW_FAULTS as error:
         raise RowRefused(" ".join(str(error).split())) from error
 
 

@@ -10,7 +10,7 @@ from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 from sqlalchemy.pool import ConnectionPoolEntry
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.store.postgresql.path import PIN
+from pycrorm_async.store.postgresql.search_path import PIN
 
 __all__ = [
     "make_engine",

@@ -28,9 +28,9 @@ of appending. All readers trust the folders, whose views they read.
 
 from __future__ import annotations
 
-from pycrorm_async.store.postgresql.path import LOG_SCHEMA as LOG
-from pycrorm_async.store.postgresql.path import TABLES_SCHEMA as TABLES
-from pycrorm_async.store.postgresql.path import VIEWS_SCHEMA as VIEWS
+from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA as LOG
+from pycrorm_async.store.postgresql.search_path import TABLES_SCHEMA as TABLES
+from pycrorm_async.store.postgresql.search_path import VIEWS_SCHEMA as VIEWS
 from pycrorm_async.store.postgresql.tables import INCARNATION
 
 __all__ = ["GRANTS"]

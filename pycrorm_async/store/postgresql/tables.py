@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
-from pycrorm_async.store.postgresql.path import LOG_SCHEMA as LOG
-from pycrorm_async.store.postgresql.path import PATH, STRANGER
-from pycrorm_async.store.postgresql.path import TABLES_SCHEMA as TABLES
-from pycrorm_async.store.postgresql.path import VIEWS_SCHEMA as VIEWS
+from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA as LOG
+from pycrorm_async.store.postgresql.search_path import PATH, STRANGER
+from pycrorm_async.store.postgresql.search_path import TABLES_SCHEMA as TABLES
+from pycrorm_async.store.postgresql.search_path import VIEWS_SCHEMA as VIEWS
 
 __all__ = [
     "MIGRATIONS",

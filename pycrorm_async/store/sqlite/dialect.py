@@ -14,7 +14,7 @@ from sqlalchemy.dialects.sqlite import dialect as make_dialect
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.bulk import make
+from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.store.dialect import (
     Birth,
@@ -27,12 +27,12 @@ from pycrorm_async.store.dialect import (
     RowsByTable,
     StoredOn,
 )
-from pycrorm_async.store.rows import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
-from pycrorm_async.store.sqlite import faults, tables
+from pycrorm_async.store.sqlite import errors, tables
 from pycrorm_async.store.sqlite import statements as sql
-from pycrorm_async.store.sqlite.binding import bound, inserts
-from pycrorm_async.store.sqlite.claim import claim
 from pycrorm_async.store.sqlite.engine import BEGIN, USE_WAL, Connection
+from pycrorm_async.store.sqlite.multi_row_insert import bound, inserts
+from pycrorm_async.store.sqlite.rebuild_lock import claim
+from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
 
 __all__ = ["SQLite"]
 
@@ -274,10 +274,10 @@ class SQLite:
     # --- faults -------------------------------------------------------------------------------------------------
 
     def refusal(self, error: Exception) -> str | None:
-        return faults.refusal(error.orig if isinstance(error, DBAPIError) else error)
+        return errors.refusal(error.orig if isinstance(error, DBAPIError) else error)
 
     def ours(self, error: Exception, name: str) -> PycrormError:
-        return faults.ours(error.orig if isinstance(error, DBAPIError) else error, name)
+        return errors.ours(error.orig if isinstance(error, DBAPIError) else error, name)
 
 
 _quote = make_dialect().identifier_preparer.quote

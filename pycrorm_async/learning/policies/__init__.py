@@ -1,0 +1,1 @@
+"""Policies for move-and-pick-up: fitted, stored, drawn."""

@@ -1,0 +1,39 @@
+"""The policy of one who knows nothing yet: any arm, any grasp, somewhere within 2 m around the object.
+
+Arm and grasp are equally likely. relative_x and relative_y are normal with a variance of 0.5 m², in (-2 m, 2 m)²
+without the open square (-0.2 m, 0.2 m)² in which the object stands; 0.94107 of the normal distribution lies there.
+"""
+
+from __future__ import annotations
+
+import math
+
+from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
+from pycrorm_async.learning.policies.marginals import Normal
+from pycrorm_async.learning.policies.policy import ARMS, GRASPS, Leaf, Policy
+
+__all__ = ["AROUND_OBJECT", "default_policy"]
+
+VARIANCE_M2 = 0.5
+FARTHEST_M = 2.0
+NEAREST_M = 0.2
+
+AROUND_OBJECT = Region(
+    (
+        Rectangle(-FARTHEST_M, -NEAREST_M, -FARTHEST_M, FARTHEST_M),
+        Rectangle(NEAREST_M, FARTHEST_M, -FARTHEST_M, FARTHEST_M),
+        Rectangle(-NEAREST_M, NEAREST_M, -FARTHEST_M, -NEAREST_M),
+        Rectangle(-NEAREST_M, NEAREST_M, NEAREST_M, FARTHEST_M),
+    )
+)
+
+
+def default_policy() -> Policy:
+    """The policy to start from; it knows nothing of heights.
+
+    >>> default_policy().probability(Evidence(arms=frozenset({Arms.LEFT})))
+    0.5
+    """
+    place = Normal(0.0, math.sqrt(VARIANCE_M2))
+    anywhere = Leaf(1.0, (1 / len(ARMS),) * len(ARMS), (1 / len(GRASPS),) * len(GRASPS), place, place)
+    return Policy((anywhere,), Evidence(region=AROUND_OBJECT))

@@ -1,0 +1,76 @@
+"""Where around an object a robot could stand and see it here and now, as rectangles in the object's own frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.learning.policies.evidence import Rectangle, Region
+from pycrorm_async.plan.current_robot import RobotHere
+from pycrorm_async.world.objects import Object
+from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.queries.costmaps import Costmap, OccupancyCostmap, VisibilityCostmap
+
+__all__ = ["free_and_visible", "rectangles", "CLEARANCE_M", "REACH_M"]
+
+CLEARANCE_M = 0.3
+"""How far from the middle of the robot furniture has to be, as in the thesis."""
+REACH_M = 2.0
+"""So far from the object, along either of its axes, places are looked at: as far as the default policy goes."""
+_RESOLUTION_M = 0.05
+_CELLS = round(2 * REACH_M / _RESOLUTION_M)
+_VISIBLE_SHARE_MIN = 0.5
+
+
+def free_and_visible(robot: RobotHere, target: Object) -> Region:
+    """The places from which the robot, standing clear of everything, sees the object. Nothing is moved."""
+    world, ignored = target.world, robot.with_load()
+    ground = Pose((target.pose.position.x, target.pose.position.y, 0.0))
+    low, high = robot.description.camera_height_m
+    # Turned with the object, the square of its own frame takes up to √2 times as much of the map.
+    size = {"size_cells": 2 * round(0.75 * _CELLS), "resolution_m": _RESOLUTION_M}
+    free = OccupancyCostmap(world, ground, distance_to_obstacle_m=CLEARANCE_M, ignore=ignored, **size)  # type: ignore[arg-type]
+    seen = VisibilityCostmap(
+        world,
+        target,
+        min_height_m=low,
+        max_height_m=high,
+        origin=ground,
+        ignore=ignored,
+        **size,  # type: ignore[arg-type]
+    )
+    middles = (np.arange(_CELLS) + 0.5) * _RESOLUTION_M - REACH_M
+    stands = _values(free, target.pose.yaw, middles) > 0
+    stands &= _values(seen, target.pose.yaw, middles) >= _VISIBLE_SHARE_MIN
+    return Region(tuple(rectangles(stands)))
+
+
+def _values(costmap: Costmap, yaw: float, middles: NDArray[np.floating]) -> NDArray[np.float64]:
+    """What the map says at the cells of a grid that is turned about its origin."""
+    x, y = np.meshgrid(middles, middles, indexing="ij")
+    turned = (np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y)
+    row, column = (np.floor(each / costmap.resolution_m + costmap.size_cells / 2).astype(int) for each in turned)
+    return np.asarray(costmap.map[row, column])
+
+
+def rectangles(cells: NDArray[np.bool_]) -> Iterator[Rectangle]:
+    """The true cells as few rectangles without overlap: runs along y that are the same in neighbouring rows are one."""
+    open_runs: dict[tuple[int, int], int] = {}
+    for row in range(len(cells) + 1):
+        runs = set(_runs(cells[row])) if row < len(cells) else set()
+        for run in [each for each in open_runs if each not in runs]:
+            yield _rectangle(open_runs.pop(run), row, run)
+        for run in runs:
+            open_runs.setdefault(run, row)
+
+
+def _runs(cells: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
+    """Where runs of true cells begin, and where they are over."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], cells, [False]])))
+    yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
+def _rectangle(first_row: int, end_row: int, run: tuple[int, int]) -> Rectangle:
+    return Rectangle(*(each * _RESOLUTION_M - REACH_M for each in (first_row, end_row, *run)))

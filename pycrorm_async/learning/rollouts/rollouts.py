@@ -1,0 +1,176 @@
+"""Many tries of one action, each chosen by a policy, each from the same start: what is learned from (thesis 5.2).
+
+A rollout is given by its seed and its index alone: the same two make the same choice, in whatever process and order.
+
+>>> with Scene().entered() as stage:
+...     tally = await batch_rollout(MoveAndPickUp(stage.target), 500, seed=69, reset=stage.reset)
+>>> tally.success_rate
+0.158
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import AbstractAsyncContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.learning.policies.policy import Policy
+from pycrorm_async.learning.policies.policy_file import name_of
+from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.plan.current_robot import world_here
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.progress_bar import watched
+
+if TYPE_CHECKING:
+    from pycrorm_async.memory import Memory
+
+__all__ = ["Tally", "batch_rollout", "BatchRolloutActionPerformable", "randomness"]
+
+
+@dataclass
+class Tally:
+    """How rollouts ended.
+
+    Attributes:
+        successes: how many went well.
+        failures: the class of the plan failure → how often.
+    """
+
+    successes: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def rollouts(self) -> int:
+        return self.successes + self.failures.total()
+
+    @property
+    def success_rate(self) -> float:
+        """Share of successes; NaN before the first rollout."""
+        return self.successes / self.rollouts if self.rollouts else math.nan
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Where the rate lies with 95 % confidence, by Wilson's formula."""
+        count, z = self.rollouts, 1.959964
+        if not count:
+            return 0.0, 1.0
+        rate, spread = self.success_rate, z * z / count
+        middle = (rate + spread / 2) / (1 + spread)
+        half = z * math.sqrt(rate * (1 - rate) / count + spread / (4 * count)) / (1 + spread)
+        return middle - half, middle + half
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(self.successes + other.successes, self.failures + other.failures)
+
+
+def randomness(seed: int, index: int) -> np.random.Generator:
+    """The random numbers of one rollout."""
+    return np.random.default_rng((seed, index))
+
+
+async def batch_rollout(
+    action: MoveAndPickUp,
+    count: int,
+    *,
+    seed: int,
+    first: int = 0,
+    scene: str = "",
+    reset: Callable[[], None] | None = None,
+    each_in: Memory | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    tell: Callable[[Tally], None] | None = None,
+) -> Tally:
+    """Performs the action so often, each time as a sample of its policy says and from the same start.
+
+    With a memory open all of it is one episode: the one that is open, or one of its own.
+
+    Args:
+        count, first: the rollouts with these indexes: `first`, `first + 1`, …
+        scene: where, in words; remembered, to tell rollouts in different scenes apart.
+        reset: puts the world back after each; left out, everything at its original pose with joints at 0.
+        each_in: makes each rollout an episode of this memory.
+        stop: asked before each rollout whether to end here.
+        tell: is told after each rollout how they went so far; left out, a bar shows it, where stderr is a terminal.
+
+    Raises `CallerError` for a count, index or seed below 0, and whatever is no `PlanFailure`: a plan may fail, a fault
+    in it ends the batch.
+    """
+    if min(count, first, seed) < 0:
+        raise CallerError(f"count, first and seed of rollouts are 0 or more, not {count}, {first} and {seed}")
+    tally = Tally()
+    with _shown(count) if tell is None else nullcontext(tell) as told:
+        run = _Run(action, action.policy_here(), reset or world_here().reset, stop, tally, told)
+        slices = ((index, 1) for index in range(first, first + count)) if each_in is not None else ((first, count),)
+        for begin, length in slices:
+            if stop():
+                break
+            batch = BatchRolloutActionPerformable(name_of(action.policy), scene, seed, begin, length, run)
+            async with _episode_of(each_in, batch):
+                await batch.perform()
+    return tally
+
+
+@contextmanager
+def _shown(count: int) -> Iterator[Callable[[Tally], None]]:
+    with watched("rollouts", unit="rollouts") as watch:
+        yield lambda tally: watch(tally.rollouts, count, f"{tally.success_rate:.1%} succeed")
+
+
+def _episode_of(memory: Memory | None, batch: BatchRolloutActionPerformable) -> AbstractAsyncContextManager[Any]:
+    if memory is None:
+        return nullcontext()
+    return memory.episode(description=f"rollout {batch.first} under policy {batch.policy}", seed=batch.seed)
+
+
+@dataclass
+class _Run:
+    """What a batch needs besides what is remembered of it."""
+
+    action: MoveAndPickUp
+    policy: Policy
+    reset: Callable[[], None]
+    stop: Callable[[], bool]
+    tally: Tally
+    tell: Callable[[Tally], None]
+
+
+@dataclass
+class BatchRolloutActionPerformable(ActionAbstract):
+    """The node that rollouts are remembered in: the one with index `first + n` is its n-th child that ended.
+
+    Made by `batch_rollout`.
+    """
+
+    policy: str
+    scene: str
+    seed: int
+    first: int
+    count: int
+    _run: _Run | None = field(default=None, repr=False, compare=False)
+
+    async def perform(self) -> None:
+        run = self._run
+        assert run is not None, "made by batch_rollout"
+        for index in self._indexes(run):
+            choice = run.policy.sample(randomness(self.seed, index))[0]
+            try:
+                await run.action.chosen(choice).perform()
+            except PlanFailure as failure:
+                run.tally.failures[type(failure).__name__] += 1
+            else:
+                run.tally.successes += 1
+            run.reset()
+            run.tell(run.tally)
+
+    def _indexes(self, run: _Run) -> Iterator[int]:
+        for index in range(self.first, self.first + self.count):
+            if index > self.first and run.stop():
+                return
+            yield index

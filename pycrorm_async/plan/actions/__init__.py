@@ -1,0 +1,1 @@
+"""Actions of a mobile manipulator and the descriptions they are grounded from."""

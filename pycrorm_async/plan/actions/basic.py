@@ -1,0 +1,239 @@
+"""The first of the actions that are there from the start: posture, driving, looking, picking up and placing.
+
+What one hand does with handles and things is in `plan.manipulation`, looking for and bringing things in
+`plan.fetching`. Each is recorded with its fields; concepts are those of SOMA. Positions are in metres in the
+map, angles in rad. Descriptions with alternatives for each of them are in `pycrorm_async.plan.actions.descriptions`.
+
+>>> await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.failures import ObjectLost
+from pycrorm_async.plan.field_types import check_properties
+from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retracted
+from pycrorm_async.plan.geometry.gripper_checks import check_takable, take
+from pycrorm_async.plan.language.resources import Resource, arms, reaching
+from pycrorm_async.plan.motions.motions import (
+    LookingMotion,
+    MoveArmJointsMotion,
+    MoveGripperMotion,
+    MoveJointsMotion,
+    MoveMotion,
+    MoveTCPMotion,
+)
+from pycrorm_async.plan.object_designators import ObjectDesignator, designator_of, in_world
+from pycrorm_async.world.enums import Arms, Grasp, GripperState
+from pycrorm_async.world.objects import Object
+from pycrorm_async.world.pose import Pose, yaw_quaternion
+
+__all__ = [
+    "FaceAtPerformable",
+    "LookAtActionPerformable",
+    "MoveAndPickUpPerformable",
+    "MoveTorsoActionPerformable",
+    "NavigateActionPerformable",
+    "ParkArmsActionPerformable",
+    "PickUpActionPerformable",
+    "PlaceActionPerformable",
+    "SetGripperActionPerformable",
+]
+
+
+class CheckedAction(ActionAbstract):
+    """Its fields are checked when it is built, as a motion's are. Raises `ResolutionError`."""
+
+    def __post_init__(self) -> None:
+        check_properties(self)
+
+
+@dataclass
+class MoveTorsoActionPerformable(CheckedAction):
+    """Lift or lower the torso to `position` (m). Raises `TorsoGoalUnreachable`."""
+
+    concept: ClassVar[str | None] = "MoveTorso"
+
+    position: float
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.TORSO})
+
+    async def perform(self) -> None:
+        await MoveJointsMotion([robot_here().description.torso_joint], [self.position]).perform()
+
+
+@dataclass
+class SetGripperActionPerformable(CheckedAction):
+    """Open or close a gripper."""
+
+    concept: ClassVar[str | None] = "SettingGripper"
+
+    gripper: Arms
+    motion: GripperState
+
+    def resources(self) -> frozenset[Resource]:
+        return arms(self.gripper)
+
+    async def perform(self) -> None:
+        await MoveGripperMotion(self.motion, self.gripper).perform()
+
+
+@dataclass
+class ParkArmsActionPerformable(CheckedAction):
+    """Fold an arm, or both, out of the way."""
+
+    concept: ClassVar[str | None] = "ParkingArms"
+
+    arm: Arms
+
+    def resources(self) -> frozenset[Resource]:
+        return arms(self.arm)
+
+    async def perform(self) -> None:
+        parked = {arm: dict(each.park) for arm, each in robot_here().each_arm(self.arm).items()}
+        await MoveArmJointsMotion(parked.get(Arms.LEFT), parked.get(Arms.RIGHT)).perform()
+
+
+@dataclass
+class NavigateActionPerformable(CheckedAction):
+    """Drive to a place."""
+
+    concept: ClassVar[str | None] = "Navigating"
+
+    target_location: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.BASE})
+
+    async def perform(self) -> None:
+        await MoveMotion(self.target_location).perform()
+
+
+@dataclass
+class LookAtActionPerformable(CheckedAction):
+    """Turn the head to a point."""
+
+    concept: ClassVar[str | None] = "LookingAt"
+
+    target: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.HEAD})
+
+    async def perform(self) -> None:
+        await LookingMotion(self.target).perform()
+
+
+@dataclass
+class PickUpActionPerformable(CheckedAction):
+    """Take an object with one arm and lift it by 3 cm; the object is attached to the gripper afterwards.
+
+    The gripper is turned as `grasp` says in the object's own axes. It opens 0.1 m before the object, seen
+    along the direction it points to when the action begins.
+
+    Raises:
+        IKError: one of the three goals of the arm is out of reach.
+        EndEffectorFailure: the gripper holds something else.
+        PerceptionObjectNotInWorld: there is no such object.
+        IllPosedGoalFailure: not one arm, or furniture or a robot is to be held.
+        CapabilityAbsenceFailure: the robot has no such arm.
+    """
+
+    concept: ClassVar[str | None] = "PickingUp"
+
+    object_designator: ObjectDesignator | Object
+    arm: Arms
+    grasp: Grasp
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
+    async def perform(self) -> None:
+        robot = robot_here()
+        wanted = in_world(self.object_designator)
+        check_takable(robot, self.arm, wanted)
+        tool_frame = robot.one_arm(self.arm).tool_frame
+        before, at, above = pick_up_poses(wanted.pose, self.grasp, robot.body.link_pose(tool_frame))
+        await MoveTCPMotion(before, self.arm, allow_gripper_collision=True).perform()
+        await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
+        await MoveTCPMotion(at, self.arm, allow_gripper_collision=True).perform()
+        await MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
+        take(robot, self.arm, wanted)
+        await MoveTCPMotion(above, self.arm, allow_gripper_collision=True).perform()
+
+
+@dataclass
+class PlaceActionPerformable(CheckedAction):
+    """Put the held object down: it ends at `target_location`, the gripper 7 cm behind.
+
+    Raises:
+        IKError: the arm does not reach; then it holds the object, unless it is the way back that it does not reach.
+        ObjectLost: the arm does not hold it.
+        PerceptionObjectNotInWorld: there is no such object.
+    """
+
+    concept: ClassVar[str | None] = "Placing"
+
+    object_designator: ObjectDesignator | Object
+    arm: Arms
+    target_location: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
+    async def perform(self) -> None:
+        robot = robot_here()
+        body, held = robot.body, in_world(self.object_designator)
+        tool_frame = robot.one_arm(self.arm).tool_frame
+        if body.attachments.get(held) != tool_frame:
+            raise ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
+        goal = place_pose(self.target_location, held.pose, body.link_pose(tool_frame))
+        await MoveTCPMotion(goal, self.arm).perform()
+        await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
+        body.detach(held)
+        await MoveTCPMotion(retracted(goal), self.arm).perform()
+
+
+@dataclass
+class FaceAtPerformable(CheckedAction):
+    """Turn on the spot to face a point, and look at it."""
+
+    concept: ClassVar[str | None] = "LookingAt"
+
+    pose: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.BASE, Resource.HEAD})
+
+    async def perform(self) -> None:
+        here = robot_here().body.pose
+        dx, dy = self.pose.position.x - here.position.x, self.pose.position.y - here.position.y
+        heading = yaw_quaternion(math.atan2(dy, dx))
+        await NavigateActionPerformable(Pose(here.position, heading, here.frame)).perform()
+        await LookAtActionPerformable(self.pose).perform()
+
+
+@dataclass
+class MoveAndPickUpPerformable(CheckedAction):
+    """Drive to a place, face the object there, and pick it up."""
+
+    concept: ClassVar[str | None] = "Fetching"
+
+    standing_position: Pose
+    object_designator: ObjectDesignator | Object
+    arm: Arms
+    grasp: Grasp
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm) | {Resource.HEAD}
+
+    async def perform(self) -> None:
+        await NavigateActionPerformable(self.standing_position).perform()
+        await FaceAtPerformable(designator_of(self.object_designator).pose).perform()
+        await PickUpActionPerformable(self.object_designator, self.arm, self.grasp).perform()

@@ -1,0 +1,239 @@
+"""A description of an action holds alternatives for each property; `resolve()` takes the first of each.
+
+A property with one value needs no list: `ParkArmsAction(Arms.LEFT)`. Iterating a description gives every
+combination, the last property varying fastest:
+
+>>> [each.motion.name for each in SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])]
+['OPEN', 'CLOSE']
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar
+
+from pycrorm_async.plan.actions.basic import (
+    LookAtActionPerformable,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    ParkArmsActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    SetGripperActionPerformable,
+)
+from pycrorm_async.plan.actions.manipulation import (
+    CloseActionPerformable,
+    GraspingActionPerformable,
+    GripActionPerformable,
+    OpenActionPerformable,
+    ReleaseActionPerformable,
+)
+from pycrorm_async.plan.actions.transport import DetectActionPerformable, TransportActionPerformable
+from pycrorm_async.plan.errors import NotResolved
+from pycrorm_async.plan.failures import IllPosedGoalFailure
+from pycrorm_async.plan.language.operators import Composable
+from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, ObjectPart
+from pycrorm_async.world.enums import Arms, Grasp, GripperState
+from pycrorm_async.world.pose import Pose
+
+__all__ = [
+    "ActionDescription",
+    "CloseAction",
+    "DetectAction",
+    "GraspingAction",
+    "GripAction",
+    "LookAtAction",
+    "MoveTorsoAction",
+    "NavigateAction",
+    "OpenAction",
+    "ParkArmsAction",
+    "PickUpAction",
+    "PlaceAction",
+    "ReleaseAction",
+    "SetGripperAction",
+    "TransportAction",
+]
+
+P = TypeVar("P")
+T = TypeVar("T")
+
+OneOrMore: TypeAlias = T | Iterable[T]
+Objects: TypeAlias = ObjectDesignatorDescription | OneOrMore[ObjectLike]
+
+
+class ActionDescription(Composable, Generic[P]):
+    """What every description does; alternatives are given by name, in the order of the performable's fields.
+
+    Objects that are described are looked for in the world each time it is asked.
+    """
+
+    def __init__(self, performable: Callable[..., P], **alternatives: Any) -> None:
+        self._performable = performable
+        self._alternatives = {name: _among(each) for name, each in alternatives.items()}
+
+    if not TYPE_CHECKING:  # a type checker finds the fault by itself
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name == "perform" or name in self.__dict__.get("_alternatives", ()):
+                raise NotResolved(type(self).__name__, name)
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def resolve(self) -> P:
+        """The performable with the first alternative of each property.
+
+        Raises:
+            IllPosedGoalFailure: a property has no alternative.
+            ObjectNotFound: no object in the world is as described.
+        """
+        return next(iter(self))
+
+    def __iter__(self) -> Iterator[P]:
+        """Every combination, the last property varying fastest. Raises as `resolve` does."""
+        choices = [self._choices(name, among) for name, among in self._alternatives.items()]
+        for combination in itertools.product(*choices):
+            yield self._performable(**dict(zip(self._alternatives, combination, strict=True)))
+
+    def _choices(self, name: str, among: ObjectDesignatorDescription | tuple[Any, ...]) -> tuple[Any, ...]:
+        if isinstance(among, ObjectDesignatorDescription):
+            return tuple(among) or (among.resolve(),)
+        if not among:
+            raise IllPosedGoalFailure(f"{type(self).__name__} has no alternative for {name}", name)
+        return among
+
+
+def _among(given: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
+    """The alternatives that are given; what holds none is the only one, and so is a word, whose letters are none."""
+    if isinstance(given, ObjectDesignatorDescription):
+        return given
+    if isinstance(given, str):
+        return (given,)
+    try:
+        each = iter(given)
+    except TypeError:
+        return (given,)
+    return tuple(each)
+
+
+class MoveTorsoAction(ActionDescription[MoveTorsoActionPerformable]):
+    """Lift or lower the torso to one of these positions (m)."""
+
+    def __init__(self, positions: OneOrMore[float]) -> None:
+        super().__init__(MoveTorsoActionPerformable, position=positions)
+
+
+class SetGripperAction(ActionDescription[SetGripperActionPerformable]):
+    """Open or close a gripper."""
+
+    def __init__(self, grippers: OneOrMore[Arms], motions: OneOrMore[GripperState]) -> None:
+        super().__init__(SetGripperActionPerformable, gripper=grippers, motion=motions)
+
+
+class ParkArmsAction(ActionDescription[ParkArmsActionPerformable]):
+    """Fold one of these arms, or both, out of the way."""
+
+    def __init__(self, arms: OneOrMore[Arms]) -> None:
+        super().__init__(ParkArmsActionPerformable, arm=arms)
+
+
+class NavigateAction(ActionDescription[NavigateActionPerformable]):
+    """Drive to one of these places."""
+
+    def __init__(self, target_locations: OneOrMore[Pose]) -> None:
+        super().__init__(NavigateActionPerformable, target_location=target_locations)
+
+
+class LookAtAction(ActionDescription[LookAtActionPerformable]):
+    """Turn the head to one of these points."""
+
+    def __init__(self, targets: OneOrMore[Pose]) -> None:
+        super().__init__(LookAtActionPerformable, target=targets)
+
+
+class PickUpAction(ActionDescription[PickUpActionPerformable]):
+    """Take an object: one, some, or whatever is as described."""
+
+    def __init__(self, object_designator_description: Objects, arms: OneOrMore[Arms], grasps: OneOrMore[Grasp]) -> None:
+        super().__init__(
+            PickUpActionPerformable,
+            object_designator=object_designator_description,
+            arm=arms,
+            grasp=grasps,
+        )
+
+
+class PlaceAction(ActionDescription[PlaceActionPerformable]):
+    """Put the held object down at one of these poses."""
+
+    def __init__(
+        self, object_designator_description: Objects, target_locations: OneOrMore[Pose], arms: OneOrMore[Arms]
+    ) -> None:
+        super().__init__(
+            PlaceActionPerformable,
+            object_designator=object_designator_description,
+            arm=arms,
+            target_location=target_locations,
+        )
+
+
+class GripAction(ActionDescription[GripActionPerformable]):
+    """Hold an object that is in the gripper, with one of these efforts (N)."""
+
+    def __init__(
+        self, grippers: OneOrMore[Arms], object_designator_description: Objects, efforts: OneOrMore[float]
+    ) -> None:
+        super().__init__(
+            GripActionPerformable,
+            gripper=grippers,
+            object_designator=object_designator_description,
+            effort=efforts,
+        )
+
+
+class ReleaseAction(ActionDescription[ReleaseActionPerformable]):
+    """Let go of an object."""
+
+    def __init__(self, grippers: OneOrMore[Arms], object_designator_description: Objects) -> None:
+        super().__init__(ReleaseActionPerformable, gripper=grippers, object_designator=object_designator_description)
+
+
+class GraspingAction(ActionDescription[GraspingActionPerformable]):
+    """Close a gripper around an object or a handle."""
+
+    def __init__(self, arms: OneOrMore[Arms], object_description: Objects) -> None:
+        super().__init__(GraspingActionPerformable, arm=arms, object_desig=object_description)
+
+
+class OpenAction(ActionDescription[OpenActionPerformable]):
+    """Open a drawer or a door by one of these handles."""
+
+    def __init__(self, object_designator_description: OneOrMore[ObjectPart], arms: OneOrMore[Arms]) -> None:
+        super().__init__(OpenActionPerformable, object_designator=object_designator_description, arm=arms)
+
+
+class CloseAction(ActionDescription[CloseActionPerformable]):
+    """Close a drawer or a door by one of these handles."""
+
+    def __init__(self, object_designator_description: OneOrMore[ObjectPart], arms: OneOrMore[Arms]) -> None:
+        super().__init__(CloseActionPerformable, object_designator=object_designator_description, arm=arms)
+
+
+class DetectAction(ActionDescription[DetectActionPerformable]):
+    """Look for an object like one of these."""
+
+    def __init__(self, object_designator_description: Objects) -> None:
+        super().__init__(DetectActionPerformable, object_designator=object_designator_description)
+
+
+class TransportAction(ActionDescription[TransportActionPerformable]):
+    """Fetch an object and put it down at one of these poses."""
+
+    def __init__(
+        self, object_designator_description: Objects, arms: OneOrMore[Arms], target_locations: OneOrMore[Pose]
+    ) -> None:
+        super().__init__(
+            TransportActionPerformable,
+            object_designator=object_designator_description,
+            arm=arms,
+            target_location=target_locations,
+        )

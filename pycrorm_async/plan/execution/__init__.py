@@ -1,0 +1,1 @@
+"""The execution of a designator: its node, its context, its observer."""

@@ -1,0 +1,1 @@
+"""The plan language: expressions of actions, their outcomes, monitors and resources."""

@@ -1,0 +1,63 @@
+"""Which parts of the robot a designator needs for itself while it runs, so that parallel branches take turns.
+
+A part is needed also when it must only hold still: an arm that reaches for a place in the map needs the base
+and the torso. Looking somewhere does not need the base, so a robot may look around while it drives. Who waits
+for whom is settled in `plan.claims`.
+
+>>> PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).resources() == reaching(Arms.LEFT)
+True
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from enum import Enum
+from typing import TYPE_CHECKING
+
+from pycrorm_async.world.enums import Arms
+
+if TYPE_CHECKING:
+    from pycrorm_async.world.robots.robot_description import RobotDescription
+
+__all__ = ["NOTHING", "Resource", "arms", "moving", "reaching"]
+
+
+class Resource(Enum):
+    """A part of the robot that one activity at a time can use."""
+
+    LEFT_ARM = "LEFT_ARM"
+    RIGHT_ARM = "RIGHT_ARM"
+    BASE = "BASE"
+    TORSO = "TORSO"
+    HEAD = "HEAD"
+
+
+NOTHING: frozenset[Resource] = frozenset()
+_ARMS = {
+    Arms.LEFT: frozenset({Resource.LEFT_ARM}),
+    Arms.RIGHT: frozenset({Resource.RIGHT_ARM}),
+    Arms.BOTH: frozenset({Resource.LEFT_ARM, Resource.RIGHT_ARM}),
+}
+_STANDING = frozenset({Resource.BASE, Resource.TORSO})
+
+
+def arms(arm: Arms) -> frozenset[Resource]:
+    """The arm, or both, with its gripper."""
+    return _ARMS[arm]
+
+
+def reaching(arm: Arms) -> frozenset[Resource]:
+    """What an arm needs that reaches for a place in the map: itself, and base and torso, which hold still."""
+    return _ARMS[arm] | _STANDING
+
+
+def moving(joints: Iterable[str], robot: RobotDescription) -> frozenset[Resource]:
+    """The parts these joints belong to; none for a joint that is in none of them."""
+    parts = {robot.torso_joint: Resource.TORSO}
+    parts |= dict.fromkeys((robot.head_pan_joint, robot.head_tilt_joint), Resource.HEAD)
+    for arm, description in robot.arms.items():
+        (part,) = _ARMS[arm]
+        parts |= dict.fromkeys(description.joints, part)
+        for positions in description.gripper_joints.values():
+            parts |= dict.fromkeys(positions, part)
+    return frozenset(parts[joint] for joint in joints if joint in parts)

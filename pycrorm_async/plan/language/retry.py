@@ -1,0 +1,64 @@
+"""An action that may fail is tried again: with the next alternative of its description, or as it is."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import operator
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.failures import IllPosedGoalFailure, NotALanguageExpression, in_words
+from pycrorm_async.plan.language.expressions import Expression, performed
+from pycrorm_async.plan.language.operators import Composable
+from pycrorm_async.plan.language.outcome import attempted, together
+
+__all__ = ["Retry"]
+
+
+@dataclass(init=False, repr=False, eq=False)
+class Retry(Expression):
+    """Performs the alternatives of a description in turn, or a designator again and again, until one succeeds.
+
+    >>> await Retry(PickUpAction(milk, [Arms.LEFT, Arms.RIGHT], [Grasp.FRONT, Grasp.TOP]), max_tries=4).perform()
+
+    Args:
+        max_tries: at most so many; fewer if there are fewer alternatives.
+
+    Raises:
+        NotALanguageExpression: it cannot be performed, or `max_tries` is no whole number from 1.
+    """
+
+    max_tries: int
+
+    def __init__(self, operand: Composable, max_tries: int = 3) -> None:
+        try:
+            self.max_tries = operator.index(max_tries)
+        except TypeError:
+            self.max_tries = 0
+        if isinstance(max_tries, bool) or self.max_tries < 1:
+            raise NotALanguageExpression(f"Retry tries a whole number of times from 1, not {max_tries!r}")
+        self.hold([operand])
+
+    async def perform(self) -> Any:
+        """Returns what the first success returns. Raises the last failure, with the earlier ones as notes."""
+        failures: list[Exception] = []
+        notes: list[str] = []
+        for number, performable in enumerate(itertools.islice(self._alternatives(), self.max_tries), start=1):
+            result, failure = await attempted(functools.partial(performed, performable))
+            if failure is None:
+                return result
+            failures = [failure]
+            notes.append(f"try {number}: {in_words(failure)}")
+            del failure
+        if not failures:
+            raise IllPosedGoalFailure(f"{self!r}: the description has no alternative")
+        for note in notes[:-1]:
+            failures[0].add_note(note)
+        raise together(failures, "")
+
+    def _alternatives(self) -> Iterator[Any]:
+        (operand,) = self.operands
+        return itertools.repeat(operand) if isinstance(operand, Designator) else iter(operand)

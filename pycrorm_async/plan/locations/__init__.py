@@ -1,0 +1,1 @@
+"""Locations: designators that propose poses for the robot's base."""

@@ -1,0 +1,1 @@
+"""Motions and the process modules that execute them."""

@@ -1,0 +1,257 @@
+"""The motions: what a robot's controllers do at once. Each is carried out by the robot chosen with
+`with simulated_robot:`, and recorded with its target; concepts are the nearest ones of SOMA.
+
+>>> with simulated_robot:
+...     await MoveMotion(Pose([0.6, 0.4, 0])).perform()
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from pycrorm_async.plan.designator import BaseMotion
+from pycrorm_async.plan.errors import ResolutionError
+from pycrorm_async.plan.language.resources import NOTHING, Resource, arms, moving, reaching
+from pycrorm_async.plan.motions.perception import perceived
+from pycrorm_async.plan.motions.process_modules import chosen_robot
+from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
+from pycrorm_async.world.enums import Arms, GripperState, ObjectType
+from pycrorm_async.world.objects import Object
+from pycrorm_async.world.observers import current_world
+from pycrorm_async.world.pose import Pose
+
+__all__ = [
+    "MoveMotion",
+    "MoveTCPMotion",
+    "LookingMotion",
+    "MoveGripperMotion",
+    "MoveArmJointsMotion",
+    "MoveJointsMotion",
+    "DetectingMotion",
+    "WorldStateDetectingMotion",
+    "OpeningMotion",
+    "ClosingMotion",
+    "AccessingMotion",
+]
+
+
+@dataclass
+class MoveMotion(BaseMotion):
+    """Drive the base to a pose in the map."""
+
+    concept: ClassVar[str | None] = "Navigating"
+
+    target: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.BASE})
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "navigate").navigate(self)
+
+
+@dataclass
+class MoveTCPMotion(BaseMotion):
+    """Bring the tool frame of one arm to a pose in the map.
+
+    Raises:
+        IKError: it is out of reach.
+        CapabilityAbsenceFailure, IllPosedGoalFailure: the robot has no such arm; one arm is needed, not BOTH.
+    """
+
+    concept: ClassVar[str | None] = "AssumingArmPose"
+
+    target: Pose
+    arm: Arms
+    allow_gripper_collision: bool | None = None
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "move_tcp").move_tcp(self)
+
+
+@dataclass
+class LookingMotion(BaseMotion):
+    """Turn the head to a point in the map."""
+
+    concept: ClassVar[str | None] = "LookingAt"
+
+    target: Pose
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.HEAD})
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "looking").looking(self)
+
+
+@dataclass
+class MoveGripperMotion(BaseMotion):
+    """Open or close a gripper."""
+
+    concept: ClassVar[str | None] = "SettingGripper"
+
+    motion: GripperState
+    gripper: Arms
+    allow_gripper_collision: bool | None = None
+
+    def resources(self) -> frozenset[Resource]:
+        return arms(self.gripper)
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "move_gripper").move_gripper(self)
+
+
+@dataclass
+class MoveArmJointsMotion(BaseMotion):
+    """Bring arm joints (by name) to positions in rad, both arms at once.
+
+    Raises `ConfigurationNotReached`, and `UnknownJoint` for one that is not of that arm.
+    """
+
+    concept: ClassVar[str | None] = "AssumingArmPose"
+
+    left_arm_poses: dict[str, float] | None = None
+    right_arm_poses: dict[str, float] | None = None
+
+    def resources(self) -> frozenset[Resource]:
+        left = arms(Arms.LEFT) if self.left_arm_poses else NOTHING
+        return left | arms(Arms.RIGHT) if self.right_arm_poses else left
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "move_arm_joints").move_arm_joints(self)
+
+
+@dataclass
+class MoveJointsMotion(BaseMotion):
+    """Bring joints to positions in rad or m, all at once.
+
+    Raises:
+        TorsoGoalUnreachable: the torso alone was to go where it cannot.
+        ConfigurationNotReached: a position is outside its joint's limits.
+        ResolutionError: not one position for each name, or a name twice.
+    """
+
+    concept: ClassVar[str | None] = "AssumingPose"
+
+    names: list[str]
+    positions: list[float]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.names) != len(self.positions):
+            counts = f"expected {len(self.names)} values, one for each name, got {len(self.positions)}"
+            raise ResolutionError(type(self).__name__, wrong=[f"positions: {counts}"])
+        if twice := {name for name in self.names if self.names.count(name) > 1}:
+            raise ResolutionError(type(self).__name__, wrong=[f"names: {', '.join(sorted(twice))} more than once"])
+
+    def resources(self) -> frozenset[Resource]:
+        world = current_world.get()
+        robot = world.robot if world is not None else None
+        known = robot.robot_description if robot is not None else None
+        return moving(self.names, known) if known is not None else NOTHING
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "move_joints").move_joints(self)
+
+
+@dataclass
+class DetectingMotion(BaseMotion):
+    """Look with the head's camera for objects of a type; returns the one that is seen best.
+
+    Raises `PerceptionObjectNotFound`, which says for each of that type why it is not seen.
+    """
+
+    concept: ClassVar[str | None] = "LookingFor"
+
+    object_type: ObjectType
+
+    def resources(self) -> frozenset[Resource]:
+        return frozenset({Resource.HEAD})
+
+    async def perform(self) -> ObjectDesignator:
+        looking = chosen_robot(self, "detecting").detecting(self)
+        return await perceived(looking, source="camera", object_type=self.object_type)
+
+
+@dataclass
+class WorldStateDetectingMotion(BaseMotion):
+    """Ask the world itself for objects of a type, seen or not; returns the first. Raises `PerceptionObjectNotFound`."""
+
+    concept: ClassVar[str | None] = "CheckingObjectPresence"
+
+    object_type: ObjectType
+
+    async def perform(self) -> ObjectDesignator:
+        asking = chosen_robot(self, "world_state_detecting").world_state_detecting(self)
+        return await perceived(asking, source="world_state", object_type=self.object_type)
+
+
+@dataclass
+class OpeningMotion(BaseMotion):
+    """With the hand on a handle, open what it belongs to, up to 0.05 m or rad before its end; the hand goes along.
+
+    Raises:
+        EnvironmentManipulationImpossible: no joint moves that part, or the hand is not on it.
+        IKError: the hand cannot follow all the way; nothing was moved.
+        PerceptionObjectNotInWorld: the whole is not in the world.
+    """
+
+    concept: ClassVar[str | None] = "Opening"
+
+    object_part: ObjectPart
+    arm: Arms
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "open").open(self)
+
+
+@dataclass
+class ClosingMotion(BaseMotion):
+    """With the hand on a handle, close what it belongs to; the hand goes along. Raises as `OpeningMotion` does."""
+
+    concept: ClassVar[str | None] = "Closing"
+
+    object_part: ObjectPart
+    arm: Arms
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "close").close(self)
+
+
+@dataclass
+class AccessingMotion(BaseMotion):
+    """With the hand on a handle, move a joint by a distance; positive opens, negative closes. Raises as
+    `OpeningMotion` does, `EnvironmentManipulationImpossible` also for a distance beyond the joint's limits.
+
+    Attributes:
+        part_of: the furniture.
+        gripper: the tool frame of the arm.
+        drawer_joint: one of the joints above the handle.
+        drawer_handle: the link that the hand is on.
+        distance: m, or rad for a door.
+    """
+
+    concept: ClassVar[str | None] = "Accessing"
+
+    part_of: ObjectDesignator | Object
+    arm: Arms
+    gripper: str
+    drawer_joint: str
+    drawer_handle: str
+    distance: float
+
+    def resources(self) -> frozenset[Resource]:
+        return reaching(self.arm)
+
+    async def perform(self) -> None:
+        await chosen_robot(self, "accessing").accessing(self)

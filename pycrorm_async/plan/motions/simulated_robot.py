@@ -1,0 +1,195 @@
+"""The simulated robot: motions as exact jumps of the robot in the world. No time, no noise, collisions if asked for.
+
+A motion either has its whole effect, which the world tells once for each thing that moved, or fails and has none.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from pycrorm_async.plan.current_robot import RobotHere, check_in_map, robot_here
+from pycrorm_async.plan.execution.observer import Seen
+from pycrorm_async.plan.failures import (
+    ConfigurationNotReached,
+    EnvironmentManipulationImpossible,
+    IKError,
+    IllPosedGoalFailure,
+    ManipulationGoalInCollision,
+    TorsoGoalUnreachable,
+)
+from pycrorm_async.plan.geometry.articulation import (
+    Handle,
+    closed_position,
+    handle_of,
+    handle_poses,
+    moved_position,
+    opened_position,
+)
+from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, between
+from pycrorm_async.plan.geometry.gripper_checks import check_beside
+from pycrorm_async.plan.motions.perception import seen_by_camera, told_by_world
+from pycrorm_async.plan.object_designators import ObjectPart
+from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.errors import JointLimitExceeded, UnknownJoint
+from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.queries.collision_queries import touched_at
+from pycrorm_async.world.robots.kinematics import Limits, Unreachable, solve
+
+if TYPE_CHECKING:
+    from pycrorm_async.plan.motions.motions import (
+        AccessingMotion,
+        ClosingMotion,
+        DetectingMotion,
+        LookingMotion,
+        MoveArmJointsMotion,
+        MoveGripperMotion,
+        MoveJointsMotion,
+        MoveMotion,
+        MoveTCPMotion,
+        OpeningMotion,
+        WorldStateDetectingMotion,
+    )
+
+__all__ = ["SimulatedModules"]
+
+
+class SimulatedModules:
+    """The process modules of `with simulated_robot:`, with arms that keep to these limits when they are to reach.
+
+    With `collisions` an arm does not go where it, or what it holds, would reach into something else than the robot;
+    the gripper itself may, where the motion allows it.
+    """
+
+    def __init__(self, limits: Limits, *, collisions: bool = False) -> None:
+        self._limits = limits
+        self._collisions = collisions
+
+    async def navigate(self, motion: MoveMotion) -> None:
+        robot_here().body.set_pose(motion.target)
+
+    async def move_tcp(self, motion: MoveTCPMotion) -> None:
+        robot = robot_here()
+        joints = self._reaching(robot, motion.arm, motion.target)
+        if self._collisions:
+            self._check_clear(robot, motion, joints)
+        robot.body.set_joint_positions(joints)
+
+    async def looking(self, motion: LookingMotion) -> None:
+        robot = robot_here()
+        check_in_map(motion.target)
+        robot.body.set_joint_positions(head_joints(robot, motion.target))
+
+    async def move_gripper(self, motion: MoveGripperMotion) -> None:
+        robot = robot_here()
+        joints: dict[str, float] = {}
+        for arm in robot.each_arm(motion.gripper).values():
+            joints |= arm.gripper_joints[motion.motion]
+        robot.body.set_joint_positions(joints)
+
+    async def move_arm_joints(self, motion: MoveArmJointsMotion) -> None:
+        robot = robot_here()
+        wanted: dict[str, float] = {}
+        for arm, positions in ((Arms.LEFT, motion.left_arm_poses), (Arms.RIGHT, motion.right_arm_poses)):
+            for joint in positions or {}:
+                if joint not in (known := robot.one_arm(arm).joints):
+                    raise UnknownJoint(f"{robot.body.name}, {arm.name} arm", joint, known)
+            wanted |= positions or {}
+        _set_joints(robot, wanted)
+
+    async def move_joints(self, motion: MoveJointsMotion) -> None:
+        _set_joints(robot_here(), dict(zip(motion.names, motion.positions, strict=True)))
+
+    async def detecting(self, motion: DetectingMotion) -> Sequence[Seen]:
+        return seen_by_camera(robot_here(), motion.object_type)
+
+    async def world_state_detecting(self, motion: WorldStateDetectingMotion) -> Sequence[Seen]:
+        return told_by_world(motion.object_type)
+
+    async def open(self, motion: OpeningMotion) -> None:
+        handle = handle_of(motion.object_part)
+        self._lead(robot_here(), motion.arm, handle, opened_position(handle))
+
+    async def close(self, motion: ClosingMotion) -> None:
+        handle = handle_of(motion.object_part)
+        self._lead(robot_here(), motion.arm, handle, closed_position(handle))
+
+    async def accessing(self, motion: AccessingMotion) -> None:
+        robot = robot_here()
+        tool_frame = robot.one_arm(motion.arm).tool_frame
+        if motion.gripper != tool_frame:
+            message = f"the gripper of the {motion.arm.name} arm is {tool_frame}, not {motion.gripper}"
+            raise IllPosedGoalFailure(message, motion.gripper)
+        handle = handle_of(ObjectPart(motion.drawer_handle, motion.part_of), motion.drawer_joint)
+        self._lead(robot, motion.arm, handle, moved_position(handle, motion.distance))
+
+    def _lead(self, robot: RobotHere, arm: Arms, handle: Handle, goal: float) -> None:
+        """Bring the handle's joint to `goal` with the hand that is on it; the hand is on it as before then."""
+        check_beside(robot, handle.whole)
+        tool_frame = robot.one_arm(arm).tool_frame
+        tool = robot.body.link_pose(tool_frame)
+        apart = between(tool, handle.whole.bounding_box(handle.link))
+        if apart > HOLD_DISTANCE_M_MAX:
+            message = f"{tool_frame} is not on {handle.link} but {apart:.3f} m away: grasp it first"
+            raise EnvironmentManipulationImpossible(message, handle.link, apart)
+        grip = tool.relative_to(handle.whole.link_pose(handle.link))
+        way = [self._reaching(robot, arm, each @ grip) for each in handle_poses(handle, goal)]
+        robot.body.set_joint_positions(way[-1])
+        handle.whole.set_joint_position(handle.joint, goal)
+
+    def _reaching(self, robot: RobotHere, arm: Arms, target: Pose) -> dict[str, float]:
+        """The arm's joints with which its tool frame is at the target. Raises `IKError`."""
+        tool_frame = robot.one_arm(arm).tool_frame
+        try:
+            return solve(robot.body, arm, target, limits=self._limits)
+        except Unreachable as unreachable:
+            raise IKError(target, arm, tool_frame, unreachable.reason) from unreachable
+
+    def _check_clear(self, robot: RobotHere, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
+        """Raise `ManipulationGoalInCollision` if the arm would be in something with these joints."""
+        arm = robot.one_arm(motion.arm)
+        last = arm.joints[-1] if motion.allow_gripper_collision else None
+        body = robot.body
+        above = {link: body.joints_above(link) for link in body.links if body.body.solids[link]}
+        links = [link for link, found in above.items() if arm.joints[0] in found and last not in found]
+        held = [thing for thing, link in body.attachments.items() if link == arm.tool_frame]
+        met = touched_at(body, joints, links=links, carried=held)
+        if met:
+            part, thing = met[0]
+            message = f"there the {motion.arm.name} arm would be in {thing.name} with {part}"
+            raise ManipulationGoalInCollision(message, part, thing.name)
+
+
+def head_joints(robot: RobotHere, target: Pose) -> dict[str, float]:
+    """Pan and tilt (rad) with which the camera's axis goes towards the target, as far as the neck can turn.
+
+    Pan turns about z of the pan link. Tilt turns about y of the tilt link, whose origin the pan carries
+    around, so it is worked out as it will be after panning.
+    """
+    body, description = robot
+    pan_pose = body.link_pose(description.head_pan_link)
+    tilt_origin = body.link_pose(description.head_tilt_link).relative_to(pan_pose).position
+    seen = target.relative_to(pan_pose).position
+    turn = math.atan2(seen.y, seen.x)
+    pan = math.remainder(body.joint_position(description.head_pan_joint) + turn, math.tau)
+    ahead = math.hypot(seen.x, seen.y) - tilt_origin.x
+    tilt = -math.atan2(seen.z - tilt_origin.z, ahead)
+    return {
+        description.head_pan_joint: _clamped(pan, body.joint_limits(description.head_pan_joint)),
+        description.head_tilt_joint: _clamped(tilt, body.joint_limits(description.head_tilt_joint)),
+    }
+
+
+def _clamped(value: float, limits: tuple[float, float]) -> float:
+    return max(limits[0], min(limits[1], value))
+
+
+def _set_joints(robot: RobotHere, positions: Mapping[str, float]) -> None:
+    body, description = robot
+    try:
+        body.set_joint_positions(positions)
+    except JointLimitExceeded as exceeded:
+        if description.torso_joint in positions and len(positions) == 1:
+            raise TorsoGoalUnreachable(str(exceeded), positions[description.torso_joint]) from exceeded
+        raise ConfigurationNotReached(str(exceeded), dict(positions)) from exceeded

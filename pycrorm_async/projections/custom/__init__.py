@@ -1,0 +1,1 @@
+"""Custom projections: those of the user's own."""

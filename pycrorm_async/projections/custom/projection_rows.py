@@ -1,0 +1,142 @@
+"""What a projection of one's own makes of a batch of events, checked, so that every database keeps the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+
+from pycrorm_async.events.codec import unwritable
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
+from pycrorm_async.projections.custom.projection import OF_EVERY_TABLE, Changes, Event, Projection, columns_of
+from pycrorm_async.projections.fold.column_values import is_missing, json_text, microseconds
+from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.fold.row_batch import Row
+from pycrorm_async.projections.fold.row_writer import stored_rows
+from pycrorm_async.projections.schema.tables import OWN, Storage, column_type, physical_name
+from pycrorm_async.store.dialect import Insertion
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.stored import StoredEvent
+
+__all__ = ["OwnRows"]
+
+_INTEGER_MAX = 2**63 - 1
+
+
+class OwnRows:
+    """Rows to insert, and changes of rows that came with an earlier batch; by table and id. Implements `Batch`."""
+
+    def __init__(self, projection: Projection, declared: Mapping[str, DesignatorTypeDeclared]) -> None:
+        self._projection = projection
+        self._declared = declared
+        self._columns = columns_of(projection)
+        self._inserts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
+        self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
+        self._insertion: Insertion = None
+
+    def fold(self, event: StoredEvent) -> None:
+        """Adds what the projection makes of this event. Raises `CannotFold`, and then has added nothing."""
+        changes = Changes()
+        try:
+            self._projection.fold(self._event(event), changes)
+        except CannotFold:
+            raise
+        except Exception as error:
+            raise CannotFold(f"{self._projection.name} raised {type(error).__name__}: {error}") from error
+        new: set[tuple[str, int]] = set()
+        checked = []
+        for inserts, table, id_, given in changes.all:
+            checked.append((inserts, table, id_, self._checked(event, table, id_, given)))
+            if inserts and ((table, id_) in new or id_ in self._inserts[table]):
+                raise CannotFold(f"{table} has a row {id_} already")
+            if inserts:
+                new.add((table, id_))
+        for inserts, table, id_, values in checked:
+            if inserts:
+                self._inserts[table][id_] = {"id": id_, "process_metadata_id": event.number, **values}
+                self._updates[table].pop(id_, None)  # it was of a row that was not there yet
+            elif id_ in self._inserts[table]:
+                self._inserts[table][id_] |= values
+            elif values:
+                self._updates[table].setdefault(id_, {}).update(values)
+
+    def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
+        """All rows to insert, by (table, columns)."""
+        found: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
+        for table, rows in self._inserts.items():
+            columns = tuple(self._columns[table])
+            if rows:
+                found[f"{OWN}{table}", columns] = [tuple(map(each.get, columns)) for each in rows.values()]
+        return found
+
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        """Makes ready what is to be inserted."""
+        self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self.to_insert(), generation))
+
+    async def write(self, connection: AsyncConnection, generation: int) -> None:
+        """All of it, in this transaction. Raises `RowRefused`."""
+        dialect, quote = dialect_of(connection), connection.dialect.identifier_preparer.quote
+        await dialect.insert(connection, self._insertion)
+        for table, rows in self._updates.items():
+            alike: dict[tuple[str, ...], list[Row]] = {}
+            for id_, values in rows.items():
+                alike.setdefault(tuple(sorted(values)), []).append((id_, *(values[name] for name in sorted(values))))
+            for columns, made in alike.items():
+                kinds = {
+                    quote(dialect.stored_column(name)): column_type(self._columns[table][name]).compile(
+                        dialect=connection.dialect
+                    )
+                    for name in ("id", *columns)
+                }
+                await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, made)
+
+    def _event(self, stored: StoredEvent) -> Event:
+        happening = happening_of(stored)
+        dtype, parameters = None, {}
+        if isinstance(happening, NodeStarted) and happening.designator is not None:
+            if happening.designator not in self._declared:
+                raise CannotFold(f"the designator type {happening.designator} was never declared")
+            dtype = self._declared[happening.designator].dtype
+            parameters = {name: None if is_missing(each) else each for name, each in happening.parameters.items()}
+        number, sequence, _, _, wall_ns, monotonic_ns, _ = stored
+        return Event(number, sequence, microseconds(wall_ns), monotonic_ns, happening, dtype, parameters)
+
+    def _checked(self, event: StoredEvent, table: str, id_: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+        columns = self._columns.get(table)
+        if columns is None:
+            raise CannotFold(f"{self._projection.name} has no table {table!r}")
+        if not isinstance(id_, int) or id_ >> 31 != event.number:
+            raise CannotFold(f"{table}: {id_!r} is no row of this episode: use event.id or event.row(sequence)")
+        for name in given:
+            if name not in columns or name in OF_EVERY_TABLE:
+                raise CannotFold(f"{table} has no column {name!r} to fill")
+        return {name: _value(f"{table}.{name}", columns[name], each) for name, each in given.items()}
+
+
+def _value(place: str, storage: Storage, value: Any) -> Any:
+    """As the column holds it. SQLite would take anything, and change what it cannot hold. Raises `CannotFold`."""
+    if value is None:
+        return None
+    match storage:
+        case "json":
+            try:
+                return json_text(value)
+            except (TypeError, ValueError) as error:
+                raise CannotFold(f"{place}: {error}") from None
+        case "text":
+            fits = isinstance(value, str)
+        case "boolean":
+            fits = isinstance(value, bool)
+        case "real":
+            fits = isinstance(value, int | float) and not isinstance(value, bool)
+        case _:
+            fits = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _INTEGER_MAX
+    if not fits:
+        raise CannotFold(f"{place}: {repr(value)[:80]} stands where {storage} is declared")
+    if storage == "real":
+        value = float(value)
+    fault = unwritable(value)
+    if fault is not None:
+        raise CannotFold(f"{place}: {fault}")
+    return value

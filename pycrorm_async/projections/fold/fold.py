@@ -1,0 +1,316 @@
+"""The fold: one event in, rows out. Pure: no clock, no lookup, no state but the rows of the batch.
+
+The same events give the same rows, live or rebuilt, in one batch or one by one. An event whose rows cannot be made
+raises `CannotFold` before it has left any, so that its episode can be parked there and the others go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from pycrorm_async.events.codec import UnknownShape, decode
+from pycrorm_async.events.ids import SLOT_ROBOT_POSE
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    Happening,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectDetected,
+    ObjectMoved,
+    ObjectRemoved,
+    StateSampled,
+)
+from pycrorm_async.projections.fold.column_values import (
+    CannotFold,
+    json_text,
+    microseconds,
+    pose_columns,
+    pose_row,
+    row,
+)
+from pycrorm_async.projections.fold.parameters import Designators, Made
+from pycrorm_async.projections.fold.row_batch import EpisodeEnd, Row, Rows
+from pycrorm_async.store.stored import StoredEvent
+
+__all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "Undecodable"]
+
+
+_NO_OUTCOME: Row = (None, None, None, None)
+
+
+class Undecodable(CannotFold):
+    """The payload is none of its type and version: nobody has written it like that."""
+
+
+def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
+    """Adds what this event means to `rows`. Raises `CannotFold`, and then has added nothing."""
+    happening = happening_of(event)
+    _FOLDS[event.type](event, happening, designators, rows)
+
+
+def fold_happening(event: StoredEvent, happening: Happening, designators: Designators, rows: Rows) -> None:
+    """The same for whoever has read already what happened."""
+    _FOLDS[event.type](event, happening, designators, rows)
+
+
+def happening_of(event: StoredEvent) -> Happening:
+    """What happened, of an event of an episode: for every fold there is. Raises `CannotFold`, `Undecodable`."""
+    _, _, type_, version, _, _, payload = event
+    if type_ not in _FOLDS:
+        raise CannotFold(f"{type_} is not an event this version knows")
+    try:
+        return decode(type_, payload, version)
+    except UnknownShape as reason:
+        raise CannotFold(str(reason)) from None
+    except msgspec.DecodeError as error:
+        raise Undecodable(f"{type_} cannot be decoded: {error}") from None
+
+
+# --- episodes -------------------------------------------------------------------------------------------------
+
+
+def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: Designators, rows: Rows) -> None:
+    if event.number in rows.episodes:
+        raise CannotFold("the episode starts a second time")
+    rows.episodes[event.number] = [
+        event.number,
+        microseconds(event.wall_ns),
+        started.created_by,
+        started.description,
+        started.software,
+        started.host,
+        started.python,
+        started.plan,
+        started.world,
+        started.seed,
+        "RUNNING",
+        None,
+        None,
+        None,
+        started.simulated,
+        started.thought_by.episode if started.thought_by else None,
+        started.thought_by.node if started.thought_by else None,
+        started.continues,
+        None,
+    ]
+    if started.simulated:
+        rows.inserts["simulated_episode"].append((event.number,))
+
+
+def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Designators, rows: Rows) -> None:
+    failure = ended.failure
+    rows.end_episode(
+        EpisodeEnd(
+            event.number,
+            ended.status,
+            microseconds(event.wall_ns),
+            failure.type if failure else None,
+            failure.message if failure else None,
+            ended.continued_in,
+        )
+    )
+
+
+# --- nodes ----------------------------------------------------------------------------------------------------
+
+
+def _node_started(event: StoredEvent, started: NodeStarted, designators: Designators, rows: Rows) -> None:
+    number, sequence, _, _, wall_ns, monotonic_ns, _ = event
+    node = row(number, sequence)
+    made: Made = []
+    designator = designators.of(started)
+    leaf = designator.rows(event, node, started.parameters, made) if designator is not None else ()
+    parent = row(number, started.parent) if started.parent is not None else None
+    robot = started.robot
+    robot_object = row(number, robot.object.row) if robot is not None and robot.object is not None else None
+    # Nothing raises from here on: an event leaves all of its rows or none.
+    if robot is not None:
+        rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
+    if designator is not None:
+        rows.leaves.setdefault(designator.leaf, []).append(leaf)
+        for table, each in made:
+            rows.inserts[table].append(each)
+    rows.nodes[node] = [
+        node,
+        number,
+        parent,
+        started.kind,
+        designator.dtype if designator is not None else None,
+        "RUNNING",
+        wall_ns // 1000,
+        None,
+        monotonic_ns,
+        None,
+        None,
+        None,
+        None,
+        None,
+        node + SLOT_ROBOT_POSE if robot is not None else None,
+        robot.torso_height if robot is not None else None,
+        robot.object_type if robot is not None else None,
+        robot_object,
+        started.simulated,
+    ]
+
+
+def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:
+    number, _, _, _, wall_ns, monotonic_ns, _ = event
+    node, status = row(number, ended.node), ended.status
+    outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else _NO_OUTCOME
+    if status == "LOST":  # nobody saw when it ended
+        rows.end_node(node, status, None, None, outcome)
+    else:
+        rows.end_node(node, status, wall_ns // 1000, monotonic_ns, outcome)
+
+
+def _outcome(ended: NodeEnded) -> Row:
+    """A node's columns reason to result."""
+    failure = ended.failure
+    return (
+        failure.type.rpartition(".")[2] if failure else None,
+        failure.message if failure else None,
+        json_text(failure.arguments) if failure and failure.arguments else None,
+        json_text(ended.result) if ended.result is not None else None,
+    )
+
+
+# --- the world ------------------------------------------------------------------------------------------------
+
+
+def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    node = _node(event, added.node)
+    joints = json_text(added.joints) if added.joints else None
+    rows.inserts["pose"].append(pose_row(own, number, added.pose))
+    rows.inserts["object"].append(_object_row(event, added, own, own, node, joints))
+
+
+def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designators, rows: Rows) -> None:
+    identity, node = row(event.number, moved.object), _node(event, moved.node)
+    own, number = _own(event)
+    rows.inserts["pose"].append(pose_row(own, number, moved.pose))
+    rows.inserts["object"].append(_object_row(event, moved, own, identity, node, None))
+
+
+def _object_row(
+    event: StoredEvent, value: ObjectAdded | ObjectMoved, own: int, identity: int, node: int | None, joints: str | None
+) -> Row:
+    time = microseconds(event.wall_ns)
+    return own, event.number, "Object", value.name, value.object_type, own, None, identity, time, node, joints
+
+
+def _object_removed(event: StoredEvent, removed: ObjectRemoved, _designators: Designators, rows: Rows) -> None:
+    reference = removed.object
+    seen, identity = row(event.number, reference.row), row(event.number, reference.object)
+    rows.inserts["object_removal"].append(
+        (*_own(event), seen, identity, microseconds(event.wall_ns), _node(event, removed.node))
+    )
+
+
+def _attachment(
+    event: StoredEvent, change: ObjectAttached | ObjectDetached, _designators: Designators, rows: Rows
+) -> None:
+    kind = "attached" if isinstance(change, ObjectAttached) else "detached"
+    parent, child = row(event.number, change.parent.row), row(event.number, change.child.row)
+    rows.inserts["attachment"].append(
+        (*_own(event), kind, parent, child, change.link, microseconds(event.wall_ns), _node(event, change.node))
+    )
+
+
+def _joints_moved(event: StoredEvent, moved: JointsMoved, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    seen, node, time = row(number, moved.object.row), _node(event, moved.node), microseconds(event.wall_ns)
+    rows.inserts["joint_change"].extend(
+        [(own, joint, number, seen, position, time, node) for joint, position in moved.joints.items()]
+    )
+
+
+# --- locations ------------------------------------------------------------------------------------------------
+
+
+def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    offered, taken = resolved.offered, resolved.taken
+    if taken is not None and not 0 <= taken < len(offered):
+        raise CannotFold(f"candidate {taken} was taken of {len(offered)}")
+    node, time = _node(event, resolved.node), microseconds(event.wall_ns)
+    pose_id = own if taken is not None else None
+    if taken is not None:
+        rows.inserts["pose"].append(pose_row(own, number, offered[taken].pose))
+    rows.inserts["location_resolution"].append(
+        (own, number, node, resolved.location, resolved.considered, len(offered), taken, pose_id, time)
+    )
+    rows.inserts["location_candidate"].extend(
+        (own, rank, number, *pose_columns(each.pose), ",".join(each.arms), rank == taken, each.grasp, each.torso_height)
+        for rank, each in enumerate(offered)
+    )
+
+
+# --- perception and the state stream --------------------------------------------------------------------------
+
+
+def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    asked = (number, _node(event, detected.node), detected.source, detected.object_type)
+    time = microseconds(event.wall_ns)
+    made = [  # a list, for `row` may raise
+        (
+            own,
+            rank,
+            *asked,
+            row(number, each.object.row) if each.object is not None else None,
+            each.name,
+            each.object_type,
+            *pose_columns(each.pose),
+            each.visible,
+            time,
+        )
+        for rank, each in enumerate(detected.seen)
+    ]
+    rows.inserts["detection"].extend(made)
+
+
+def _state_sampled(event: StoredEvent, sampled: StateSampled, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    seen, node = row(number, sampled.object.row), _node(event, sampled.node)
+    time, ns = microseconds(event.wall_ns), event.monotonic_ns
+    rows.inserts["state_sample"].extend(
+        [(own, channel, number, seen, node, value, time, ns) for channel, value in sampled.channels.items()]
+    )
+
+
+# --- parts ----------------------------------------------------------------------------------------------------
+
+
+def _own(event: StoredEvent) -> tuple[int, int]:
+    return row(event.number, event.sequence), event.number
+
+
+def _node(event: StoredEvent, sequence: int | None) -> int | None:
+    return row(event.number, sequence) if sequence is not None else None
+
+
+_FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {
+    "EpisodeStarted": _episode_started,
+    "EpisodeEnded": _episode_ended,
+    "NodeStarted": _node_started,
+    "NodeEnded": _node_ended,
+    "ObjectAdded": _object_added,
+    "ObjectMoved": _object_moved,
+    "ObjectRemoved": _object_removed,
+    "ObjectAttached": _attachment,
+    "ObjectDetached": _attachment,
+    "JointsMoved": _joints_moved,
+    "LocationResolved": _location_resolved,
+    "ObjectDetected": _object_detected,
+    "StateSampled": _state_sampled,
+}

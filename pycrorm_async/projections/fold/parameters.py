@@ -1,0 +1,164 @@
+"""A node's parameters as rows: one in the leaf table of its designator, and those of the poses, objects and entries of
+lists and dicts that it names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, TypeAlias
+
+from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
+    FieldDeclared,
+    NodeStarted,
+    ObjectReference,
+    ObjectValue,
+)
+from pycrorm_async.projections.fold.column_values import (
+    AS_IT_IS,
+    CannotFold,
+    in_slot,
+    is_missing,
+    microseconds,
+    object_of,
+    pose_columns,
+    pose_of,
+    pose_row,
+    row,
+    scalar,
+)
+from pycrorm_async.projections.fold.row_batch import Row
+from pycrorm_async.store.stored import StoredEvent
+
+__all__ = ["Designators", "DesignatorFold", "Made"]
+
+_NO_POSE = (None,) * 8
+_ITEM_SCALARS = {"integer": 0, "real": 1, "text": 2, "enum": 2, "boolean": 3, "datetime": 4}
+
+Made: TypeAlias = list[tuple[str, Row]]
+"""Rows of other tables than the leaf table, each with its table."""
+
+
+class DesignatorFold:
+    """How the parameters of one declaration become rows.
+
+    Attributes:
+        leaf: the leaf table and its columns.
+    """
+
+    def __init__(self, declared: DesignatorTypeDeclared) -> None:
+        columned = [each for each in declared.fields if each.type not in ("list", "dict")]
+        self.dtype = declared.dtype
+        self.leaf = (declared.table, ("id", *(each.column for each in columned)))
+        self._columned = [(f.name, AS_IT_IS.get(f.type), _CONVERTED.get(f.type, _scalar), f) for f in columned]
+        self._listed = [each for each in declared.fields if each.type in ("list", "dict")]
+
+    def rows(self, event: StoredEvent, node: int, given: Mapping[str, Any], made: Made) -> Row:
+        """The node's row in the leaf table; those of other tables are added to `made`. Raises `CannotFold`."""
+        leaf: list[Any] = [node]
+        for name, as_it_is, converted, field in self._columned:
+            value = given.get(name)
+            if value is None or type(value) is as_it_is:
+                leaf.append(value)
+            elif is_missing(value):
+                leaf.append(None)
+            else:
+                leaf.append(converted(event, node, field, value, made))
+        for field in self._listed:
+            value = given.get(field.name)
+            if value is not None and not is_missing(value):
+                made.extend(("parameter_item", each) for each in _entries(event, node, field, value))
+        return tuple(leaf)
+
+
+class Designators:
+    """How to fold the nodes of every declared type, by the fingerprint of its declaration.
+
+    `refused` says why declarations cannot share the tables: their nodes cannot be folded.
+    """
+
+    def __init__(
+        self,
+        declarations: Mapping[str, DesignatorTypeDeclared] | None = None,
+        refused: Mapping[str, str] | None = None,
+    ) -> None:
+        self._refused = dict(refused or {})
+        accepted = {name: each for name, each in (declarations or {}).items() if name not in self._refused}
+        self._folds = {name: DesignatorFold(each) for name, each in accepted.items()}
+
+    def of(self, started: NodeStarted) -> DesignatorFold | None:
+        """That of this node; None for a root. Raises `CannotFold`."""
+        name = started.designator
+        if name is None:
+            return None
+        fold = self._folds.get(name)
+        if fold is None:
+            raise CannotFold(self._refused.get(name, f"the designator type {name} was never declared"))
+        return fold
+
+
+def _scalar(_event: StoredEvent, _node: int, field: FieldDeclared, value: Any, _made: Made) -> Any:
+    return scalar(field, field.type, value)
+
+
+def _pose(event: StoredEvent, node: int, field: FieldDeclared, value: Any, made: Made) -> int:
+    pose = pose_of(field, value)
+    own = in_slot(node, field.slot)
+    made.append(("pose", pose_row(own, event.number, pose)))
+    return own
+
+
+def _object(event: StoredEvent, node: int, field: FieldDeclared, given: Any, made: Made) -> int:
+    """The row in force of an object of the world; for another a row of its own, in the field's slot."""
+    value = object_of(field, given)
+    if isinstance(value, ObjectReference):
+        return row(event.number, value.row)
+    own = in_slot(node, field.slot)
+    if value.pose is not None:
+        made.append(("pose", pose_row(own, event.number, value.pose)))
+    pose_id = own if value.pose is not None else None
+    part_of = row(event.number, value.part_of.row) if value.part_of is not None else None
+    number, time = event.number, microseconds(event.wall_ns)
+    columns = own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node, None
+    made.append(("object", columns))
+    return own
+
+
+_CONVERTED: Mapping[str, Callable[[StoredEvent, int, FieldDeclared, Any, Made], Any]] = {
+    "pose": _pose,
+    "object": _object,
+}
+"""How a field's value becomes that of its column; of all other types it is `_scalar`."""
+
+
+def _entries(event: StoredEvent, node: int, field: FieldDeclared, value: Any) -> Iterator[Row]:
+    """The rows of a list's or dict's entries."""
+    if field.type == "dict" and isinstance(value, dict):
+        pairs: list[tuple[str | None, Any]] = list(value.items())
+    elif field.type == "list" and isinstance(value, list):
+        pairs = [(None, each) for each in value]
+    else:
+        raise CannotFold(f"{field.name}: {repr(value)[:80]} stands where {field.type} is declared")
+    for position, (key, entry) in enumerate(pairs):
+        yield (node, field.name, position, event.number, key, *_entry(event, field, entry))
+
+
+def _entry(event: StoredEvent, field: FieldDeclared, value: Any) -> Row:
+    """The columns integer to obj_type of `parameter_item`."""
+    item = field.item or "text"
+    scalars: list[Any] = [None] * 5
+    if value is None or is_missing(value):
+        return (*scalars, *_NO_POSE, None, None, None)
+    if item == "pose":
+        return (*scalars, *pose_columns(pose_of(field, value)), None, None, None)
+    if item == "object":
+        return (*scalars, *_object_entry(event, object_of(field, value)))
+    scalars[_ITEM_SCALARS[item]] = scalar(field, item, value)
+    return (*scalars, *_NO_POSE, None, None, None)
+
+
+def _object_entry(event: StoredEvent, value: ObjectReference | ObjectValue) -> Row:
+    if isinstance(value, ObjectReference):
+        return (*_NO_POSE, row(event.number, value.row), None, None)
+    pose = pose_columns(value.pose) if value.pose is not None else _NO_POSE
+    return (*pose, None, value.name, value.object_type)

@@ -1,0 +1,1 @@
+"""Running folds: batches, checkpoints, catching up."""

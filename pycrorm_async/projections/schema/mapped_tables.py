@@ -1,0 +1,62 @@
+"""The leaf tables that mapped classes stand on, so that a fresh memory answers all of them with nothing.
+
+The built-in classes name their dtype themselves. A class somebody else declared (`class ORMSaying(Action)`) only has a
+table until a designator says which dtype is kept there. Classes of one memory alone come from its declarations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from sqlalchemy import Boolean, Column, Double, Float, Integer, Table
+from sqlalchemy.orm import Mapper
+from sqlalchemy.types import TypeEngine
+
+from pycrorm_async.orm import Action, Designator, Language, Motion
+from pycrorm_async.orm.types import Moment
+from pycrorm_async.projections.schema.layout import Leaf
+from pycrorm_async.projections.schema.tables import Storage
+
+__all__ = ["mapped_leaves", "storage_of"]
+
+_KINDS = {Action: "action", Motion: "motion", Language: "language"}
+_ROOTS = (Designator, *_KINDS)
+
+
+def mapped_leaves() -> list[Leaf]:
+    """Those of all classes below `Designator` that every memory of this process shares."""
+    return list(_leaves(Designator.__mapper__))
+
+
+def _leaves(root: Mapper[Designator]) -> Iterator[Leaf]:
+    for mapper in root.self_and_descendants:
+        table = mapper.local_table
+        if mapper.class_ in _ROOTS or mapper.class_.metadata is not Designator.metadata or not isinstance(table, Table):
+            continue
+        if table.metadata is not Designator.metadata:
+            continue
+        columns = {str(each.name): _storage(each) for each in table.columns if each.name != "id"}
+        built_in = mapper.class_.__module__.startswith("pycrorm_async.orm.")
+        kind = next((kind for root, kind in _KINDS.items() if issubclass(mapper.class_, root)), None)
+        yield Leaf(str(table.name), columns, mapper.class_.__name__ if built_in else None, kind if built_in else None)
+
+
+def _storage(column: Column[object]) -> Storage:
+    for key in column.foreign_keys:
+        target = key.target_fullname
+        if target in ("pose.id", "object.id"):
+            return "pose" if target == "pose.id" else "object"
+    return storage_of(column.type)
+
+
+def storage_of(type_: TypeEngine[Any]) -> Storage:
+    """How a value of this type is stored."""
+    kinds: tuple[tuple[type, Storage], ...] = (
+        (Moment, "time"),
+        (Boolean, "boolean"),
+        (Integer, "integer"),
+        (Float, "real"),
+        (Double, "real"),
+    )
+    return next((storage for kind, storage in kinds if isinstance(type_, kind)), "text")

@@ -1,0 +1,35 @@
+"""The designator types of a memory that have no tables, and why; each stops the episodes that perform it."""
+
+from __future__ import annotations
+
+import msgspec
+
+from pycrorm_async.events.codec import fingerprint
+from pycrorm_async.projections.schema.generations import SHOWN, noted
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog
+
+__all__ = ["unmade_types"]
+
+
+class _Named(msgspec.Struct):
+    dtype: str = ""
+
+
+async def unmade_types(log: EventLog) -> dict[str, str]:
+    """By dtype, or by fingerprint where a declaration has no dtype that can be read."""
+    async with log.snapshot() as connection:
+        generation = await noted(connection, SHOWN)
+        payloads = await dialect_of(connection).declarations(connection)
+    refused = unite(Layout() if generation is None else generation.layout, payloads).refused
+    names = {fingerprint(each): _dtype(each) for each in payloads if fingerprint(each) in refused}
+    return {names[each] or each: reason for each, reason in refused.items()}
+
+
+def _dtype(payload: bytes) -> str:
+    try:
+        return msgspec.json.decode(payload, type=_Named).dtype
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return ""

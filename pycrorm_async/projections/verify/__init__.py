@@ -1,0 +1,1 @@
+"""Verification: the log and the tables compared."""

@@ -1,0 +1,356 @@
+"""Folds the log again and compares with the tables; and looks whether the log itself is whole.
+
+Reads only. Each part is read in one snapshot, so recording and folding go on meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
+from typing import NamedTuple
+
+from sqlalchemy import text
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, TablesOutdated
+from pycrorm_async.events.codec import fingerprint
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.fold.parameters import Designators
+from pycrorm_async.projections.fold.row_batch import Rows
+from pycrorm_async.projections.schema.generations import Generation, current_generation
+from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.unmade_types import unmade_types
+from pycrorm_async.projections.verify.episode_check import Rereading
+from pycrorm_async.projections.verify.findings import Damage, Stopped, Verified
+from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
+from pycrorm_async.projections.verify.verify_custom import compared, not_compared
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
+
+__all__ = ["Verified", "Damage", "Stopped", "verify"]
+
+_PART_EVENTS = 4_000
+_TOLD_MAX = 100
+"""So many findings of each kind are kept; all are counted."""
+_ATTEMPTS = 10
+
+_FINGERPRINTS = text("SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal")
+_TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number >= :first_number AND number < :end")
+# From one number to the next by the index: to read all of it takes minutes where there is much.
+_NUMBERS_OF_NOBODY = text("""
+WITH RECURSIVE there (number) AS (
+    SELECT min(episode) FROM event
+    UNION ALL SELECT (SELECT min(episode) FROM event WHERE episode > number) FROM there WHERE number IS NOT NULL
+) SELECT number FROM there WHERE number IS NOT NULL AND number NOT IN (SELECT number FROM episode) ORDER BY number""")
+_BEYOND = text("""
+SELECT number, head, first, last FROM (
+    SELECT number, head, (SELECT min(sequence) FROM event WHERE episode = number) AS first,
+        (SELECT max(sequence) FROM event WHERE episode = number) AS last
+    FROM episode WHERE number >= :first_number AND number < :end
+) AS each_episode WHERE first < 1 OR last > head ORDER BY number""")
+
+
+async def verify(
+    log: EventLog,
+    *,
+    episode: EpisodeRow | None = None,
+    projections: Sequence[Projection] = (),
+    tell: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Verified:
+    """Looks at all of a memory, or at one episode.
+
+    Args:
+        log: may be open for reading only.
+        episode: to look at; all of them if None.
+        projections: whose tables are looked at too.
+        tell: how many events were looked at, of how many.
+
+    Raises `DatabaseForeign` for tables of a newer version, `DatabaseUnavailable` for a memory without tables.
+    """
+    check = _Check(log, tell)
+    with log.translated():
+        if episode is None:
+            await check.whole()
+        await check.stopped(episode)
+        try:
+            if episode is None:
+                await check.episodes(_Place(0, 0), None)
+            else:
+                await check.episodes(_Place(episode.number, 0), episode.number + 1)
+        except TablesOutdated as fault:
+            check.outdated = str(fault)
+        await check.projections(projections, episode)
+    return check.found()
+
+
+class _Check:
+    """One look at a memory, and how far it is."""
+
+    def __init__(self, log: EventLog, tell: Callable[[int, int], None]) -> None:
+        self._log = log
+        self._dialect = dialect_of(log.engine)
+        self._tell = tell
+        self._damages: list[Damage] = []
+        self._differences: list[Difference] = []
+        self._damage = self._drift = self._remarks = 0
+        self._episodes = self._events = self._rows = self._behind = 0
+        self._not_compared: dict[str, str] = {}
+        self._stopped: list[Stopped] = []
+        self._unmade: dict[str, str] = {}
+        self.outdated: str | None = None
+        self._unfinished = Rereading(0)
+        self._comparison: Comparison | None = None
+
+    def found(self) -> Verified:
+        return Verified(
+            episodes=self._episodes,
+            events=self._events,
+            rows=self._rows,
+            behind=self._behind,
+            damage=self._damage,
+            drift=self._drift,
+            damages=self._damages,
+            differences=self._differences,
+            remarks=self._remarks,
+            not_compared=self._not_compared,
+            stopped=self._stopped,
+            unmade=self._unmade,
+            outdated=self.outdated,
+        )
+
+    async def whole(self) -> None:
+        """The database's own pages, the declarations, and events of no episode."""
+        try:
+            async with self._log.snapshot() as connection:
+                for reason in await self._dialect.faults_of_file(connection):
+                    self._damaged(None, None, reason)
+                names = (await connection.execute(_FINGERPRINTS)).scalars()
+                for name, payload in zip(names, await self._dialect.declarations(connection), strict=True):
+                    if fingerprint(payload) != name:
+                        self._damaged(None, None, f"the declaration {name} is not what was declared")
+                for (number,) in await connection.execute(_NUMBERS_OF_NOBODY):
+                    self._damaged(None, None, f"there are events of an episode {number}, which is not in the log")
+        except DamageError as fault:
+            self._damaged(None, None, str(fault))
+
+    async def stopped(self, episode: EpisodeRow | None) -> None:
+        """The episodes that stopped, and the types without tables that stop every episode which performs them."""
+        for each in await self._log.stopped():
+            if episode is None or each.number == episode.number:
+                if each.refused is not None:
+                    self._stopped.append(Stopped(each.number, "refused", each.refused))
+                if each.parked is not None:
+                    self._stopped.append(Stopped(each.number, "parked", each.parked))
+        if episode is None:
+            self._unmade = await unmade_types(self._log)
+
+    async def episodes(self, at: _Place, end: int | None) -> None:
+        """Those from this place on and below number `end`; to the end of the memory if None."""
+        async with self._log.snapshot() as connection:
+            total = await self._heads(connection, at.number, end)
+        limit = _PART_EVENTS
+        after: _Place | None = at
+        while after is not None:
+            try:
+                after = await self._part(after, end, limit)
+                limit = min(limit * 8, _PART_EVENTS)
+            except _Unreadable as fault:
+                if limit > 1:  # until it is known which event
+                    limit = max(limit // 8, 1)
+                else:
+                    self._damaged(fault.span.number, fault.span.last, f"cannot be read: {fault}")
+                    after = _Place(fault.span.number + 1, 0)
+            self._tell(self._events, max(total, self._events))
+
+    async def projections(self, known: Sequence[Projection], episode: EpisodeRow | None) -> None:
+        """The tables of those that are known here, of all episodes or of one."""
+        self._not_compared = await not_compared(self._log, known)
+        first, end = (0, None) if episode is None else (episode.number, episode.number + 1)
+        for each in known:
+            if each.name in self._not_compared:
+                continue
+            try:
+                async for part in compared(self._log, each, first=first, end=end):
+                    self._rows += part.rows
+                    for difference in part.differences:
+                        self._differs(difference)
+            except DamageError as fault:
+                self._damaged(None, None, str(fault))
+
+    async def _heads(self, connection: AsyncConnection, first: int, end: int | None) -> int:
+        """How many events there should be; and tells of those that should not be."""
+        numbers = {"first_number": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end}
+        for number, head, lowest, highest in await connection.execute(_BEYOND, numbers):
+            for sequence in sorted({lowest, highest}):
+                if not 1 <= sequence <= head:
+                    self._damaged(number, sequence, f"is there, and the episode is said to end with {head}")
+        return int((await connection.execute(_TOTAL, numbers)).scalar_one())
+
+    async def _part(self, at: _Place, end: int | None, limit: int) -> _Place | None:
+        """Looks at so many events that follow this place, in one snapshot; where to go on, None at the end.
+
+        Raises `_Unreadable`, and has told nothing then.
+        """
+        for _ in range(_ATTEMPTS):
+            async with self._log.snapshot() as connection:
+                generation = await current_generation(connection)
+                if generation is None:
+                    raise DatabaseUnavailable(
+                        f"{self._log.address} has no tables yet: `pycrorm writer --once` makes them"
+                    )
+                comparison = self._comparison
+                if comparison is None or comparison.generation != generation:
+                    self._comparison = comparison = Comparison(generation, self._dialect.stored_column)
+                if await self._dialect.keep(connection, comparison.tables):
+                    return await self._look(connection, comparison, at, end, limit)
+            # Between two statements tables were made anew and the old ones dropped.
+        raise DatabaseForeign(f"{self._log.address}: a table is gone: run `pycrorm rebuild`")
+
+    async def _look(
+        self, connection: AsyncConnection, comparison: Comparison, at: _Place, end: int | None, limit: int
+    ) -> _Place | None:
+        episodes = await _episodes(connection, at.number, end, limit)
+        spans, place = _cut(episodes, at, limit)
+        events = await self._events_of(connection, spans)
+        designators = await _designators(connection, comparison.generation)
+        folded = {each.number: each.folded for each in episodes}
+        rows = Rows()
+        low, high = at, place or (None if end is None else _Place(end, 0))
+        settled: frozenset[int] = frozenset()
+        if at.after:
+            self._unfinished.resume(rows, at.after, folded.get(at.number, 0))
+            settled = self._unfinished.carried.intersection(rows.nodes)
+            if self._unfinished.compared:
+                low = _Place(at.number + 1, 0)
+        read: dict[int, Rereading] = {}
+        for span in spans:
+            if span.after == 0:
+                self._unfinished = Rereading(span.number)
+                self._episodes += 1
+            read[span.number] = self._unfinished
+            self._unfinished.read(span, events.get(span.number, {}), folded[span.number], designators, rows)
+        carried: frozenset[int] = frozenset()
+        if place is not None and place.after:
+            self._unfinished.leave(rows, place.after, folded[place.number])
+            carried = self._unfinished.carried
+            if self._unfinished.compared:
+                high = _Place(place.number + 1, 0)
+        self._take_over(read.values())
+        within = Range(low.row or None, high and high.row, low.number or None, high and high.number)
+        await self._compare(connection, comparison, rows, within, carried, settled - carried, read)
+        return place
+
+    async def _events_of(self, connection: AsyncConnection, spans: Sequence[Span]) -> dict[int, dict[int, StoredEvent]]:
+        """By number and sequence."""
+        try:
+            with self._log.translated():
+                events = await self._dialect.spans(connection, spans)
+        except DamageError as fault:
+            for span in spans:
+                if span.last > span.after:
+                    raise _Unreadable(span, str(fault)) from fault
+            raise
+        by_number = groupby(events, key=attrgetter("number"))
+        return {number: {event.sequence: event for event in each} for number, each in by_number}
+
+    async def _compare(
+        self,
+        connection: AsyncConnection,
+        comparison: Comparison,
+        rows: Rows,
+        within: Range,
+        carried: Collection[int],
+        settled: Collection[int],
+        read: Mapping[int, Rereading],
+    ) -> None:
+        try:
+            with self._log.translated():
+                found = await comparison.differences(connection, rows, within, carried=carried, settled=settled)
+        except DamageError as fault:
+            self._damaged(None, None, str(fault))
+            return
+        self._rows += comparison.count
+        for each in sorted(found, key=attrgetter("number", "sequence")):
+            if each.number not in read or not read[each.number].hides(each):
+                self._differs(each)
+
+    # --- findings -----------------------------------------------------------------------------------------------
+
+    def _take_over(self, episodes: Iterable[Rereading]) -> None:
+        """What was found in this part of each."""
+        for each in episodes:
+            for sequence, reason in each.damages:
+                self._damaged(each.number, sequence, reason)
+            self._events += each.events
+            self._behind += each.behind
+            self._remarks += each.remarks
+            each.events = each.behind = each.remarks = 0
+            each.damages.clear()
+
+    def _differs(self, difference: Difference) -> None:
+        self._drift += 1
+        if len(self._differences) < _TOLD_MAX:
+            self._differences.append(difference)
+
+    def _damaged(self, number: int | None, sequence: int | None, reason: str) -> None:
+        self._damage += 1
+        if len(self._damages) < _TOLD_MAX:
+            self._damages.append(Damage(number, sequence, " ".join(reason.split())))
+
+
+class _Unreadable(Exception):
+    """The first event of this span, or one after it, cannot be read from the file."""
+
+    def __init__(self, span: Span, reason: str) -> None:
+        super().__init__(reason)
+        self.span = span
+
+
+class _Place(NamedTuple):
+    """After this event of this episode."""
+
+    number: int
+    after: int
+
+    @property
+    def row(self) -> int:
+        """The smallest id a row can have that is made after it."""
+        return self.number << 31 | (self.after + 1 if self.after else 0) << 5
+
+
+def _cut(episodes: Sequence[EpisodeRow], at: _Place, limit: int) -> tuple[list[Span], _Place | None]:
+    """The next part of these episodes, and where the one after it begins; None if that is the end of all."""
+    spans: list[Span] = []
+    left = limit
+    for each in episodes:
+        after = at.after if each.number == at.number else 0
+        last = min(each.head, after + left)
+        spans.append(Span(each.number, after, last))
+        left -= last - after
+        if last < each.head:
+            return spans, _Place(each.number, last)
+        if left <= 0:
+            return spans, _Place(each.number + 1, 0)
+    if len(episodes) < limit:
+        return spans, None
+    return spans, _Place(episodes[-1].number + 1, 0)
+
+
+async def _episodes(connection: AsyncConnection, first: int, end: int | None, limit: int) -> list[EpisodeRow]:
+    found = await connection.execute(
+        text(
+            "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode"
+            " WHERE number >= :first AND number < :end ORDER BY number LIMIT :limit"
+        ),
+        {"first": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end, "limit": limit},
+    )
+    return [EpisodeRow(*row) for row in found]
+
+
+async def _designators(connection: AsyncConnection, generation: Generation) -> Designators:
+    payloads = await dialect_of(connection).declarations(connection)
+    _, accepted, refused = unite(generation.layout, payloads)
+    return Designators(accepted, refused)

@@ -1,0 +1,148 @@
+"""Folds the log again for a projection of one's own, and compares with its tables, whole episodes at a time."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Sequence
+from typing import NamedTuple
+
+from sqlalchemy import text
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.errors import DatabaseForeign
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.custom.projection_rows import OwnRows
+from pycrorm_async.projections.custom.projection_tables import OwnMeaning, fault_in_version, layout_of
+from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.run import checkpoints
+from pycrorm_async.projections.run.batch_fold import Batch
+from pycrorm_async.projections.schema.generations import Generation, all_noted, projections_in
+from pycrorm_async.projections.schema.tables import OWN
+from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import Span
+
+__all__ = ["Compared", "compared", "not_compared"]
+
+_PART_EVENTS = 4_000
+_EPISODES_MAX = 400
+_ATTEMPTS = 10
+
+
+class Compared(NamedTuple):
+    """Some episodes: how many rows were looked at, and what is different."""
+
+    rows: int
+    differences: list[Difference]
+
+
+async def not_compared(log: EventLog, known: Sequence[Projection]) -> dict[str, str]:
+    """By name, why a projection of this memory cannot be compared."""
+    here = {each.name: each for each in known}
+    async with log.snapshot() as connection:
+        there = projections_in(await all_noted(connection))
+        dialect = connection.dialect
+    reasons: dict[str, str] = {}
+    for name, each in there.items():
+        fault = "its code is not here"
+        if name in here:
+            fault = fault_in_version(here[name], each, layout_of(here[name], dialect)) or ""
+        if fault:
+            reasons[name] = fault
+    return reasons
+
+
+async def compared(
+    log: EventLog, projection: Projection, *, first: int = 0, end: int | None = None
+) -> AsyncIterator[Compared]:
+    """Part after part, the episodes from number `first` on and below `end`; all of them if None.
+
+    Nothing if it has no tables here yet. Raises `DatabaseForeign` if one is gone.
+    """
+    at: int | None = first
+    while at is not None:
+        at, part = await _part(log, projection, at, end)
+        yield part
+
+
+async def _part(log: EventLog, projection: Projection, first: int, end: int | None) -> tuple[int | None, Compared]:
+    for _ in range(_ATTEMPTS):
+        async with log.snapshot() as connection:
+            generation = projections_in(await all_noted(connection)).get(projection.name)
+            if generation is None or generation.version != projection.version:
+                return None, Compared(0, [])
+            comparison = Comparison(generation, dialect_of(connection).stored_column, {})
+            place = checkpoints.place_of(generation.number, projection.name)
+            if await dialect_of(connection).keep(connection, [*comparison.tables, place]):
+                return await _look(connection, projection, comparison, first, end)
+        # Between two statements they were made anew and the old ones dropped.
+    raise DatabaseForeign(
+        f"{log.address}: a table of the projection {projection.name} is gone: run `pycrorm rebuild {projection.name}`"
+    )
+
+
+async def _look(
+    connection: AsyncConnection, projection: Projection, comparison: Comparison, first: int, end: int | None
+) -> tuple[int | None, Compared]:
+    folded = await _folded(connection, projection, comparison.generation, first, end)
+    payloads = await dialect_of(connection).declarations(connection)
+    _, batch = OwnMeaning(projection).learn(comparison.generation.layout, payloads)
+    rows = batch()
+    assert isinstance(rows, OwnRows)
+    findings: list[Difference] = []
+    count = 0
+    following = end
+    for number, last in folded:
+        if count >= _PART_EVENTS:
+            following = number
+            break
+        fault = await _fold_again(connection, rows, number, last)
+        count += last
+        if fault is not None:
+            sequence, reason = fault
+            stored = "shown in the tables"
+            findings.append(Difference(number, sequence, projection.name, "fold", stored, f"parked: {reason}"))
+    else:
+        if len(folded) == _EPISODES_MAX:
+            following = folded[-1][0] + 1
+    lost = {each.number for each in findings}
+    within = Range(first << 31 or None, None if following is None else following << 31, None, None)
+    found = await comparison.differences(connection, rows, within, carried=(), settled=())
+    findings += [each._replace(table=each.table.removeprefix(OWN)) for each in found if each.number not in lost]
+    return None if following == end else following, Compared(comparison.count, findings)
+
+
+async def _folded(
+    connection: AsyncConnection, projection: Projection, generation: Generation, first: int, end: int | None
+) -> list[tuple[int, int]]:
+    """Number of each episode, and how much of it the tables show."""
+    place = checkpoints.place_of(generation.number, projection.name)
+    found = await connection.execute(
+        text(
+            f"SELECT id, folded FROM {place} WHERE id >= :first AND id < :end ORDER BY id LIMIT {_EPISODES_MAX}"  # noqa: S608
+        ),
+        {"first": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end},
+    )
+    return [(each.id, each.folded) for each in found]
+
+
+async def _fold_again(connection: AsyncConnection, rows: Batch, number: int, last: int) -> tuple[int, str] | None:
+    """The event that cannot be folded, and why; None if all of them can."""
+    for after in range(0, last, _PART_EVENTS):
+        page = Span(number, after, min(after + _PART_EVENTS, last))
+        sequence = after
+        for event in await dialect_of(connection).spans(connection, [page]):
+            sequence += 1
+            if event.sequence != sequence:
+                break
+            try:
+                rows.fold(event)
+            except CannotFold as reason:
+                return sequence, str(reason)
+        else:
+            if sequence == page.last:
+                continue
+            sequence += 1
+        return sequence, "it is missing in the log"
+    return None

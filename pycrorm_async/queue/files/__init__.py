@@ -1,0 +1,1 @@
+"""The files of a spool: frames, segments, locks, how they are read."""

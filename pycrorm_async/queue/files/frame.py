@@ -1,0 +1,244 @@
+"""One frame to bytes and back; pure. The layout is in the package's docstring.
+
+A frame decodes whole and unchanged or not at all: every bit of it is under its checksum.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Iterator, Sequence
+from struct import Struct, pack
+from typing import Final, NamedTuple, TypeAlias
+from zlib import crc32
+
+from pycrorm_async.bulk_records import make
+
+__all__ = [
+    "Buffer",
+    "Frame",
+    "Fields",
+    "EVENT",
+    "DECLARATION",
+    "COMMIT",
+    "HEADER_BYTES",
+    "TYPE_BYTES_MAX",
+    "COMMIT_BYTES",
+    "NO_EPISODE",
+    "CHECKSUM",
+    "CHECKSUM_START",
+    "encode",
+    "encode_header",
+    "encode_body",
+    "encode_commit",
+    "encode_span",
+    "decode",
+    "decode_each",
+    "span_checksum",
+    "frame_bytes",
+]
+
+Buffer: TypeAlias = bytes | mmap.mmap
+
+EVENT: Final = 1
+DECLARATION: Final = 2
+COMMIT: Final = 3
+
+_HEAD: Final = Struct("<BBHIQQqq16sI")
+"""The header of a frame without its checksum."""
+CHECKSUM: Final = Struct("<I")
+CHECKSUM_START: Final = _HEAD.size
+HEADER_BYTES: Final = _HEAD.size + CHECKSUM.size
+_HEADER: Final = Struct(f"{_HEAD.format}I")
+_CHECKED: Final = 0x2144DF1C
+"""The crc32 of anything with its own crc32 behind it."""
+COMMIT_BYTES: Final = HEADER_BYTES + 8
+TYPE_BYTES_MAX: Final = 2**8 - 1
+NO_EPISODE: Final = bytes(16)
+_PADDING: Final = tuple(bytes(count) for count in range(8))
+
+
+class Frame(NamedTuple):
+    """One decoded frame. `size` is the bytes it takes; `type` is still UTF-8; `checksum` is its own crc32."""
+
+    kind: int
+    version: int
+    position: int
+    sequence: int
+    wall_ns: int
+    monotonic_ns: int
+    episode: bytes
+    type: bytes
+    payload: bytes
+    checksum: int
+    size: int
+
+
+Fields: TypeAlias = tuple[int, int, int, int, int, int, bytes, bytes, bytes, int, int]
+"""A `Frame` without its names, which take a fifth of the time of decoding it."""
+
+
+def encode(
+    *,
+    kind: int,
+    version: int,
+    position: int,
+    sequence: int,
+    wall_ns: int,
+    monotonic_ns: int,
+    episode: bytes,
+    type_name: bytes,
+    payload: bytes,
+    salt: int,
+) -> bytes:
+    """The bytes of one frame."""
+    body = encode_body(type_name, payload)
+    header = encode_header(
+        kind,
+        len(type_name),
+        version,
+        len(payload),
+        position,
+        sequence,
+        wall_ns,
+        monotonic_ns,
+        episode,
+        salt,
+        crc32(body),
+    )
+    return header + body
+
+
+def encode_body(type_name: bytes, payload: bytes) -> bytes:
+    """What follows a frame's header. The live queue makes it outside its lock, and the header inside."""
+    return b"".join((type_name, payload, _PADDING[-(len(type_name) + len(payload)) & 7]))
+
+
+def encode_header(  # by place: keywords would cost every event 0.05 µs
+    kind: int,
+    type_bytes: int,
+    version: int,
+    payload_bytes: int,
+    position: int,
+    sequence: int,
+    wall_ns: int,
+    monotonic_ns: int,
+    episode: bytes,
+    salt: int,
+    body_checksum: int,
+    /,
+) -> bytes:
+    """A frame's header, `CHECKSUM_START` bytes and the checksum of all of the frame."""
+    head = _HEAD.pack(
+        kind, type_bytes, version, payload_bytes, position, sequence, wall_ns, monotonic_ns, episode, salt
+    )
+    return head + CHECKSUM.pack(crc32(head, body_checksum))
+
+
+def encode_commit(*, position: int, count: int, checksum: int, wall_ns: int, monotonic_ns: int, salt: int) -> bytes:
+    """The frame that says: all records up to `position` are on the disk, `count` of them since the last such frame."""
+    return encode(
+        kind=COMMIT,
+        version=0,
+        position=position,
+        sequence=count,
+        wall_ns=wall_ns,
+        monotonic_ns=monotonic_ns,
+        episode=NO_EPISODE,
+        type_name=b"",
+        payload=CHECKSUM.pack(checksum),
+        salt=salt,
+    )
+
+
+def encode_span(frames: Sequence[Frame], *, after: int, salt: int, unsaid: Sequence[int] = ()) -> tuple[bytes, bytes]:
+    """These records at the positions that follow `after`; and the commit frame that says of them, and of those before
+    whose checksums are `unsaid`, that they are on the disk.
+    """
+    encoded = [
+        encode(
+            kind=each.kind,
+            version=each.version,
+            position=position,
+            sequence=each.sequence,
+            wall_ns=each.wall_ns,
+            monotonic_ns=each.monotonic_ns,
+            episode=each.episode,
+            type_name=each.type,
+            payload=each.payload,
+            salt=salt,
+        )
+        for position, each in enumerate(frames, after + 1)
+    ]
+    checksums = [*unsaid, *(CHECKSUM.unpack_from(each, CHECKSUM_START)[0] for each in encoded)]
+    commit = encode_commit(
+        position=after + len(frames),
+        count=len(checksums),
+        checksum=span_checksum(checksums),
+        wall_ns=frames[-1].wall_ns if frames else 0,
+        monotonic_ns=frames[-1].monotonic_ns if frames else 0,
+        salt=salt,
+    )
+    return b"".join(encoded), commit
+
+
+def decode(buffer: Buffer, offset: int, salt: int) -> Frame | None:
+    """The frame that begins at `offset`, or None: nothing, a torn frame, a changed one, or one of another segment."""
+    for fields in decode_each(buffer, offset, salt):
+        return make(Frame, fields)
+    return None
+
+
+def decode_each(buffer: Buffer, offset: int, salt: int) -> Iterator[Fields]:
+    """The frames that follow one another from `offset` on, up to where none decodes; looks at each when asked for it.
+
+    1 µs each, a third of it for the checksum.
+    """
+    unpack, end = _HEADER.unpack, len(buffer)
+    while (body_start := offset + HEADER_BYTES) <= end:
+        header = buffer[offset:body_start]  # a copy: what is checked is what was unpacked, also while others write
+        (
+            kind,
+            type_bytes,
+            version,
+            payload_bytes,
+            position,
+            sequence,
+            wall_ns,
+            monotonic_ns,
+            episode,
+            salted,
+            checksum,
+        ) = unpack(header)
+        if salted != salt or not EVENT <= kind <= COMMIT:
+            return
+        size = HEADER_BYTES + (type_bytes + payload_bytes + 7 & -8)
+        offset += size
+        if offset > end:
+            return
+        body = buffer[body_start:offset]
+        if crc32(header, crc32(body)) != _CHECKED:
+            return
+        yield (
+            kind,
+            version,
+            position,
+            sequence,
+            wall_ns,
+            monotonic_ns,
+            episode,
+            body[:type_bytes],
+            body[type_bytes : type_bytes + payload_bytes],
+            checksum,
+            size,
+        )
+
+
+def frame_bytes(type_bytes: int, payload_bytes: int) -> int:
+    """The size of a frame with a type's name and a payload of these sizes."""
+    length = type_bytes + payload_bytes
+    return HEADER_BYTES + length + (-length & 7)
+
+
+def span_checksum(checksums: Sequence[int]) -> int:
+    """The checksum of a span of records, from those of its frames. Chained record by record it is the same."""
+    return crc32(pack(f"<{len(checksums)}I", *checksums))

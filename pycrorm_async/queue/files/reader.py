@@ -1,0 +1,128 @@
+"""Reads records back from the segments of a recorder that lives, in order, payloads untouched.
+
+A hole is an error here: whoever calls knows up to which position the records are there.
+"""
+
+from __future__ import annotations
+
+import mmap
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from pycrorm_async.bulk_records import make
+from pycrorm_async.errors import SpoolDamaged
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.queue.files.frame import COMMIT, EVENT, Buffer, decode_each
+from pycrorm_async.queue.files.segment import decode_header, header_bytes, salt_of
+
+__all__ = ["Cursor", "Batch", "Reader", "checked_type"]
+
+
+class Cursor(NamedTuple):
+    """A place between two records: the next frame to look at, and the position of the record before it."""
+
+    number: int
+    offset: int
+    position: int
+
+
+class Batch(NamedTuple):
+    """Records, their payloads' size, and where the next ones begin. `complete`: one more would pass a limit."""
+
+    records: list[Record]
+    payload_bytes: int
+    after: Cursor
+    complete: bool
+
+
+def checked_type(path: Path, offset: int, name: bytes) -> str:
+    """The name of an event's type in the frame at this place. Raises `SpoolDamaged` for what no recorder writes."""
+    try:
+        type_name = name.decode()
+    except UnicodeDecodeError:
+        raise SpoolDamaged(path, offset, f"the name of the event's type, {name!r}, is not UTF-8") from None
+    if not type_name or "\0" in type_name:
+        raise SpoolDamaged(path, offset, f"the name of the event's type, {name!r}, is not one")
+    return type_name
+
+
+class Reader:
+    """Reads one recorder's segments. `load` gives the bytes of the segment of a number."""
+
+    def __init__(self, *, recorder: bytes, start: Cursor, load: Callable[[int], tuple[Path, Buffer]]) -> None:
+        self.cursor = start
+        self._recorder = recorder
+        self._load = load
+        self._number = 0
+        self._path = Path()
+        self._buffer: Buffer = b""
+        self._types: dict[bytes, str] = {}
+
+    def read(self, *, last: int, events_max: int, bytes_max: int, begun: Batch | None = None) -> Batch:
+        """The records after `begun` (or after the cursor) up to position `last`, those of `begun` before them.
+
+        At most `events_max`, and payloads of at most `bytes_max` together unless the first alone is larger. The
+        cursor stays: set it to `after` when the batch was given away. Raises `SpoolDamaged`.
+        """
+        records, total, (number, offset, position), _ = begun or Batch([], 0, self.cursor, complete=False)
+        types = self._types
+        if number != self._number:
+            self._turn_to(number)
+        until = min(last, position + events_max - len(records))
+        full = False
+        while position < until and not full:
+            for frame in decode_each(self._buffer, offset, salt_of(self._recorder, number)):
+                kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, _, size = frame
+                if kind != COMMIT:
+                    total += len(payload)
+                    if total > bytes_max and records:
+                        total -= len(payload)
+                        full = True
+                        break
+                    if at != position + 1:
+                        raise SpoolDamaged(self._path, offset, f"holds position {at} where {position + 1} belongs")
+                    position = at
+                    type_name = types.get(name)
+                    if type_name is None:
+                        type_name = types[name] = checked_type(self._path, offset, name)
+                    owner = episode if kind == EVENT else None
+                    values = (position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
+                    records.append(make(Record, values))
+                offset += size
+                if position == until:
+                    break
+            else:
+                number, offset = number + 1, self._next_segment(number + 1, offset, position)
+                if not records:  # the segment that ended may be deleted before the next read
+                    self.cursor = Cursor(number, offset, position)
+        complete = full or len(records) >= events_max or total >= bytes_max
+        return Batch(records, total, Cursor(number, offset, position), complete)
+
+    def skip_to(self, position: int) -> None:
+        """Goes on behind this position, all records up to which are there. Raises as `read` does."""
+        while self.cursor.position < position:
+            self.cursor = self.read(last=position, events_max=10_000, bytes_max=2**22).after
+
+    def close(self) -> None:
+        """Gives up the segment it looks at."""
+        if isinstance(self._buffer, mmap.mmap):
+            self._buffer.close()
+        self._number, self._buffer = 0, b""
+
+    def _turn_to(self, number: int) -> None:
+        self.close()
+        self._path, self._buffer = self._load(number)
+        self._number = number
+
+    def _next_segment(self, number: int, offset: int, position: int) -> int:
+        """The first frame of the segment that goes on where this one ends."""
+        before = self._path
+        try:
+            self._turn_to(number)
+        except FileNotFoundError:
+            raise SpoolDamaged(before, offset, f"position {position + 1} is missing") from None
+        header = decode_header(self._buffer)
+        if header is None or header.base != position + 1:
+            raise SpoolDamaged(before, offset, f"position {position + 1} is missing")
+        return header_bytes(len(header.open))

@@ -1,0 +1,237 @@
+"""One segment file: its header, and the file itself, allocated ahead and mapped.
+
+The whole file has its blocks before anything is mapped, so a full disk is an `OSError` while allocating and never a
+SIGBUS while writing. It gets its name only when that is safe on the disk.
+"""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from struct import Struct
+from typing import Final, NamedTuple
+from zlib import crc32
+
+from pycrorm_async.errors import SpoolDamaged
+from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId
+from pycrorm_async.queue.files.file_access import open_file
+from pycrorm_async.queue.files.frame import Buffer
+from pycrorm_async.queue.files.locks import FileIdentity
+
+__all__ = [
+    "FORMAT",
+    "OPENS",
+    "CLOSES",
+    "SEGMENT_BYTES_MAX",
+    "Last",
+    "SegmentHeader",
+    "Segment",
+    "header_bytes",
+    "encode_header",
+    "decode_header",
+    "format_of",
+    "salt_of",
+    "segment_path",
+    "segment_numbers",
+    "sync_folder",
+    "read_segment",
+    "map_segment",
+]
+
+MAGIC: Final = b"PYCRQSEG"
+FORMAT: Final = 1
+SUFFIX: Final = ".segment"
+OPENS: Final = "EpisodeStarted"
+CLOSES: Final = "EpisodeEnded"
+SEGMENT_BYTES_MAX: Final = 2**30
+"""No segment is larger, so that reading one never takes more memory than this: 128 times the default."""
+_HEADER: Final = Struct("<8sII16sQQI")
+_CHECKSUM: Final = Struct("<I")
+_POSITION_MAX: Final = 2**62
+"""No recorder gets so far; a header that says so was changed."""
+_FIXED: Final = _HEADER.size + _CHECKSUM.size
+_OPEN: Final = Struct("<16sQqq")
+
+
+class Last(NamedTuple):
+    """The last record of an open episode."""
+
+    sequence: int
+    wall_ns: int
+    monotonic_ns: int
+
+
+class SegmentHeader(NamedTuple):
+    """Where a segment belongs: `base` is the position of its first record, `open` the episodes open before it."""
+
+    recorder: bytes
+    number: int
+    base: int
+    open: Mapping[EpisodeId, Last]
+
+
+def header_bytes(episodes: int) -> int:
+    """The size of a header that names so many open episodes."""
+    return _FIXED + episodes * _OPEN.size
+
+
+def salt_of(recorder: bytes, number: int) -> int:
+    """What every frame of this segment carries, and no frame of another."""
+    return crc32(number.to_bytes(8, "little"), crc32(recorder))
+
+
+def encode_header(header: SegmentHeader) -> bytes:
+    """The bytes at the begin of a segment."""
+    episodes = b"".join(_OPEN.pack(episode, *last) for episode, last in header.open.items())
+    fixed = _HEADER.pack(
+        MAGIC,
+        FORMAT,
+        salt_of(header.recorder, header.number),
+        header.recorder,
+        header.number,
+        header.base,
+        len(header.open),
+    )
+    return fixed + _CHECKSUM.pack(crc32(fixed, crc32(episodes))) + episodes
+
+
+def format_of(buffer: Buffer) -> int | None:
+    """The format this segment was written in, or None where no header of any format begins."""
+    if len(buffer) < _FIXED or buffer[: len(MAGIC)] != MAGIC:
+        return None
+    return int.from_bytes(buffer[8:12], "little")
+
+
+def decode_header(buffer: Buffer) -> SegmentHeader | None:
+    """The header, or None: made ahead and never begun, torn, or changed."""
+    if format_of(buffer) != FORMAT:
+        return None
+    fixed = buffer[: _HEADER.size]
+    _, _, salt, recorder, number, base, count = _HEADER.unpack(fixed)
+    end = header_bytes(count)
+    if end > len(buffer):
+        return None
+    episodes = buffer[_FIXED:end]
+    (checksum,) = _CHECKSUM.unpack_from(buffer, _HEADER.size)
+    if crc32(fixed, crc32(episodes)) != checksum or salt != salt_of(recorder, number):
+        return None
+    opened = {EpisodeId(episode): Last(*last) for episode, *last in _OPEN.iter_unpack(episodes)}
+    if not 0 < base <= _POSITION_MAX or any(not 0 < last.sequence <= SEQUENCE_MAX for last in opened.values()):
+        return None
+    return SegmentHeader(recorder, number, base, opened)
+
+
+def segment_path(folder: Path, number: int) -> Path:
+    """The file of this number; names sort as numbers do up to 10⁸ segments."""
+    return folder / f"{number:08d}{SUFFIX}"
+
+
+def segment_numbers(folder: Path) -> list[int]:
+    """The numbers of the segments in this folder, in order. Files of other names are not ours to judge."""
+    stems = (path.name.removesuffix(SUFFIX) for path in folder.iterdir() if path.suffix == SUFFIX)
+    numbers = ((stem, int(stem)) for stem in stems if stem.isascii() and stem.isdigit())
+    return sorted(number for stem, number in numbers if 0 < number < 2**64 and stem == f"{number:08d}")
+
+
+def read_segment(path: Path) -> bytes:
+    """The bytes of a segment that no process writes any more.
+
+    Raises `SpoolDamaged` for a file larger than any segment, and `OSError`.
+    """
+    descriptor, size = _open_segment(path)
+    with os.fdopen(descriptor, "rb") as file:
+        return file.read(size)
+
+
+def map_segment(path: Path) -> mmap.mmap:
+    """The bytes of a segment, shared with the process that writes it. Raises as `read_segment` does."""
+    descriptor, size = _open_segment(path)
+    try:
+        if size == 0:
+            raise SpoolDamaged(path, 0, "it is empty")
+        return mmap.mmap(descriptor, size, access=mmap.ACCESS_READ)
+    finally:
+        os.close(descriptor)
+
+
+def _open_segment(path: Path) -> tuple[int, int]:
+    """The descriptor and the size of a regular file; opening a pipe of that name must not wait for its writer."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    status = os.fstat(descriptor)
+    if stat.S_ISREG(status.st_mode) and status.st_size <= SEGMENT_BYTES_MAX:
+        return descriptor, status.st_size
+    os.close(descriptor)
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
+    raise SpoolDamaged(
+        path, SEGMENT_BYTES_MAX, f"it takes {status.st_size:,} bytes, and a segment at most {SEGMENT_BYTES_MAX:,}"
+    )
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes the names in a folder safe. Raises `OSError`."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+class Segment:
+    """A segment this process writes: `buffer` is its bytes, shared with the file."""
+
+    __slots__ = ("buffer", "descriptor", "identity", "number", "path")
+
+    def __init__(self, *, number: int, path: Path, descriptor: int, buffer: mmap.mmap) -> None:
+        self.number = number
+        self.path = path
+        self.descriptor = descriptor
+        self.identity = FileIdentity.of(os.fstat(descriptor))
+        self.buffer = buffer
+
+    @classmethod
+    def allocate(cls, folder: Path, *, number: int, size: int) -> Segment:
+        """A new file of zeros, safe on the disk under its name. Raises `OSError` and leaves nothing behind."""
+        path = segment_path(folder, number)
+        unfinished = path.with_suffix(".making")
+        descriptor = open_file(unfinished, os.O_RDWR | os.O_TRUNC)
+        try:
+            os.posix_fallocate(descriptor, 0, size)
+            os.fsync(descriptor)
+            unfinished.rename(path)
+            sync_folder(folder)
+            buffer = mmap.mmap(descriptor, size)
+        except BaseException:
+            os.close(descriptor)
+            unfinished.unlink(missing_ok=True)
+            path.unlink(missing_ok=True)
+            raise
+        return cls(number=number, path=path, descriptor=descriptor, buffer=buffer)
+
+    def begin(self, header: SegmentHeader) -> int:
+        """Writes the header and returns where the first frame goes."""
+        encoded = encode_header(header)
+        self.buffer[: len(encoded)] = encoded
+        return len(encoded)
+
+    def sync(self) -> None:
+        """Everything in the mapping is on the disk. Raises `OSError`, after which nothing about it is known."""
+        os.fdatasync(self.descriptor)
+
+    @property
+    def is_in_place(self) -> bool:
+        """Whether the file still has its name: syncing one that was deleted succeeds."""
+        return self.identity.is_at(self.path)
+
+    def close(self) -> None:
+        """Gives up the mapping and the file; what was written stays. Twice is once."""
+        if self.descriptor >= 0:
+            self.buffer.close()
+            os.close(self.descriptor)
+            self.descriptor = -1

@@ -1,0 +1,153 @@
+"""The consumer's end of a live queue: synced records in order, read back from the folder the queue is in.
+
+It belongs to one task of one loop. The sync thread may move the queue to another folder at any moment (`relocation.py`)
+and publishes the new `Place`. The consumer follows with its next step, from the position it has got to. A read that
+fails because of the move is made again there; the sync thread is asked to look at its files first.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolUnavailable
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.queue.files.frame import Buffer
+from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.reader import Batch, Cursor, Reader
+from pycrorm_async.queue.files.recorder_folder import DRAIN, available
+from pycrorm_async.queue.files.segment import map_segment, segment_path
+from pycrorm_async.queue.live.notifier import Bell
+from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+
+__all__ = ["Consumer", "Place", "Written"]
+
+
+class Place(NamedTuple):
+    """The folder a queue writes in, under this recorder's id; `start` is before its first record."""
+
+    folder: Path
+    recorder: bytes
+    start: Cursor
+
+
+class Written(Protocol):
+    """The queue, as its consumer sees it. All of it is another thread's and may change between two steps."""
+
+    @property
+    def place(self) -> Place: ...
+
+    @property
+    def synced(self) -> int: ...
+
+    @property
+    def failure(self) -> PycrormError | None: ...
+
+    def ends_at(self, position: int) -> bool:
+        """Whether nothing comes after this position any more."""
+        ...
+
+    async def look(self) -> None:
+        """Done when the files were compared with those in the folder; a queue that is displaced has moved by then."""
+        ...
+
+
+class Consumer:
+    """Reads, and holds the lock `drain` from its first batch on."""
+
+    def __init__(self, queue: Written, bell: Bell) -> None:
+        self._queue = queue
+        self._bell = bell
+        self._place = queue.place
+        self._drain: FileLock | None = None
+        self._released = False
+        self._refused = RefusedRecords(self._place.folder)
+        self.reader = _reader(self._place)
+
+    @property
+    def drains(self) -> bool:
+        return self._drain is not None
+
+    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
+        """As `RecorderQueue.get_batch`."""
+        while True:
+            try:
+                self._follow()
+                return await self._batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+            except (SpoolDamaged, SpoolUnavailable) as error:
+                if error is self._queue.failure:
+                    raise
+                if self._queue.place is self._place:
+                    await self._queue.look()
+                if self._queue.place is self._place:
+                    raise self._queue.failure or error from None
+
+    def set_aside(self, records: Sequence[Record]) -> None:
+        """As `RecorderQueue.set_aside`."""
+        self._refused.put(records)
+
+    def release(self) -> None:
+        """Gives up files and locks. Twice is once."""
+        self._released = True
+        self.reader.close()
+        self._refused.release()
+        if self._drain is not None:
+            self._drain.release()
+
+    def _follow(self) -> None:
+        """Goes on in the folder where the queue is now. Where records were lost it goes on behind them."""
+        place = self._queue.place
+        if place is self._place:
+            return
+        reader = _reader(place)
+        with available(place.folder):
+            reader.skip_to(self.reader.cursor.position)
+        self.reader.close()
+        self._refused.release()
+        if self._drain is not None:
+            self._drain.release()
+        self._drain, self._refused = None, RefusedRecords(place.folder)
+        self.reader, self._place = reader, place
+
+    async def _batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
+        self._take_drain()
+        await self._bell.until(partial(self._further, self.reader.cursor.position))
+        batch = self._read(None, events_max, bytes_max)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(age_s_max):
+                while not batch.complete and not self._queue.ends_at(batch.after.position):
+                    await self._bell.until(partial(self._further, batch.after.position))
+                    batch = self._read(batch, events_max, bytes_max)
+        if not batch.records and self._queue.failure is not None:
+            raise self._queue.failure
+        self.reader.cursor = batch.after
+        return batch.records
+
+    def _further(self, position: int) -> bool:
+        return self._queue.synced > position or self._queue.ends_at(position) or self._queue.place is not self._place
+
+    def _read(self, begun: Batch | None, events_max: int, bytes_max: int) -> Batch:
+        if self._queue.place is not self._place:
+            raise SpoolUnavailable(self._place.folder, "is not used any more")
+        with available(self._place.folder):
+            last = self._queue.synced
+            return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, begun=begun)
+
+    def _take_drain(self) -> None:
+        if self._drain is None and not self._released:
+            with available(self._place.folder):
+                self._drain = FileLock.take(self._place.folder / DRAIN)
+            if self._drain is None:
+                raise SpoolUnavailable(self._place.folder, "is being drained by another process")
+
+
+def _reader(place: Place) -> Reader:
+    def load(number: int) -> tuple[Path, Buffer]:
+        path = segment_path(place.folder, number)
+        return path, map_segment(path)
+
+    return Reader(recorder=place.recorder, start=place.start, load=load)

@@ -1,0 +1,128 @@
+"""An appender whose records can be carried to another one, in another folder, while threads go on putting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Final
+from zlib import crc32
+
+from pycrorm_async.errors import InternalError, PycrormError, SpoolUnavailable
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.files.frame import (
+    CHECKSUM_START,
+    COMMIT,
+    EVENT,
+    HEADER_BYTES,
+    Fields,
+    decode_each,
+    encode_body,
+    encode_header,
+)
+from pycrorm_async.queue.files.segment import CLOSES, Segment
+from pycrorm_async.queue.live.appender import Appender
+
+__all__ = ["MovableAppender", "Relocated"]
+
+_CLOSES: Final = CLOSES.encode()
+_LATE_BYTES: Final = 2**16
+"""What is carried while the lock is held, at most: half a millisecond's work."""
+
+
+class Relocated(InternalError):
+    """This appender takes nothing any more: its successor does. Never leaves the queue."""
+
+
+class MovableAppender(Appender):
+    """Adds to an appender what it takes to be the successor of another one, and to have one."""
+
+    @property
+    def segments(self) -> tuple[Segment, ...]:
+        """Those that are mapped: full ones that no sync covers yet, and the current one."""
+        return self._alone.run(lambda: (*self._sealed, self._current))
+
+    def carry(self, record: Fields) -> None:
+        """Append a record of another appender with its own position, sequence and times."""
+        self._alone.run(partial(self._carry, record))
+
+    def hand_over(
+        self, successor: MovableAppender, segment: Segment, offset: int, *, switch: Callable[[], None]
+    ) -> bool:
+        """Carry what was put behind `offset` of this segment, refuse more with `Relocated`, and call `switch`.
+
+        All of it is one step for the threads that put. False, with nothing done, when that would take them longer than
+        a moment. Raises `SpoolUnavailable` when the mapping does not hold what was put.
+        """
+        return self._alone.run(partial(self._hand_over, successor, segment, offset, switch))
+
+    def settle(self, folder: Path) -> None:
+        """The folder was renamed to this."""
+        self._alone.run(partial(self._settle, folder))
+
+    @property
+    def free_bytes(self) -> int:
+        """What fits into the current segment."""
+        return self._end - self._offset
+
+    def _carry(self, record: Fields) -> None:
+        kind, version, position, sequence, wall_ns, monotonic_ns, episode, name, payload, _, _ = record
+        if position != self.position + 1:
+            raise SpoolUnavailable(self._folder, f"position {self.position + 1} cannot be read in the old folder")
+        body = encode_body(name, payload)
+        if self._offset + HEADER_BYTES + len(body) > self._end:
+            self._roll()
+        offset, end = self._offset, self._offset + HEADER_BYTES + len(body)
+        header = encode_header(
+            kind,
+            len(name),
+            version,
+            len(payload),
+            position,
+            sequence,
+            wall_ns,
+            monotonic_ns,
+            episode,
+            self._salt,
+            crc32(body),
+        )
+        self._buffer[offset + HEADER_BYTES : end] = body
+        self._buffer[offset : offset + HEADER_BYTES] = header
+        self._offset = end
+        self.position = position
+        self._span_count += 1
+        self._span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
+        if kind == EVENT:
+            self.open[EpisodeId(episode)] = (sequence, wall_ns, monotonic_ns)
+            if name == _CLOSES:
+                del self.open[EpisodeId(episode)]
+
+    def _hand_over(self, successor: MovableAppender, segment: Segment, offset: int, switch: Callable[[], None]) -> bool:
+        late_bytes = self._offset - offset
+        if segment is not self._current or late_bytes > min(_LATE_BYTES, successor.free_bytes):
+            return False
+        for record in decode_each(self._buffer, offset, self._salt):
+            if record[0] != COMMIT:
+                successor.carry(record)
+        if successor.position != self.position:
+            raise SpoolUnavailable(
+                segment.path, f"holds records up to position {successor.position} of {self.position} that were put"
+            )
+        successor.stuck = self.stuck
+        successor.declarations = self.declarations  # not before: what is carried keeps its positions
+        if self._refusal is not None:
+            successor.refuse(self._refusal)
+        self._refusal = _relocated
+        switch()
+        return True
+
+    def _settle(self, folder: Path) -> None:
+        self._folder = folder
+        for segment in (*self._sealed, self._current, self._prepared):
+            if segment is not None:
+                segment.path = folder / segment.path.name
+        self.begun = [each._replace(path=folder / each.path.name) for each in self.begun]
+
+
+def _relocated() -> PycrormError:
+    return Relocated("the queue has moved to another folder")

@@ -1,0 +1,1 @@
+"""Inspection, repair and salvage of a recorder's folder."""

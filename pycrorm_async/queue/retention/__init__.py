@@ -1,0 +1,1 @@
+"""Stored segments, kept so that a log that went back can be offered them again."""

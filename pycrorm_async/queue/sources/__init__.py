@@ -1,0 +1,1 @@
+"""Sources of records for a drain, and the dead letters it leaves."""

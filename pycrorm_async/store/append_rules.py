@@ -1,0 +1,163 @@
+"""What becomes of a batch: which records are new, which are here already, which are refused and why. Pure.
+
+An episode's events are stored without a gap: the next one taken is always `head + 1`. One at or below that is a repeat,
+to be compared with what is stored. At the first record that cannot be taken the episode stops, for this batch, and the
+reason is kept; what came before it is stored, and other episodes are not touched.
+
+An end that recovery computed is no repeat: a folder that was damaged, or put back from a backup, may know less than was
+stored. It follows what the log has, and is left out if the log knows the end or waits for missing events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from pycrorm_async.errors import DamageError
+from pycrorm_async.events.envelope import Record, is_computed_end
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
+
+__all__ = ["Sorted", "Step", "NoNumber", "sort", "step", "new_episode", "differing"]
+
+
+@dataclass(frozen=True, slots=True)
+class Sorted:
+    """A batch by what its records belong to, each in the order of arrival."""
+
+    declarations: list[bytes]
+    episodes: dict[EpisodeId, list[Record]]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one batch does to one episode: the row as it will be, the records to insert, those to compare.
+
+    `known_better` counts the computed ends that are left out.
+    """
+
+    after: EpisodeRow
+    fresh: list[Record]
+    again: list[Record] = field(default_factory=list)
+    known_better: int = 0
+
+
+class NoNumber(ValueError):
+    """Every episode number is taken."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used:"
+            " `pycrorm spool rebind` gives its spool to another"
+        )
+
+
+def sort(records: Iterable[Record]) -> Sorted:
+    """Tells episodes apart. Raises `DamageError` for a record of the recorder itself that is not a declaration."""
+    declarations: list[bytes] = []
+    episodes: dict[EpisodeId, list[Record]] = {}
+    for record in records:
+        episode = record.episode
+        if episode is None:
+            declarations.append(_declaration(record))
+        elif episode in episodes:
+            episodes[episode].append(record)
+        else:
+            episodes[episode] = [record]
+    return Sorted(declarations, episodes)
+
+
+def step(records: Sequence[Record], known: EpisodeRow) -> Step:
+    """What these records, all of one episode, do to it."""
+    first = records[0].sequence
+    if first == known.head + 1 and _consecutive(records) and _sound(records):
+        return Step(_advanced(known, records, refused=None), list(records))
+    return _careful_step(records, known)
+
+
+def new_episode(episode: EpisodeId, first: Record, number: int) -> EpisodeRow:
+    """The row of an episode of which nothing is stored. Raises `NoNumber`."""
+    if number > EPISODE_NUMBER_MAX:
+        raise NoNumber
+    return EpisodeRow(number, episode_text(episode), head=0, folded=0, started_wall_ns=first.wall_ns)
+
+
+def differing(again: Iterable[Record], stored: Mapping[int, StoredEvent]) -> int | None:
+    """The first sequence that is stored as something else than these records; None if all are the same."""
+    return min((each.sequence for each in again if not _same(each, stored.get(each.sequence))), default=None)
+
+
+def _same(record: Record, stored: StoredEvent | None) -> bool:
+    # From the type on, a record and a stored event have the same fields in the same order.
+    return stored is not None and tuple(record[3:]) == tuple(stored[2:])
+
+
+def _careful_step(records: Sequence[Record], known: EpisodeRow) -> Step:
+    fresh: list[Record] = []
+    again: list[Record] = []
+    refused: str | None = None
+    known_better = 0
+    expected = known.head + 1
+    for record in records:
+        if record.sequence < expected:
+            if not is_computed_end(record):
+                again.append(record)
+                continue
+            if known.ended_wall_ns is not None or known.refused is not None:
+                known_better += 1
+                continue
+            record = record._replace(sequence=expected)
+        refused = _refusal(record, expected)
+        if refused is not None:
+            break
+        fresh.append(record)
+        expected += 1
+    return Step(_advanced(known, fresh, refused=refused), fresh, again, known_better)
+
+
+def _refusal(record: Record, expected: int) -> str | None:
+    if record.sequence > expected:
+        missing = (
+            f"event {expected}" if record.sequence == expected + 1 else f"events {expected} to {record.sequence - 1}"
+        )
+        return f"{missing} did not arrive before event {record.sequence}"
+    if record.sequence > SEQUENCE_MAX:
+        return f"event {record.sequence}: an episode holds at most {SEQUENCE_MAX:,} events"
+    if not _is_text(record.payload):
+        return f"event {record.sequence}: its payload is not text that a database can hold"
+    return None
+
+
+def _advanced(known: EpisodeRow, fresh: Sequence[Record], *, refused: str | None) -> EpisodeRow:
+    if not fresh:  # a repeat says nothing new about why the episode stopped before
+        return known._replace(refused=known.refused or refused)
+    last = fresh[-1]
+    ended = last.wall_ns if last.type == "EpisodeEnded" else known.ended_wall_ns
+    return known._replace(head=last.sequence, ended_wall_ns=ended, refused=refused)
+
+
+def _consecutive(records: Sequence[Record]) -> bool:
+    first = records[0].sequence
+    return [record.sequence for record in records] == list(range(first, first + len(records)))
+
+
+def _sound(records: Sequence[Record]) -> bool:
+    return records[-1].sequence <= SEQUENCE_MAX and _is_text(b"\n".join([each.payload for each in records]))
+
+
+def _is_text(payload: bytes) -> bool:
+    if b"\0" in payload:
+        return False
+    try:
+        payload.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _declaration(record: Record) -> bytes:
+    if record.type != "DesignatorTypeDeclared":
+        raise DamageError(f"record {record.position} belongs to no episode and is a {record.type}, not a declaration")
+    if not _is_text(record.payload):
+        raise DamageError(f"record {record.position}: the declaration is not text that a database can hold")
+    return record.payload

@@ -1,0 +1,199 @@
+"""The silent side of an object: one loaded description in one Bullet client, and where it stands.
+
+Poses and joint positions are kept here exactly as they were set; Bullet gets a copy and answers for the links. Nothing
+here tells an observer, checks a limit or knows what is attached: `objects.Object` does, and everything outside this
+package goes through it.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from pycrorm_async.world.bullet_loader import captured, engine
+from pycrorm_async.world.enums import JointType
+from pycrorm_async.world.errors import DescriptionNotLoadable
+from pycrorm_async.world.pose import IDENTITY, Pose, Quaternion, Vector, product, rotated
+from pycrorm_async.world.queries.bounding_boxes import BoundingBox, Frame, Solid, box_around, solids_of
+
+__all__ = ["Body", "Color"]
+
+Color = tuple[float, float, float, float]
+"""Red, green, blue, opacity, each 0 to 1."""
+
+_ROOT = -1  # Bullet's number of a body's first link
+_MOVABLE = (JointType.REVOLUTE, JointType.CONTINUOUS, JointType.PRISMATIC)
+_ENDLESS = (-math.inf, math.inf)
+_AT_ORIGIN: Frame = (Vector(0.0, 0.0, 0.0), IDENTITY)
+
+
+class Body:
+    """One body: its links and joints by name, its pose, its joint positions."""
+
+    def __init__(self, name: str, urdf: str, client: int, pose: Pose, color: Color | None) -> None:
+        self.client = client
+        self.number = _loaded(name, urdf, client)
+        self.pose = pose
+        self.positions: dict[str, float] = {}
+        self.limits: dict[str, tuple[float, float]] = {}
+        self.joint_types: dict[str, JointType] = {}
+        self.movable_above: dict[str, tuple[str, ...]] = {}
+        self._joint_numbers: dict[str, int] = {}
+        self._link_numbers: dict[str, int] = {}
+        self._inertial: dict[int, Frame] = {}  # Bullet places a link by its centre of mass, given in its frame
+        self._inertial_back: dict[int, Frame] = {}
+        self._read()
+        self.solids: dict[str, tuple[Solid, ...]] = {
+            link: solids_of(engine(), client, self.number, number, self._inertial[number])
+            for link, number in self._link_numbers.items()
+        }
+        if color is not None:
+            self._paint(color)
+        self.place(pose)
+
+    @property
+    def root(self) -> str:
+        """The name of the link whose frame is the body's pose."""
+        return next(iter(self._link_numbers))
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """All links, the root first."""
+        return tuple(self._link_numbers)
+
+    def link_number(self, link: str) -> int:
+        """Bullet's number of the link."""
+        return self._link_numbers[link]
+
+    def place(self, pose: Pose) -> None:
+        """Put the root link's frame there."""
+        position, orientation = _composed((pose.position, pose.orientation), self._inertial[_ROOT])
+        engine().resetBasePositionAndOrientation(self.number, position, orientation, physicsClientId=self.client)
+        self.pose = pose
+
+    def turn(self, positions: Mapping[str, float]) -> None:
+        """Set these joints, all at once."""
+        self._turn_in_bullet(positions)
+        self.positions.update(positions)
+
+    def link_frame(self, link: str) -> Frame:
+        """Where the link's frame is in "map"."""
+        number = self._link_numbers[link]
+        if number == _ROOT:
+            return self.pose.position, self.pose.orientation
+        state = engine().getLinkState(self.number, number, computeForwardKinematics=True, physicsClientId=self.client)
+        return self._link_frame(number, state)
+
+    def link_frame_at(self, link: str, positions: Mapping[str, float]) -> Frame:
+        """Where the link's frame would be in "map" with these joints there; Bullet tries it and puts them back."""
+        now = {joint: self.positions[joint] for joint in positions}
+        try:
+            self._turn_in_bullet(positions)
+            return self.link_frame(link)
+        finally:
+            self._turn_in_bullet(now)
+
+    def box(self, links: Iterable[str]) -> BoundingBox | None:
+        """The box around the shapes of these links; None if they have none."""
+        shaped = [link for link in links if self.solids[link]]
+        numbers = [number for link in shaped if (number := self._link_numbers[link]) != _ROOT]
+        states: Sequence[Any] = ()
+        if numbers:
+            states = engine().getLinkStates(
+                self.number, numbers, computeForwardKinematics=True, physicsClientId=self.client
+            )
+        frames = {_ROOT: (self.pose.position, self.pose.orientation)}
+        for number, state in zip(numbers, states, strict=True):
+            frames[number] = self._link_frame(number, state)
+        return box_around((frames[self._link_numbers[link]], self.solids[link]) for link in shaped)
+
+    def unload(self) -> None:
+        """Take it out of Bullet; pose and positions stay readable."""
+        engine().removeBody(self.number, physicsClientId=self.client)
+
+    def _turn_in_bullet(self, positions: Mapping[str, float]) -> None:
+        numbers = [self._joint_numbers[joint] for joint in positions]
+        values = [[position] for position in positions.values()]
+        engine().resetJointStatesMultiDof(self.number, numbers, values, physicsClientId=self.client)
+
+    def _link_frame(self, number: int, state: Sequence[Any]) -> Frame:
+        # Bullet also gives the link's own frame, but in single precision; its inertial frame is exact to a double
+        return _composed((state[0], state[1]), self._inertial_back[number])
+
+    def _read(self) -> None:
+        """Names, limits and inertial frames, as Bullet understood them; parents come before their children."""
+        bullet, client = engine(), self.client
+        root = bullet.getBodyInfo(self.number, physicsClientId=client)[0].decode()
+        names = {_ROOT: root}
+        self.movable_above[root] = ()
+        for number in range(bullet.getNumJoints(self.number, physicsClientId=client)):
+            joint = bullet.getJointInfo(self.number, number, physicsClientId=client)
+            name, link, above = joint[1].decode(), joint[12].decode(), self.movable_above[names[joint[16]]]
+            names[number] = link
+            self._joint_numbers[name] = number
+            self.joint_types[name] = kind = _joint_type(joint[2], lower=joint[8], upper=joint[9])
+            if kind in _MOVABLE:
+                above = (name, *above)
+                self.limits[name] = (joint[8], joint[9]) if kind is not JointType.CONTINUOUS else _ENDLESS
+                self.positions[name] = 0.0
+            self.movable_above[link] = above
+        self._link_numbers = {link: number for number, link in names.items()}
+        for number in names:
+            dynamics = bullet.getDynamicsInfo(self.number, number, physicsClientId=client)
+            self._inertial[number] = Vector(*dynamics[3]), Quaternion(*dynamics[4])
+            self._inertial_back[number] = _inverse(self._inertial[number])
+
+    def _paint(self, color: Color) -> None:
+        for number in self._link_numbers.values():
+            engine().changeVisualShape(self.number, number, rgbaColor=color, physicsClientId=self.client)
+
+
+def _loaded(name: str, urdf: str, client: int) -> int:
+    """Bullet's number of a body made from URDF text, all links kept, its base fixed where it is put."""
+    bullet = engine()
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
+        file.write(urdf)
+        file.flush()
+        with captured() as words:
+            try:
+                number: int | None = bullet.loadURDF(
+                    file.name,
+                    useFixedBase=True,
+                    flags=bullet.URDF_USE_IMPLICIT_CYLINDER,
+                    physicsClientId=client,
+                )
+            except bullet.error:
+                number = None
+    if number is None:
+        raise DescriptionNotLoadable(name, _reason("".join(words)))
+    return number
+
+
+def _reason(words: str) -> str:
+    """What Bullet printed as errors, without its file names and line numbers."""
+    said = [part.partition("]:\n")[2].strip() for part in words.split("b3Error[")[1:]]
+    return " ".join(part.split("b3Warning[")[0] for part in said) or "Bullet gives no reason"
+
+
+def _joint_type(number: int, *, lower: float, upper: float) -> JointType:
+    """Bullet knows no continuous joints: they are revolute, without a range."""
+    kind = JointType(number) if number <= JointType.FIXED else JointType.UNKNOWN
+    return JointType.CONTINUOUS if kind is JointType.REVOLUTE and lower > upper else kind
+
+
+def _composed(outer: Frame | tuple[Sequence[float], Sequence[float]], inner: Frame) -> Frame:
+    """`inner`, given relative to `outer`, in outer's frame."""
+    (x, y, z), turn = outer
+    if inner == _AT_ORIGIN:
+        return Vector(x, y, z), Quaternion(*turn)
+    moved = rotated(turn, inner[0])
+    return Vector(x + moved.x, y + moved.y, z + moved.z), product(turn, inner[1])
+
+
+def _inverse(frame: Frame) -> Frame:
+    position, (x, y, z, w) = frame
+    back = Quaternion(-x, -y, -z, w)
+    moved = rotated(back, position)
+    return Vector(-moved.x, -moved.y, -moved.z), back

@@ -1,0 +1,1 @@
+"""Built-in models: primitives, a kitchen, a robot."""

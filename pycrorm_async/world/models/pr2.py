@@ -1,0 +1,246 @@
+"""The PR2 as a model Bullet can load: from boxes made here (`pr2_urdf`), or from meshes (`pr2_mesh_urdf_path`).
+
+Both have the same root, links, joints and measures as far as plans go. The built-in one needs no file and loads in
+milliseconds; the mesh one comes with the optional package example-robot-data and stops earlier at two joints (wrist
+flex -2.094, torso 0.31).
+
+The root link `base_footprint` lies on the floor. The mass of every link sits in its origin, so that Bullet's frames are
+the model's. Shapes are about as large as the robot's: meant for bounding boxes, rays and pictures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement, fromstring, indent, tostring
+
+from pycrorm_async.errors import MissingExtra
+from pycrorm_async.world.models.primitives import INERTIA, numbers
+from pycrorm_async.world.robots.robot_description import FINGER_OPEN_RAD, PR2, ArmDescription, Bounds
+
+__all__ = ["pr2_urdf", "pr2_mesh_urdf_path"]
+
+_X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
+_WHITE, _GREY, _DARK = "0.93 0.93 0.95 1", "0.6 0.6 0.65 1", "0.2 0.2 0.22 1"
+_OPTICAL = (-math.pi / 2, 0.0, -math.pi / 2)
+_MESH_MODEL = "cmeel.prefix/share/example-robot-data/robots/pr2_description/urdf/pr2.urdf"
+
+
+def pr2_urdf() -> str:
+    """A PR2 of boxes as URDF text, with the real one's names and measures and no file beside it.
+
+    Hard limits are in it; the rolls of forearm and wrist are continuous.
+    """
+    robot = Element("robot", name=PR2.name)
+    _link(robot, "base_footprint")
+    _fixed(robot, "base_footprint_joint", "base_footprint", "base_link", (0, 0, 0.051))
+    _link(robot, "base_link", (0.65, 0.65, 0.28), (0, 0, 0.14), _WHITE)
+    torso = PR2.torso_origin
+    _moving(
+        robot,
+        PR2.torso_joint,
+        "base_link",
+        "torso_lift_link",
+        (torso.x, torso.y, torso.z - 0.051),
+        _Z,
+        PR2.torso_limits,
+    )
+    _link(robot, "torso_lift_link", (0.24, 0.44, 0.95), (-0.1, 0, -0.235), _WHITE)
+    _head(robot)
+    for arm in PR2.arms.values():
+        _arm(robot, arm)
+    indent(robot)  # Bullet cannot read a long file in one line
+    return tostring(robot, encoding="unicode")
+
+
+def pr2_mesh_urdf_path() -> Path:
+    """Where the optional package example-robot-data keeps the PR2's mesh model.
+
+    Bullet finds its meshes from there without a search path. Loading prints warnings about frames without a mass.
+
+    Raises:
+        MissingExtra: the package, or the model in it, is not installed.
+    """
+    try:
+        path = Path(str(distribution("example-robot-data").locate_file(_MESH_MODEL)))
+    except PackageNotFoundError:
+        raise MissingExtra(
+            "the PR2's mesh model is not installed: pip install 'pycrorm-async[pr2]'; the built-in model needs nothing"
+        ) from None
+    if not path.is_file():
+        raise MissingExtra(f"example-robot-data has no PR2 at {path}: pip install 'pycrorm-async[pr2]'")
+    return path
+
+
+def _head(robot: Element) -> None:
+    """Pan and tilt, and the stereo camera on top: 1.27 m above the floor at torso height 0."""
+    _moving(
+        robot,
+        PR2.head_pan_joint,
+        "torso_lift_link",
+        PR2.head_pan_link,
+        (-0.01707, 0, 0.38145),
+        _Z,
+        Bounds(-3.007, 3.007),
+    )
+    _link(robot, PR2.head_pan_link, (0.16, 0.2, 0.2), (0.02, 0, -0.06), _DARK)
+    _moving(
+        robot,
+        PR2.head_tilt_joint,
+        PR2.head_pan_link,
+        PR2.head_tilt_link,
+        (0.068, 0, 0),
+        _Y,
+        Bounds(-0.471238, 1.39626),
+    )
+    _link(robot, PR2.head_tilt_link, (0.22, 0.3, 0.11), (-0.05, 0, 0.1), _WHITE)
+    for joint, parent, child, origin in (
+        ("head_plate_frame_joint", PR2.head_tilt_link, "head_plate_frame", (0.0232, 0, 0.0645)),
+        ("sensor_mount_frame_joint", "head_plate_frame", "sensor_mount_link", (0, 0, 0)),
+        ("double_stereo_frame_joint", "sensor_mount_link", "double_stereo_link", (0, 0, 0.003)),
+        ("wide_stereo_frame_joint", "double_stereo_link", "wide_stereo_link", (0, 0.03, 0.0305)),
+    ):
+        _fixed(robot, joint, parent, child, origin)
+        _link(robot, child)
+    _fixed(
+        robot,
+        "wide_stereo_optical_frame_joint",
+        "wide_stereo_link",
+        PR2.camera_link,
+        (0, 0, 0),
+        turned=_OPTICAL,
+    )
+    _link(robot, PR2.camera_link)
+
+
+def _arm(robot: Element, arm: ArmDescription) -> None:
+    """Seven joints from the torso to the wrist, then the gripper."""
+    prefix = arm.tool_frame[0]
+    pan, lift, roll, elbow, forearm_roll, wrist, wrist_roll = (
+        joint.removesuffix("_joint") + "_link" for joint in arm.joints
+    )
+    upper_arm, forearm = f"{prefix}_upper_arm_link", f"{prefix}_forearm_link"
+    to_lift, to_elbow, to_wrist = (
+        (length, 0.0, 0.0) for length in (arm.shoulder_offset_m, arm.upper_arm_m, arm.forearm_m)
+    )
+    here = (0.0, 0.0, 0.0)
+    chain = (  # parent, child, where the joint sits in the parent, axis
+        ("torso_lift_link", pan, arm.shoulder, _Z),
+        (pan, lift, to_lift, _Y),
+        (lift, roll, here, _X),
+        (upper_arm, elbow, to_elbow, _Y),
+        (elbow, forearm_roll, here, _X),
+        (forearm, wrist, to_wrist, _Y),
+        (wrist, wrist_roll, here, _X),
+    )
+    for joint, (parent, child, origin, axis) in zip(arm.joints, chain, strict=True):
+        _moving(robot, joint, parent, child, origin, axis, arm.hard_limits[joint])
+    _fixed(robot, f"{prefix}_upper_arm_joint", roll, upper_arm, here)
+    _fixed(robot, f"{prefix}_forearm_joint", forearm_roll, forearm, here)
+
+    _link(robot, pan, (0.2, 0.2, 0.5), (0.02, 0, -0.2), _WHITE)
+    _link(robot, lift, (0.22, 0.16, 0.22), here, _GREY)
+    _link(robot, roll)
+    _link(robot, upper_arm, (0.3, 0.14, 0.14), (0.22, 0, 0), _WHITE)
+    _link(robot, elbow, (0.14, 0.1, 0.14), here, _GREY)
+    _link(robot, forearm_roll)
+    _link(robot, forearm, (0.22, 0.11, 0.11), (0.18, 0, 0), _WHITE)
+    _link(robot, wrist, (0.07, 0.05, 0.08), here, _GREY)
+    _link(robot, wrist_roll)
+    _gripper(robot, arm, prefix, wrist_roll)
+
+
+def _gripper(robot: Element, arm: ArmDescription, prefix: str, wrist_roll: str) -> None:
+    """Palm, two fingers that swing outwards, and the tool frame between their tips."""
+    palm = f"{prefix}_gripper_palm_link"
+    _fixed(robot, f"{prefix}_gripper_palm_joint", wrist_roll, palm, (0, 0, 0))
+    _link(robot, palm, (0.1, 0.1, 0.05), (0.07, 0, 0), _DARK)
+    _fixed(robot, f"{prefix}_gripper_tool_joint", palm, arm.tool_frame, (arm.tool_m, 0, 0))
+    _link(robot, arm.tool_frame)
+    for finger, side in (("l", 1), ("r", -1)):
+        link = f"{prefix}_gripper_{finger}_finger_link"
+        origin, axis = (0.07691, side * 0.01, 0), (0, 0, side)
+        _moving(
+            robot,
+            f"{prefix}_gripper_{finger}_finger_joint",
+            palm,
+            link,
+            origin,
+            axis,
+            Bounds(0.0, FINGER_OPEN_RAD),
+        )
+        _link(robot, link, (0.12, 0.02, 0.03), (0.06, side * 0.005, 0), _GREY)
+
+
+# --- the four shapes of element a URDF is made of ---------------------------------------------------------------
+
+
+def _link(
+    robot: Element,
+    name: str,
+    size: Sequence[float] | None = None,
+    centre: Sequence[float] = (0, 0, 0),
+    rgba: str = _GREY,
+) -> None:
+    """A box around `centre`, or, without a size, a frame."""
+    link = SubElement(robot, "link", name=name)
+    link.append(fromstring(INERTIA))  # noqa: S314  our own text
+    if size is None:
+        return
+    for purpose in ("visual", "collision"):
+        shape = SubElement(link, purpose)
+        SubElement(shape, "origin", xyz=numbers(centre))
+        SubElement(SubElement(shape, "geometry"), "box", size=numbers(size))
+        if purpose == "visual":
+            SubElement(SubElement(shape, "material", name=rgba), "color", rgba=rgba)
+
+
+def _fixed(
+    robot: Element,
+    name: str,
+    parent: str,
+    child: str,
+    origin: Sequence[float],
+    *,
+    turned: Sequence[float] = (0, 0, 0),
+) -> None:
+    _joint(robot, "fixed", name, parent, child, origin, turned)
+
+
+def _moving(
+    robot: Element,
+    name: str,
+    parent: str,
+    child: str,
+    origin: Sequence[float],
+    axis: Sequence[float],
+    bounds: Bounds,
+) -> None:
+    """Continuous where the bounds are infinite, prismatic for the torso, revolute otherwise."""
+    endless = math.isinf(bounds.upper)
+    kind = "continuous" if endless else "prismatic" if name == PR2.torso_joint else "revolute"
+    joint = _joint(robot, kind, name, parent, child, origin, (0, 0, 0))
+    SubElement(joint, "axis", xyz=numbers(axis))
+    limit = SubElement(joint, "limit", effort="100", velocity="3")
+    if not endless:
+        limit.set("lower", repr(bounds.lower))
+        limit.set("upper", repr(bounds.upper))
+
+
+def _joint(
+    robot: Element,
+    kind: str,
+    name: str,
+    parent: str,
+    child: str,
+    origin: Sequence[float],
+    turned: Sequence[float],
+) -> Element:
+    joint = SubElement(robot, "joint", name=name, type=kind)
+    SubElement(joint, "parent", link=parent)
+    SubElement(joint, "child", link=child)
+    # `numbers` rounds to a millionth: no longer a right angle
+    SubElement(joint, "origin", xyz=numbers(origin), rpy=" ".join(map(repr, turned)))
+    return joint

@@ -1,0 +1,1 @@
+"""Questions about a world: boxes, contacts, visibility, free space."""

@@ -1,0 +1,1 @@
+"""Robots: their description and inverse kinematics."""
