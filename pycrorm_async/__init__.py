@@ -30,12 +30,12 @@ __all__ = ["Memory", "MemoryStatus", "Projection", "PycrormError", "Reading", "S
 _HOMES = {
     "Memory": "memory",
     "MemoryStatus": "memory",
-    "Projection": "projections.own",
+    "Projection": "projections.custom.projection",
     "PycrormError": "errors",
     "Reading": "query.reading",
-    "Settings": "config",
-    "UserView": "projections.views",
-    "recover": "adoption",
+    "Settings": "settings",
+    "UserView": "projections.schema.user_views",
+    "recover": "operations.destination",
 }
 
 

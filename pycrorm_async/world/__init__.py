@@ -61,16 +61,16 @@ __all__ = [
 ]
 
 _HOME = {
-    "boxes": ("BoundingBox",),
+    "queries.bounding_boxes": ("BoundingBox",),
     "bullet": ("BulletWorld",),
-    "copying": ("copied",),
-    "costmaps": ("Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"),
+    "world_copy": ("copied",),
+    "queries.costmaps": ("Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"),
     "enums": ("Arms", "Grasp", "GripperState", "JointType", "ObjectType", "WorldMode"),
     "objects": ("Object",),
     "pose": ("Pose", "Quaternion", "Vector"),
-    "robot": ("Limits", "RobotDescription", "robot_description"),
+    "robots.robot_description": ("Limits", "RobotDescription", "robot_description"),
     "state": ("WorldState",),
-    "watch": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),
+    "observers": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),
 }
 
 

@@ -210,7 +210,7 @@ def test_a_class_with_the_name_of_a_built_in_one_is_refused() -> None:
         async def perform(self) -> None:
             """Nothing."""
 
-    with pytest.raises(DeclarationRefused, match=r"pycrorm_async\.plan\.actions\.NavigateActionPerformable is 'Nav"):
+    with pytest.raises(DeclarationRefused, match=r"pycrorm_async\.plan\.actions\.basic\.NavigateActionPerformable is 'Nav"):
         Declarations().of(NavigateAction, lambda _: None)
 
 
@@ -258,7 +258,7 @@ def test_a_field_may_be_called_aliases() -> None:
         (("WelcomeAction",), r"its alias 'WelcomeAction' is its present name"),
         (
             ("PickUpAction",),
-            r"its alias 'PickUpAction' is that of pycrorm_async\.plan\.actions\.PickUpActionPerformable",
+            r"its alias 'PickUpAction' is that of pycrorm_async\.plan\.actions\.basic\.PickUpActionPerformable",
         ),
         (("EverythingAction",), r"its alias 'EverythingAction' is that of a class it descends from"),
     ],

@@ -24,7 +24,7 @@ from pycrorm_async.operations.destination import recover
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.fold.fold import fold
+from pycrorm_async.projections.fold import fold
 from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
