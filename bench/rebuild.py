@@ -69,7 +69,7 @@ async def fill(url: str, events: int) -> None:
         if number == 1:
             projector = Projector(log)
             await projector.open()
-            await projector.fold_behind()
+            await projector.catch_up()
     await log.close()
 
 

@@ -56,7 +56,7 @@ from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.delegated_writer import HandedOver
+from pycrorm_async.writer.delegated_writer import DelegatedWriter
 from pycrorm_async.writer.writer_thread import WriterThread
 
 if TYPE_CHECKING:
@@ -199,9 +199,9 @@ class Memory:
             spool.path, settings=self._settings, clock=self._clock, recorder=recorder_id, offered=by_daemon
         )
         self._stack.callback(queue.release)
-        writer: WriterThread | HandedOver
+        writer: WriterThread | DelegatedWriter
         if by_daemon:
-            writer = HandedOver(queue, self._settings)
+            writer = DelegatedWriter(queue, self._settings)
         else:
             opened = partial(open_destination, address, spool, clock=self._clock, settings=self._settings)
             writer = WriterThread(
@@ -236,7 +236,7 @@ class Memory:
     async def _drain(
         self,
         queue: RecorderQueue,
-        writer: WriterThread | HandedOver,
+        writer: WriterThread | DelegatedWriter,
         _kind: type[BaseException] | None,
         error: BaseException | None,
         _traceback: TracebackType | None,

@@ -16,7 +16,7 @@ from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.world.observers import watcher
-from pycrorm_async.writer.delegated_writer import HandedOver
+from pycrorm_async.writer.delegated_writer import DelegatedWriter
 from pycrorm_async.writer.writer_thread import WriterThread
 
 __all__ = ["Parts"]
@@ -26,7 +26,7 @@ class Parts(NamedTuple):
     """What an open memory is made of."""
 
     queue: RecorderQueue
-    writer: WriterThread | HandedOver
+    writer: WriterThread | DelegatedWriter
     reading: Reading
     emitter: Emitter
     recorder: Recorder

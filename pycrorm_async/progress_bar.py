@@ -9,20 +9,20 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-__all__ = ["stderr", "watched", "Tell"]
+__all__ = ["stderr", "watched", "ProgressCallback"]
 
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 """One for all that is said there: a bar that stands still while something else is printed above it."""
 
 
-class Tell(Protocol):
+class ProgressCallback(Protocol):
     """How much is done, and of how much; and what is done with it, if that is something else now."""
 
     def __call__(self, done: int, total: int, what: str | None = None) -> None: ...
 
 
 @contextmanager
-def watched(what: str, *, unit: str = "events") -> Iterator[Tell]:
+def watched(what: str, *, unit: str = "events") -> Iterator[ProgressCallback]:
     """The bar, while the context lasts."""
     bar = Progress(
         TextColumn("{task.description}"),

@@ -79,7 +79,7 @@ async def _round(url: str, rng: random.Random, outcome: Outcome) -> int:
             count = rng.randint(3, 12)
             some, left = left[:count], left[count:]
             await log.append([each for number, payload in some for each in _episode(number, payload)])
-            await projector.fold_behind()
+            await projector.catch_up()
             expected += [_event(number, payload) for number, payload in some if payload in good]
         stopped = await _compared(log, outcome, expected, good)
         await rebuild_memory(url)

@@ -11,7 +11,7 @@ from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption
 from pycrorm_async.cli.output import print_json, print_table, problem
 from pycrorm_async.cli.pending_events import note_what_waits
-from pycrorm_async.operations.copy import Copied, copy_episodes
+from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.progress_bar import watched
 
 __all__ = ["copy"]
@@ -56,6 +56,6 @@ def copy(
     return 4 if damaged else 1 if stopped else 0
 
 
-async def _watched(source: str, target: str, episodes: list[str]) -> Copied:
+async def _watched(source: str, target: str, episodes: list[str]) -> CopySummary:
     with watched("copying") as tell:
         return await copy_episodes(source, target, episodes=episodes, watch=tell)

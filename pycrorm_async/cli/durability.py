@@ -13,11 +13,11 @@ from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Incarnation
 
-__all__ = ["Durability", "Kept", "durability", "kept_in", "print_durability"]
+__all__ = ["Durability", "KeptSegments", "durability", "kept_in", "print_durability"]
 
 
 @dataclass(frozen=True)
-class Kept:
+class KeptSegments:
     """Segments kept below `spool/stored` after all their records were stored.
 
     Attributes:
@@ -38,11 +38,11 @@ class Durability:
     went_back: list[Incarnation]
 
 
-def kept_in(spool: Path) -> Kept:
+def kept_in(spool: Path) -> KeptSegments:
     """Raises `SpoolUnavailable`."""
     with available(spool):
         segments = kept_segments(spool)
-    return Kept(
+    return KeptSegments(
         len(segments), sum(each.bytes for each in segments), _moment(segments[0].stored_ns) if segments else None
     )
 
@@ -52,7 +52,7 @@ async def durability(log: EventLog) -> Durability:
     return Durability(await log.stored_on(), await log.incarnations())
 
 
-def print_durability(kept: Kept, known: Durability | None) -> None:
+def print_durability(kept: KeptSegments, known: Durability | None) -> None:
     """In sentences; `known` is None where the database did not answer."""
     if known is not None:
         machines, standbys = known.stored_on

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pycrorm_async.cli.output import note
-from pycrorm_async.operations.destination import waiting
+from pycrorm_async.operations.destination import pending_recorders
 from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["note_what_waits"]
@@ -13,7 +13,7 @@ __all__ = ["note_what_waits"]
 
 def note_what_waits(url: str, spool: Path | None) -> None:
     """One line on stderr for each kind of recorder that may hold more than the database shows."""
-    dead, alive = waiting(url, spool)
+    dead, alive = pending_recorders(url, spool)
     if dead:
         option = f" --spool {spool}" if spool else ""
         note(

@@ -13,7 +13,7 @@ from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption,
 from pycrorm_async.cli.output import duration, note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_what_waits
 from pycrorm_async.errors import CallerError
-from pycrorm_async.operations.rebuild import Rebuilt, projections_of, rebuild_memory, rebuild_projection
+from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import watched
 from pycrorm_async.projections.custom.discovery import installed_besides, named
 from pycrorm_async.projections.custom.projection import Projection
@@ -90,7 +90,7 @@ async def _chosen(url: str, names: list[str], known: Mapping[str, Projection]) -
     return [each for each in (_TABLES, *known) if not names or each in names]
 
 
-async def _rebuild(url: str, workers: int | None, projection: Projection | None) -> Rebuilt:
+async def _rebuild(url: str, workers: int | None, projection: Projection | None) -> RebuildSummary:
     with watched("rebuilding") as watch:
 
         def tell(what: str, done: int, total: int) -> None:

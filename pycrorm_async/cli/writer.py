@@ -32,7 +32,7 @@ from pycrorm_async.operations.fold_workers import WORKERS
 from pycrorm_async.projections.custom.discovery import named
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.daemon import LEAVE_S, Moved
+from pycrorm_async.writer.daemon import LEAVE_S, DaemonSummary
 
 __all__ = ["writer", "store_once"]
 
@@ -79,7 +79,7 @@ async def _until_told_to_leave(
     projections: Sequence[Projection],
     settings: Settings,
     processes: Sequence[FoldProcess],
-) -> Moved:
+) -> DaemonSummary:
     leave = asyncio.Event()
 
     def told() -> None:

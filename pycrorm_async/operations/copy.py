@@ -28,13 +28,13 @@ from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.writer.backoff import BRIEF
-from pycrorm_async.writer.retry import answer_of
+from pycrorm_async.writer.retry import retry
 
-__all__ = ["copy_episodes", "Copied", "EpisodeCopied"]
+__all__ = ["copy_episodes", "CopySummary", "EpisodeCopy"]
 
 
 @dataclass(frozen=True)
-class EpisodeCopied:
+class EpisodeCopy:
     """One episode.
 
     Attributes:
@@ -56,12 +56,12 @@ class EpisodeCopied:
 
 
 @dataclass(frozen=True)
-class Copied:
+class CopySummary:
     """What was copied from where to where; the URLs are without passwords."""
 
     source: str
     target: str
-    episodes: tuple[EpisodeCopied, ...]
+    episodes: tuple[EpisodeCopy, ...]
 
 
 def _unwatched(_done: int, _of: int) -> None: ...
@@ -74,7 +74,7 @@ async def copy_episodes(
     episodes: Sequence[str] = (),
     settings: Settings | None = None,
     watch: Callable[[int, int], None] = _unwatched,
-) -> Copied:
+) -> CopySummary:
     """Copy these episodes, by number in the source, id, first digits of it or `last`; without any, all of them.
 
     A target that does not exist is made. `watch` is told how many events are done, and of how many. Damage of one
@@ -91,7 +91,7 @@ async def copy_episodes(
             done = await copier.copy(rows)
     finally:
         await log.close()
-    return Copied(source_address.to_type, target_address.to_type, done)
+    return CopySummary(source_address.to_type, target_address.to_type, done)
 
 
 @asynccontextmanager
@@ -105,7 +105,7 @@ async def _made(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tup
                 " copy into a new one"
             )
         projector = Projector(log)
-        await answer_of(projector.open, backoff=BRIEF)  # another copy may be making the tables
+        await retry(projector.open, backoff=BRIEF)  # another copy may be making the tables
         yield log, LogAndTables(log, projector)
     finally:
         await log.close()
@@ -135,7 +135,7 @@ class _Copier:
         self._declared: dict[str, bytes] = {}
         self._sent: set[str] = set()
 
-    async def copy(self, rows: Sequence[EpisodeRow]) -> tuple[EpisodeCopied, ...]:
+    async def copy(self, rows: Sequence[EpisodeRow]) -> tuple[EpisodeCopy, ...]:
         self._of = sum(row.head for row in rows)
         before = {row.id: row.head for row in await self._target.episodes()}
         for row in rows:
@@ -148,7 +148,7 @@ class _Copier:
         after = {row.id: row.head for row in await self._target.episodes()}
         stopped = {**await self._destination.stopped(), **self._refused}
         return tuple(
-            EpisodeCopied(
+            EpisodeCopy(
                 id=row.id,
                 number=row.number,
                 were_there=(were_there := min(before.get(row.id, 0), row.head)),
@@ -215,10 +215,10 @@ class _Copier:
     async def _fold(self, episodes: set[str]) -> None:
         """Until the tables show these; where others append all the time there is always something else to fold."""
         while episodes & (await self._destination.behind()).keys():
-            await answer_of(self._destination.fold_some, backoff=BRIEF)
+            await retry(self._destination.fold_next_batch, backoff=BRIEF)
 
     async def _append_at_once(self, records: Sequence[Record]) -> None:
-        refusals = await answer_of(partial(self._destination.append, records), backoff=BRIEF)
+        refusals = await retry(partial(self._destination.append, records), backoff=BRIEF)
         self._refused |= {episode_text(episode): reason for episode, reason in refusals.items()}
 
     async def _declarations(self, events: Iterable[Sequence[StoredEvent]]) -> list[Record]:

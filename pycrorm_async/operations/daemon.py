@@ -16,7 +16,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.operations.destination import open_destination, shared_address
 from pycrorm_async.operations.fold_process import FoldProcess
 from pycrorm_async.operations.fold_worker import Assignment
-from pycrorm_async.operations.fold_workers import DaemonNote, FoldedByWorkers, FoldWorkers, FoldWorkerState
+from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldWorkerState, FoldWorkerTables
 from pycrorm_async.projections.custom.discovery import checked
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.queue.files.locks import FileLock
@@ -28,8 +28,8 @@ from pycrorm_async.queue.sources.live_source import LiveQueue
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.daemon import Daemon, Moved
-from pycrorm_async.writer.ports import Found, Held, LetGo, Shown
+from pycrorm_async.writer.daemon import Daemon, DaemonSummary
+from pycrorm_async.writer.ports import ClaimedSource, ReleaseOutcome, ScanResult, Tables
 
 __all__ = ["serve"]
 
@@ -44,7 +44,7 @@ async def serve(
     projections: Sequence[Projection] = (),
     fold_workers: int = 0,
     forked: Sequence[FoldProcess] = (),
-) -> Moved:
+) -> DaemonSummary:
     """Drains every recorder of the spool and folds, until `leave` is set; `say` gets one line for each notable thing.
 
     `projections` of one's own are kept up to date too, with those that are installed. `fold_workers` processes fold, of
@@ -75,7 +75,7 @@ async def serve(
         workers = await held.enter_async_context(
             FoldWorkers(fold_workers, assignment, settings=settings, say=say, note=note, forked=forked)
         )
-        shown: Shown = FoldedByWorkers(destination, workers) if fold_workers else destination
+        shown: Tables = FoldWorkerTables(destination, workers) if fold_workers else destination
         return await Daemon(shown, look, settings=settings, say=say).run(leave)
 
 
@@ -109,12 +109,12 @@ class _Folders:
         self._opened = _identity(self._file)
         self._taken: set[str] = set()
 
-    def __call__(self, but: Collection[str]) -> Found:
+    def __call__(self, but: Collection[str]) -> ScanResult:
         # A file that is only gone may be put back. Into another one this process, which has the old one open, would
         # never write: the next one looks what it is.
         if (now := _identity(self._file)) is not None and now != self._opened:
             raise DatabaseForeign(f"{self._file} was replaced while it was open: start `pycrorm writer` again")
-        held: list[Held] = []
+        held: list[ClaimedSource] = []
         failed: dict[str, Exception] = {}
         present = self._spool.recorders()
         self._taken &= {each.name for each in present}
@@ -130,7 +130,7 @@ class _Folders:
                 if taken is not None:
                     held.append(taken)
                     self._taken.add(folder.name)
-        return Found(held, failed)
+        return ScanResult(held, failed)
 
 
 def _identity(file: Path | None) -> tuple[int, int] | None:
@@ -142,7 +142,7 @@ def _identity(file: Path | None) -> tuple[int, int] | None:
     return None if status is None else (status.st_dev, status.st_ino)
 
 
-def _take(folder: RecorderFolder, stored: StoredSegments | None = None, *, again: bool) -> Held | None:
+def _take(folder: RecorderFolder, stored: StoredSegments | None = None, *, again: bool) -> ClaimedSource | None:
     if folder.alive:
         return _Living.take(folder.path)
     dead = open_dead(folder.path, stored=stored)
@@ -158,16 +158,16 @@ def _take(folder: RecorderFolder, stored: StoredSegments | None = None, *, again
 
 
 class _Living(LiveQueue):
-    """A living recorder's folder, as the daemon holds it. Implements `Held`."""
+    """A living recorder's folder, as the daemon holds it. Implements `ClaimedSource`."""
 
-    def let_go(self) -> LetGo:
+    def release_folder(self) -> ReleaseOutcome:
         is_alive, closed = self.is_alive, self.is_closed
         self.release()
         what = "has ended" if closed else "is left at work" if is_alive else "died"
-        return LetGo(what, whole=self.stored == self.given or not is_alive)
+        return ReleaseOutcome(what, whole=self.stored == self.given or not is_alive)
 
 
-class _Dead(Held):
+class _Dead(ClaimedSource):
     """What a dead recorder left. Nobody waits there, so nobody is told anything."""
 
     is_alive = False
@@ -185,25 +185,25 @@ class _Dead(Held):
     async def acknowledge(self, position: int) -> None:
         await self._queue.acknowledge(position)
 
-    def set_aside(self, records: Sequence[Record]) -> bool:
-        return self._queue.set_aside(records)
+    def dead_letter(self, records: Sequence[Record]) -> bool:
+        return self._queue.dead_letter(records)
 
-    def give_up(self, reason: str) -> None:
-        self._queue.give_up(reason)
+    def fail(self, reason: str) -> None:
+        self._queue.fail(reason)
 
     def finish(self) -> None:
         """All of it is there already."""
 
-    def note_shown(self, position: int, stopped: Mapping[str, str]) -> None: ...
+    def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None: ...
 
-    def note_away(self, reason: str | None) -> None: ...
+    def mark_unavailable(self, reason: str | None) -> None: ...
 
-    def let_go(self) -> LetGo:
+    def release_folder(self) -> ReleaseOutcome:
         if not self._queue.all_stored:
             self._queue.release()
-            return LetGo("is kept", whole=False, again=not self._queue.holds_refused)
+            return ReleaseOutcome("is kept", whole=False, again=not self._queue.holds_refused)
         self._queue.remove()
         count = len(self._queue.lost)
-        return LetGo(
+        return ReleaseOutcome(
             f"is recovered ({count} episode{'s' * (count != 1)} LOST)" if count else "is recovered", whole=True
         )

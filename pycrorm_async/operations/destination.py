@@ -32,7 +32,7 @@ from pycrorm_async.queue.sources.live_source import LiveQueue
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.drain_once import Recovered, drain_once
+from pycrorm_async.writer.drain_once import DrainSummary, drain_once
 from pycrorm_async.writer.ports import Source
 
 __all__ = [
@@ -45,8 +45,8 @@ __all__ = [
     "recover",
     "Rebinding",
     "rebind",
-    "Waiting",
-    "waiting",
+    "PendingRecorders",
+    "pending_recorders",
 ]
 
 _APPENDS_AT_ONCE = 4
@@ -111,11 +111,11 @@ class LogAndTables:
 
     async def fold(self) -> int:
         async with self._tables():
-            return await self._projector.fold_behind()
+            return await self._projector.catch_up()
 
-    async def fold_some(self) -> bool:
+    async def fold_next_batch(self) -> bool:
         async with self._tables():
-            return await self._projector.fold_some()
+            return await self._projector.fold_next_batch()
 
     @asynccontextmanager
     async def _tables(self) -> AsyncIterator[None]:
@@ -249,7 +249,7 @@ class RecoveryReport(NamedTuple):
         dead_letters: by episode id, the folder that keeps what the database refused of it, now or earlier.
     """
 
-    drained: Recovered
+    drained: DrainSummary
     living: int
     lost: tuple[str, ...]
     failed: Mapping[str, PycrormError]
@@ -282,7 +282,7 @@ async def recover(
             done = await drain_once(sources, destination, settings=settings)
             for queue, state in zip(living, done.drained, strict=False):
                 stopped = {each: why for each, why in done.stopped.items() if each in queue.episodes}
-                queue.note_shown(state.appended or queue.given, {**state.refused, **stopped})
+                queue.mark_visible(state.appended or queue.given, {**state.refused, **stopped})
     dead_letters = {each.refused: each.path for each in place.recorders() if each.refused is not None}
     return RecoveryReport(done, len(living), tuple(lost), {**done.failed, **failures}, dead_letters)
 
@@ -357,16 +357,16 @@ async def rebind(
     return rebinding
 
 
-class Waiting(NamedTuple):
+class PendingRecorders(NamedTuple):
     """How many recorders of a spool are dead, with events that may not be in the database, and how many alive."""
 
     dead: int
     alive: int
 
 
-def waiting(url: str, spool: Path | None = None) -> Waiting:
+def pending_recorders(url: str, spool: Path | None = None) -> PendingRecorders:
     """What a spool holds beside its database. Reads only. Raises `SpoolUnavailable`."""
     found = Spool(spool or DatabaseAddress.parse(url).default_spool).recorders()
     recorders = [each for each in found if each.refused is None]  # what was refused is no news: `status` tells it
     alive = sum(each.alive for each in recorders)
-    return Waiting(len(recorders) - alive, alive)
+    return PendingRecorders(len(recorders) - alive, alive)

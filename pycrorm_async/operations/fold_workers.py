@@ -1,7 +1,7 @@
 """Processes that fold beside the daemon, which appends: started when they are needed, watched, restarted.
 
     async with FoldWorkers(2, assignment, settings=settings, say=say, note=note) as workers:
-        tables = FoldedByWorkers(destination, workers)
+        tables = FoldWorkerTables(destination, workers)
 
 Theory of operation. A worker is a spawned process (`fold_worker`) with one connection. The daemon sends it a request
 and waits for the answer; between requests a worker holds nothing, neither a lock nor a transaction. What a worker had
@@ -39,9 +39,9 @@ from pycrorm_async.projections.run.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPip
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.stored import Span
 from pycrorm_async.writer.backoff import Backoff
-from pycrorm_async.writer.ports import Shown
+from pycrorm_async.writer.ports import Tables
 
-__all__ = ["WORKERS", "DaemonNote", "FoldWorkers", "FoldedByWorkers", "FoldWorkerState", "FoldWorkerLost", "verdict"]
+__all__ = ["WORKERS", "DaemonNote", "FoldWorkers", "FoldWorkerTables", "FoldWorkerState", "FoldWorkerLost", "verdict"]
 
 WORKERS: Final = 2
 """Processes that fold for one daemon: while one writes the other one prepares, and no database lets two write well."""
@@ -324,7 +324,7 @@ class FoldWorkers:
             self._note_all(states)
 
 
-class FoldedByWorkers(Shown):
+class FoldWorkerTables(Tables):
     """A destination whose tables are folded by workers, and by this process while none of them is ready."""
 
     def __init__(self, destination: LogAndTables, workers: FoldWorkers) -> None:
@@ -342,12 +342,12 @@ class FoldedByWorkers(Shown):
     async def fold(self) -> int:
         return await self._destination.fold()
 
-    async def fold_some(self) -> bool:
+    async def fold_next_batch(self) -> bool:
         if not self._workers.are_wanted:  # a daemon with little to do has no process that it does not need
             self._workers.want(await self._pipeline.size())
         hands = self._workers.ready
         if not hands:
-            folded = await self._destination.fold_some()
+            folded = await self._destination.fold_next_batch()
             self._workers.want(folded)
             return folded
         try:

@@ -24,9 +24,9 @@ from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["Rebuilt", "rebuild_memory", "rebuild_projection", "projections_of"]
+__all__ = ["RebuildSummary", "rebuild_memory", "rebuild_projection", "projections_of"]
 
-Tell: TypeAlias = Callable[[str, int, int], None]
+ReportProgress: TypeAlias = Callable[[str, int, int], None]
 
 _LOOK_S = 0.5
 _ALONE_EVENTS_MAX = 500_000
@@ -37,7 +37,7 @@ _WAIT_S = 20.0
 """For a turn to write on SQLite: what has run for an hour does not give up for a plan that is busy."""
 
 
-class Rebuilt(NamedTuple):
+class RebuildSummary(NamedTuple):
     """What a rebuild made.
 
     Attributes:
@@ -61,9 +61,9 @@ async def rebuild_memory(
     *,
     workers: int | None = 1,
     views: Sequence[UserView] = (),
-    tell: Tell = lambda _what, _done, _total: None,
+    tell: ReportProgress = lambda _what, _done, _total: None,
     clock: Clock = SYSTEM_CLOCK,
-) -> Rebuilt:
+) -> RebuildSummary:
     """Makes the tables of a memory anew from its log.
 
     Args:
@@ -86,9 +86,9 @@ async def rebuild_projection(
     url: str,
     projection: Projection,
     *,
-    tell: Tell = lambda _what, _done, _total: None,
+    tell: ReportProgress = lambda _what, _done, _total: None,
     clock: Clock = SYSTEM_CLOCK,
-) -> Rebuilt:
+) -> RebuildSummary:
     """The same for the tables of one projection, of whatever version they are. Raises also `DatabaseForeign`."""
     return await _rebuilt(url, lambda log: Rebuild.begin(log, projection=projection), 1, tell, clock)
 
@@ -104,8 +104,8 @@ async def projections_of(url: str) -> list[str]:
 
 
 async def _rebuilt(
-    url: str, begin: Callable[[EventLog], Awaitable[Rebuild]], workers: int | None, tell: Tell, clock: Clock
-) -> Rebuilt:
+    url: str, begin: Callable[[EventLog], Awaitable[Rebuild]], workers: int | None, tell: ReportProgress, clock: Clock
+) -> RebuildSummary:
     address = shared_address(url)
     await (await EventLog.open(address, create=False)).close()  # it makes no memory where there is none
     log = await _opened(address)
@@ -123,7 +123,7 @@ async def _rebuilt(
             left = await clear(log)
         episodes, events = await recorded(log)
         ids = {each.number: each.id for each in await log.episodes()} if parked else {}
-        return Rebuilt(
+        return RebuildSummary(
             generation=rebuild.number,
             events=events,
             episodes=episodes,
@@ -139,7 +139,7 @@ async def _opened(address: DatabaseAddress) -> EventLog:
     return await EventLog.open(address, create=True, busy_timeout_s=_WAIT_S if address.is_sqlite else BUSY_TIMEOUT_S)
 
 
-async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, tell: Tell) -> None:
+async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, tell: ReportProgress) -> None:
     _, total = await recorded(log)
     if workers is None:
         idle = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
@@ -148,7 +148,7 @@ async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, tell: Tell
         await _share_out(log.address, rebuild, workers, lambda left: tell("rebuilding", max(total - left, 0), total))
     # All of it, or what came meanwhile and what a worker that failed has left: then it fails here too, and says why.
     done = total - await rebuild.left()
-    while (count := await rebuild.fold_some()) is not None:
+    while (count := await rebuild.fold_next_batch()) is not None:
         done += count
         tell("rebuilding", done, max(total, done))
 
@@ -194,7 +194,7 @@ async def _work_on(address: DatabaseAddress, share: Share) -> None:
     try:
         rebuild = await Rebuild.join(log, share)
         parent = multiprocessing.parent_process()
-        while parent is not None and parent.is_alive() and await rebuild.fold_some() is not None:
+        while parent is not None and parent.is_alive() and await rebuild.fold_next_batch() is not None:
             pass
     finally:
         await log.close()

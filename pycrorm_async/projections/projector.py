@@ -2,7 +2,7 @@
 
 projector = Projector(log)
 await projector.open()
-await projector.fold_behind()
+await projector.catch_up()
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.custom.projection_tables import OwnTables
+from pycrorm_async.projections.custom.projection_tables import CustomTables
 from pycrorm_async.projections.run.batch_fold import Folding, Prepared
 from pycrorm_async.projections.run.parked_release import release_parked
 from pycrorm_async.projections.schema.generations import (
@@ -63,7 +63,7 @@ class Projector:
         self._log = log
         self._views = views
         self._batch_events = batch_events
-        self._own = OwnTables(log, projections, found, batch_events=batch_events)
+        self._own = CustomTables(log, projections, found, batch_events=batch_events)
         self._has_news = True
         self._folding: Folding | None = None
         self._last_number = 0
@@ -86,11 +86,11 @@ class Projector:
                 changed = await self._own.set_up(connection, layout)
                 if found is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
-                generation = await release_parked(connection, _Live(), generation)
-            self._folding = Folding(self._log, _Live(), generation)
+                generation = await release_parked(connection, _LiveTarget(), generation)
+            self._folding = Folding(self._log, _LiveTarget(), generation)
             await self._sweep()
 
-    async def fold_behind(self) -> int:
+    async def catch_up(self) -> int:
         """Shows in the tables what the log holds; the number of events folded.
 
         An event that cannot be folded parks its episode with the reason, what came before it is shown, and the others
@@ -102,11 +102,11 @@ class Projector:
                 count += some
             while await self._refresh():
                 pass
-            while await self._own.fold_some(now=True):
+            while await self._own.fold_next_batch(now=True):
                 pass
         return count
 
-    async def fold_some(self) -> bool:
+    async def fold_next_batch(self) -> bool:
         """One batch of the same, or some of the views that are kept; False if nothing was behind."""
         with self._log.translated():
             self._has_news = await self._fold_next() is not None or await self.fold_rest(now=self._has_news)
@@ -118,7 +118,7 @@ class Projector:
         Of a projection few events are left for later unless it is to be `now`.
         """
         with self._log.translated():
-            return await self._refresh() or await self._own.fold_some(now=now)
+            return await self._refresh() or await self._own.fold_next_batch(now=now)
 
     async def prepare(self, spans: Sequence[Span]) -> Prepared:
         """Reads and folds these, and writes nothing. Raises `DatabaseUnavailable`."""
@@ -151,7 +151,7 @@ class Projector:
             return False
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).alone(connection)
-            generation = await _Live().generation(connection, "share")
+            generation = await _LiveTarget().generation(connection, "share")
             return await refresh_some(connection, generation.layout, generation.number)
 
     async def _sweep(self) -> None:
@@ -159,7 +159,7 @@ class Projector:
             await dialect_of(connection).sweep(connection)
 
 
-class _Live:
+class _LiveTarget:
     """What people see, and `episode.folded`. Implements `Goal`."""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:

@@ -2,7 +2,7 @@
 
     async with claimed(log):
         rebuild = await Rebuild.begin(log)
-        while await rebuild.fold_some(): ...
+        while await rebuild.fold_next_batch(): ...
         await rebuild.show()
         await clear(log)
 
@@ -24,10 +24,10 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.custom.projection_tables import OwnMeaning, layout_of, make_own, refuse_taken
+from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, layout_of, make_own, refuse_taken
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import TABLES
-from pycrorm_async.projections.run.catch_up import WHOLE, Beside, CatchUp, Share
+from pycrorm_async.projections.run.catch_up import WHOLE, CatchUp, Share, SideTarget
 from pycrorm_async.projections.schema.generations import (
     MAKING,
     PROJECTION,
@@ -112,12 +112,12 @@ class Rebuild:
         self._key = SHOWN if projection is None else f"{PROJECTION}{projection.name}"
         name = None if projection is None else projection.name
         self._place = checkpoints.place_of(generation.number, name)
-        self._making = Beside(f"{self._key}{_MAKING}", name, generation.version, number=generation.number)
+        self._making = SideTarget(f"{self._key}{_MAKING}", name, generation.version, number=generation.number)
         self._catch_up = CatchUp(
             log,
             self._making,
             generation,
-            meaning=TABLES if projection is None else OwnMeaning(projection),
+            meaning=TABLES if projection is None else CustomFoldDefinition(projection),
             share=share,
             after_tables=projection is not None,
             batch_events=_BATCH_EVENTS,
@@ -149,7 +149,7 @@ class Rebuild:
                     await make_empty(connection, {checkpoints.TABLE: checkpoints.COLUMNS}, making.number)
                 making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
                 await note(connection, MAKING, making)
-            goal = Beside(MAKING, None, making.version, number=making.number)
+            goal = SideTarget(MAKING, None, making.version, number=making.number)
             while (grown := await _grown(log, goal, payloads)).layout != making.layout:
                 making = grown
             async with log.engine.begin() as connection:
@@ -184,16 +184,16 @@ class Rebuild:
         async with self._log.reading() as connection:
             return await checkpoints.parked(connection, self._place)
 
-    async def fold_some(self) -> int | None:
+    async def fold_next_batch(self) -> int | None:
         """Folds a batch; the number of events, None when none is left of this share."""
         with self._log.translated():
-            return await self._catch_up.fold_some()
+            return await self._catch_up.fold_next_batch()
 
     async def show(self) -> None:
         """Puts the new tables before the people, with all that the old ones showed. The old ones wait for `clear`."""
         with self._log.translated():
             for _ in range(_SHOW_ATTEMPTS):
-                while await self.fold_some() is not None:
+                while await self.fold_next_batch() is not None:
                     pass
                 await self._fill_kept()
                 try:
@@ -274,7 +274,7 @@ class Rebuild:
         await show(connection, replace(tables, revision=tables.revision + 1))
 
 
-async def _grown(log: EventLog, goal: Beside, payloads: Sequence[bytes]) -> Generation:
+async def _grown(log: EventLog, goal: SideTarget, payloads: Sequence[bytes]) -> Generation:
     """The generation with more of the tables of these declarations, or as it was if it has all that can be made."""
     async with log.engine.begin() as connection:
         await dialect_of(connection).alone(connection)

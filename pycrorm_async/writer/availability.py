@@ -8,9 +8,9 @@ from typing import TypeVar
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.writer.ports import Shown
+from pycrorm_async.writer.ports import Tables
 
-__all__ = ["Watched", "is_notable"]
+__all__ = ["AvailabilityMonitor", "is_notable"]
 
 _T = TypeVar("_T")
 _NOTABLE_S = 1.0
@@ -25,12 +25,12 @@ def is_notable(unanswered_s: float) -> bool:
     return unanswered_s >= _NOTABLE_S
 
 
-class Watched(Shown):
+class AvailabilityMonitor(Tables):
     """`on_away` is called with the reason once it is notable, `on_back` with the seconds at the next answer."""
 
     def __init__(
         self,
-        destination: Shown,
+        destination: Tables,
         *,
         now_s: Callable[[], float],
         on_away: Callable[[str], None],
@@ -52,8 +52,8 @@ class Watched(Shown):
     async def fold(self) -> int:
         return await self._answered(self._destination.fold())
 
-    async def fold_some(self) -> bool:
-        return await self._answered(self._destination.fold_some())
+    async def fold_next_batch(self) -> bool:
+        return await self._answered(self._destination.fold_next_batch())
 
     async def behind(self) -> Mapping[str, int]:
         return await self._answered(self._destination.behind())

@@ -14,10 +14,10 @@ from typing import NamedTuple, TypeVar
 from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.backoff import PATIENT
-from pycrorm_async.writer.drain import Drain, DrainState, to_the_end
+from pycrorm_async.writer.drain import Drain, DrainState, run_to_completion
 from pycrorm_async.writer.patience import Patience
 from pycrorm_async.writer.ports import Destination, Source
-from pycrorm_async.writer.retry import answer_of
+from pycrorm_async.writer.retry import retry
 
 __all__ = ["LiveWriter", "WriterState"]
 
@@ -162,7 +162,7 @@ class LiveWriter:
 
     async def _patiently(self, ask: Callable[[], Awaitable[_T]]) -> _T:
         """Asks again while the database is away; the caller bounds the time."""
-        answer = await answer_of(ask, backoff=PATIENT, on_away=self._note_away, randomness=self._randomness)
+        answer = await retry(ask, backoff=PATIENT, on_away=self._note_away, randomness=self._randomness)
         self._fold_error = None
         return answer
 
@@ -190,8 +190,8 @@ class LiveWriter:
         # Finding and recovering folders reads files: in a thread, so that our own queue does not wait for it.
         sources: Iterator[Source] = iter(())
         try:
-            sources = await to_the_end(asyncio.to_thread(lambda: iter(self._adopt())))
-            while (source := await to_the_end(asyncio.to_thread(next, sources, None))) is not None:
+            sources = await run_to_completion(asyncio.to_thread(lambda: iter(self._adopt())))
+            while (source := await run_to_completion(asyncio.to_thread(next, sources, None))) is not None:
                 await self._drain_adopted(source)
         except Exception as error:  # noqa: BLE001 - shown in the state; another's folder does not stop our own queue
             self._adoption_errors.append(str(error))

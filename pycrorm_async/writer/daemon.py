@@ -15,13 +15,13 @@ from typing import Final, NamedTuple
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.availability import Watched
+from pycrorm_async.writer.availability import AvailabilityMonitor
 from pycrorm_async.writer.backoff import PATIENT, Backoff
-from pycrorm_async.writer.drain import to_the_end
-from pycrorm_async.writer.ports import Found, Held, Look, Shown
-from pycrorm_async.writer.visibility import Serving
+from pycrorm_async.writer.drain import run_to_completion
+from pycrorm_async.writer.ports import ClaimedSource, ScanResult, SourceScanner, Tables
+from pycrorm_async.writer.visibility import VisibilityTracker
 
-__all__ = ["Daemon", "Moved", "LEAVE_S"]
+__all__ = ["Daemon", "DaemonSummary", "LEAVE_S"]
 
 LEAVE_S: Final = 10.0
 """How long leaving may take. What is not stored by then stays in its folder, and the next daemon finds it."""
@@ -32,7 +32,7 @@ _REST = Backoff(first_s=1.0, longest_s=60.0)
 """Before a folder is tried again that could not be drained to its end: it is damaged, or nothing can be set aside."""
 
 
-class Moved(NamedTuple):
+class DaemonSummary(NamedTuple):
     """What a daemon did: recorders it let go of, and records it gave to the log."""
 
     recorders: int
@@ -44,26 +44,28 @@ class Daemon:
 
     def __init__(
         self,
-        destination: Shown,
-        look: Look,
+        destination: Tables,
+        look: SourceScanner,
         *,
         settings: Settings,
         say: Callable[[str], None],
         randomness: Callable[[], float] = random.random,
     ) -> None:
-        self._destination = Watched(destination, now_s=self._now_s, on_away=self._note_away, on_back=self._note_back)
+        self._destination = AvailabilityMonitor(
+            destination, now_s=self._now_s, on_away=self._note_away, on_back=self._note_back
+        )
         self._look = look
         self._settings = settings
         self._say = say
         self._randomness = randomness
-        self._serving: dict[str, Serving] = {}
+        self._serving: dict[str, VisibilityTracker] = {}
         self._rests: dict[str, tuple[int, float]] = {}  # by name: how often it was tried, when it may be again
         self._news = asyncio.Event()
         self._away: str | None = None
         self._said: dict[str, str] = {}  # by what it is about, the last line
         self._recorders = self._records = 0
 
-    async def run(self, leave: asyncio.Event) -> Moved:
+    async def run(self, leave: asyncio.Event) -> DaemonSummary:
         """Until `leave` is set. Then takes hold of nothing new, drains what is synced at that moment, folds, returns.
 
         Returns after `LEAVE_S` in any case, when the database lets it; nothing is lost by that. Raises `SpoolForeign`
@@ -96,26 +98,26 @@ class Daemon:
             confirming.cancel()
         if foreign is not None:
             raise foreign
-        return Moved(self._recorders, self._records)
+        return DaemonSummary(self._recorders, self._records)
 
     # --- looking round ----------------------------------------------------------------------------------------
 
-    async def _look_round(self) -> list[Held]:
+    async def _look_round(self) -> list[ClaimedSource]:
         now_s = self._now_s()
         resting = {name for name, (_, until_s) in self._rests.items() if until_s > now_s}
         but = self._serving.keys() | resting
-        found = Found([], {})
+        found = ScanResult([], {})
 
         def look() -> None:
             nonlocal found
             found = self._look(but)
 
         try:
-            await to_the_end(asyncio.to_thread(look))
+            await run_to_completion(asyncio.to_thread(look))
         except asyncio.CancelledError:
             for held in found.held:  # the next daemon, which may be in this process, is to find them free
                 with suppress(PycrormError):
-                    held.let_go()
+                    held.release_folder()
             raise
         except SpoolForeign:
             raise
@@ -137,9 +139,9 @@ class Daemon:
 
     # --- one recorder -----------------------------------------------------------------------------------------
 
-    async def _serve(self, held: Held) -> None:
+    async def _serve(self, held: ClaimedSource) -> None:
         name = held.name
-        serving = Serving(
+        serving = VisibilityTracker(
             held,
             self._destination,
             settings=self._settings,
@@ -152,17 +154,17 @@ class Daemon:
         fault: str | None = None
         try:
             if self._away is not None:
-                held.note_away(self._away)
+                held.mark_unavailable(self._away)
             await serving.run()
         except Exception as error:  # noqa: BLE001 - told, and tried again; the other recorders go on
             fault = _in_a_line(error)
         finally:
-            await to_the_end(self._let_go(serving, fault))
+            await run_to_completion(self._let_go(serving, fault))
 
-    async def _let_go(self, serving: Serving, fault: str | None) -> None:
+    async def _let_go(self, serving: VisibilityTracker, fault: str | None) -> None:
         name, state, again = serving.name, serving.state, True
         try:
-            left = await asyncio.to_thread(serving.held.let_go)
+            left = await asyncio.to_thread(serving.held.release_folder)
             again = left.again
             if fault is None and not left.whole:
                 fault = next(
@@ -191,7 +193,7 @@ class Daemon:
             await self._news.wait()
             self._news.clear()
             try:
-                while await self._destination.fold_some():
+                while await self._destination.fold_next_batch():
                     await self._tell_what_shows()
                 await self._tell_what_shows()
             except Exception as error:  # noqa: BLE001 - told, and tried again; appending goes on
@@ -239,7 +241,7 @@ class Daemon:
     def _tell_away(self) -> None:
         for serving in self._serving.values():
             try:
-                serving.held.note_away(self._away)
+                serving.held.mark_unavailable(self._away)
             except FilesError as error:
                 self._say(f"recorder {serving.name}: {error}")
 

@@ -9,7 +9,7 @@ from pycrorm_async.errors import DatabaseError, EpisodeParked, FlushTimeout
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.ports import DrainProgress, OfferedQueue
 
-__all__ = ["HandedOver"]
+__all__ = ["DelegatedWriter"]
 
 _log = logging.getLogger("pycrorm_async")
 _LOOK_S = 0.01
@@ -18,7 +18,7 @@ _UNTENDED_S = 2.0
 is dead. Longer than a daemon takes to look round for a queue that was just made."""
 
 
-class HandedOver:
+class DelegatedWriter:
     """What `WriterThread` is for a memory that writes by itself: flushes and closes. Belongs to the plan's loop."""
 
     def __init__(self, queue: OfferedQueue, settings: Settings) -> None:

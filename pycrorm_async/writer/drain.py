@@ -22,9 +22,9 @@ from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.backoff import PATIENT, Backoff
 from pycrorm_async.writer.ports import Destination, Source
-from pycrorm_async.writer.retry import answer_of
+from pycrorm_async.writer.retry import retry
 
-__all__ = ["Drain", "DrainState", "to_the_end"]
+__all__ = ["Drain", "DrainState", "run_to_completion"]
 
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
@@ -110,7 +110,7 @@ class Drain:
                 self._on_append()
                 await self._tell()
         except Exception as error:
-            self._source.give_up(_stopped(error))
+            self._source.fail(_stopped(error))
             raise
         finally:
             self._over = True
@@ -118,7 +118,7 @@ class Drain:
 
     async def abandon(self, error: Exception) -> None:
         """Instead of `run`, when it cannot be: who waits is told."""
-        self._source.give_up(_stopped(error))
+        self._source.fail(_stopped(error))
         self._over = True
         await self._tell()
 
@@ -148,8 +148,8 @@ class Drain:
         )
 
     async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        refusals = await answer_of(
-            lambda: to_the_end(self._destination.append(batch)),
+        refusals = await retry(
+            lambda: run_to_completion(self._destination.append(batch)),
             backoff=self._backoff,
             on_away=self._note_away,
             randomness=self._randomness,
@@ -173,13 +173,13 @@ class Drain:
 
     async def _set_aside(self, records: Sequence[Record], refused: Mapping[str, str]) -> None:
         try:
-            aside = await to_the_end(asyncio.to_thread(self._source.set_aside, records))
+            aside = await run_to_completion(asyncio.to_thread(self._source.dead_letter, records))
         except (FilesError, DamageError) as error:
             self._ceiling, self.stuck = records[0].position - 1, error
             episode, reason = next(iter(refused.items()))
             refusal = f"episode {episode} was refused: {reason}; its events cannot be set aside: {error}"
             self._say(f"nothing more is acknowledged to recorder {self._source.name}: {refusal}")
-            self._source.give_up(refusal)
+            self._source.fail(refusal)
             return
         if not aside:
             self._ceiling = records[0].position - 1
@@ -202,7 +202,7 @@ def _stopped(error: Exception) -> str:
     return f"the writer stopped: {error}"
 
 
-async def to_the_end(work: Coroutine[Any, Any, _T]) -> _T:
+async def run_to_completion(work: Coroutine[Any, Any, _T]) -> _T:
     """Awaits work that is not to be left half done: a cancellation, or several, is passed on when it is finished."""
     task = asyncio.create_task(work)
     try:

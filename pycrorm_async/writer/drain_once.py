@@ -10,13 +10,13 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.writer.backoff import BRIEF
 from pycrorm_async.writer.drain import Drain, DrainState
 from pycrorm_async.writer.ports import Destination, Source
-from pycrorm_async.writer.retry import answer_of
+from pycrorm_async.writer.retry import retry
 
-__all__ = ["Recovered", "drain_once"]
+__all__ = ["DrainSummary", "drain_once"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recovered:
+class DrainSummary:
     """What one round moved.
 
     Attributes:
@@ -32,7 +32,7 @@ class Recovered:
     stopped: Mapping[str, str]
 
 
-async def drain_once(sources: Iterable[Source], destination: Destination, *, settings: Settings) -> Recovered:
+async def drain_once(sources: Iterable[Source], destination: Destination, *, settings: Settings) -> DrainSummary:
     """Drains each source to its end, then folds. One that is damaged does not keep the others from being drained.
 
     Raises `DatabaseUnavailable` if the database stays away for some attempts at any of this; what was stored stays.
@@ -52,8 +52,8 @@ async def drain_once(sources: Iterable[Source], destination: Destination, *, set
         if drain.stuck is not None:
             failed[source.name] = drain.stuck
         drained.append(drain.state)
-    await answer_of(destination.confirm, backoff=BRIEF)
-    folded = await answer_of(destination.fold, backoff=BRIEF)
-    stopped = await answer_of(destination.stopped, backoff=BRIEF)
+    await retry(destination.confirm, backoff=BRIEF)
+    folded = await retry(destination.fold, backoff=BRIEF)
+    stopped = await retry(destination.stopped, backoff=BRIEF)
     refused = {episode: reason for each in drained for episode, reason in each.refused.items()}
-    return Recovered(drained=tuple(drained), failed=failed, folded=folded, stopped={**refused, **stopped})
+    return DrainSummary(drained=tuple(drained), failed=failed, folded=folded, stopped={**refused, **stopped})

@@ -1,6 +1,6 @@
 """What the writer needs of its two ends: a source of synced records, and a log that takes and folds them.
 
-`Source` and `Destination` are what a writer beside a plan needs; `Held` and `Shown` what a daemon needs more.
+`Source` and `Destination` are what a writer beside a plan needs; `ClaimedSource` and `Tables` what a daemon needs more.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pycrorm_async.events.ids import EpisodeId
 __all__ = [
     "Source",
     "Destination",
-    "Held",
-    "LetGo",
-    "Look",
-    "Found",
-    "Shown",
+    "ClaimedSource",
+    "ReleaseOutcome",
+    "SourceScanner",
+    "ScanResult",
+    "Tables",
     "OfferedQueue",
     "DrainProgress",
     "DrainRemarks",
@@ -46,7 +46,7 @@ class Source(Protocol):
         """Everything up to this position is stored for good: its segments may be deleted."""
         ...
 
-    def set_aside(self, records: Sequence[Record]) -> bool:
+    def dead_letter(self, records: Sequence[Record]) -> bool:
         """Keeps records that the log refused elsewhere, so that the source may forget them like stored ones: durable
         when it returns. What was set aside before is so once. Blocks.
 
@@ -55,7 +55,7 @@ class Source(Protocol):
         """
         ...
 
-    def give_up(self, reason: str) -> None:
+    def fail(self, reason: str) -> None:
         """From now on nothing more will be acknowledged: whoever waits for room is told why. The first reason stays."""
         ...
 
@@ -93,7 +93,7 @@ class Destination(Protocol):
         ...
 
 
-class Held(Source, Protocol):
+class ClaimedSource(Source, Protocol):
     """One recorder's folder, held by a daemon: nobody else drains it meanwhile."""
 
     @property
@@ -105,20 +105,20 @@ class Held(Source, Protocol):
         """Nothing beyond what is synced now is given any more."""
         ...
 
-    def note_shown(self, position: int, stopped: Mapping[str, str]) -> None:
+    def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None:
         """Everything up to this position shows in the tables, or never will: of the `stopped` episodes, by id."""
         ...
 
-    def note_away(self, reason: str | None) -> None:
+    def mark_unavailable(self, reason: str | None) -> None:
         """Why the database takes nothing now; None when it does again."""
         ...
 
-    def let_go(self) -> LetGo:
+    def release_folder(self) -> ReleaseOutcome:
         """Leaves it to whoever comes next; what a dead recorder left is deleted if all of it is stored. Blocks."""
         ...
 
 
-class LetGo(NamedTuple):
+class ReleaseOutcome(NamedTuple):
     """What became of a folder, in words; `whole` unless something is left in it that could not be stored.
 
     `again`: whether that is to be tried again in this process.
@@ -129,23 +129,23 @@ class LetGo(NamedTuple):
     again: bool = True
 
 
-class Found(NamedTuple):
+class ScanResult(NamedTuple):
     """What looking round brought: folders to drain, and by name those that cannot be, and why."""
 
-    held: Sequence[Held]
+    held: Sequence[ClaimedSource]
     failed: Mapping[str, Exception]
 
 
-class Look(Protocol):
+class SourceScanner(Protocol):
     """Takes hold of every recorder's folder that can be drained, but for those of these names. Reads files: blocks."""
 
-    def __call__(self, but: Collection[str]) -> Found: ...
+    def __call__(self, but: Collection[str]) -> ScanResult: ...
 
 
-class Shown(Destination, Protocol):
+class Tables(Destination, Protocol):
     """A destination that says what shows in the tables, and folds in steps, so that appending goes on beside it."""
 
-    async def fold_some(self) -> bool:
+    async def fold_next_batch(self) -> bool:
         """Shows some of what the tables do not show yet; False if there was nothing. Raises as `fold` does."""
         ...
 

@@ -1,6 +1,6 @@
 """Asks a database again while it is away, with the pauses of a `Backoff`; all that the writer asks goes through here.
 
->>> folded = await answer_of(destination.fold, backoff=BRIEF)
+>>> folded = await retry(destination.fold, backoff=BRIEF)
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import TypeVar
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.writer.backoff import Backoff
 
-__all__ = ["answer_of"]
+__all__ = ["retry"]
 
 _T = TypeVar("_T")
 
 
-async def answer_of(
+async def retry(
     ask: Callable[[], Awaitable[_T]],
     *,
     backoff: Backoff,

@@ -10,15 +10,15 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Drain, DrainState
-from pycrorm_async.writer.ports import Destination, Held, Source
+from pycrorm_async.writer.ports import ClaimedSource, Destination, Source
 
-__all__ = ["Serving"]
+__all__ = ["VisibilityTracker"]
 
 _UNSHOWN_MAX = 256
 """Batches that are followed each for itself; further ones are followed together, however long the tables lag."""
 
 
-class Serving(Source):
+class VisibilityTracker(Source):
     """The source of its own drain: it notes what it passes on, and tells the recorder when that can be seen.
 
     How far the tables are is asked of the log, episode by episode, so it does not matter who folded.
@@ -26,7 +26,7 @@ class Serving(Source):
 
     def __init__(
         self,
-        held: Held,
+        held: ClaimedSource,
         destination: Destination,
         *,
         settings: Settings,
@@ -74,7 +74,7 @@ class Serving(Source):
             self._unshown.popleft()
             shown = position
         if shown:
-            self.held.note_shown(shown, self._stopped)
+            self.held.mark_visible(shown, self._stopped)
             self._noted.set()
 
     # --- as a source ------------------------------------------------------------------------------------------
@@ -93,11 +93,11 @@ class Serving(Source):
     async def acknowledge(self, position: int) -> None:
         await self.held.acknowledge(position)
 
-    def set_aside(self, records: Sequence[Record]) -> bool:
-        return self.held.set_aside(records)
+    def dead_letter(self, records: Sequence[Record]) -> bool:
+        return self.held.dead_letter(records)
 
-    def give_up(self, reason: str) -> None:
-        self.held.give_up(reason)
+    def fail(self, reason: str) -> None:
+        self.held.fail(reason)
 
     def _follow(self, position: int, lasts: dict[str, int]) -> None:
         if len(self._unshown) >= _UNSHOWN_MAX:

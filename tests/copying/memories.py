@@ -71,7 +71,7 @@ async def append(url: str, records: Iterable[Record], *, folded: bool = True) ->
         if folded:
             projector = Projector(log)
             await projector.open()
-            await projector.fold_behind()
+            await projector.catch_up()
     finally:
         await log.close()
 

@@ -14,7 +14,7 @@ import pytest
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.operations.copy import Copied, copy_episodes
+from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.settings import Settings
 from tests.copying.memories import (
     PATIENT,
@@ -42,7 +42,7 @@ SMALL = Settings(batch_events_max=40, batch_bytes_max=8_000)
 New = Callable[[], str]
 
 
-def counts(done: Copied) -> list[tuple[int, int, int, int]]:
+def counts(done: CopySummary) -> list[tuple[int, int, int, int]]:
     assert [(each.damage, each.stopped) for each in done.episodes if each.damage or each.stopped] == []
     return [(each.number, each.were_there, each.copied, each.head) for each in done.episodes]
 

@@ -25,7 +25,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.writer.background_writer import LiveWriter
 from pycrorm_async.writer.daemon import Daemon
-from pycrorm_async.writer.ports import Found, Held
+from pycrorm_async.writer.ports import ClaimedSource, ScanResult
 from tests.databases import ask
 from tests.projections.script import SAYING, Script, declarations, name_of
 from tests.queue.writing import make
@@ -224,7 +224,7 @@ async def test_a_flush_is_cancelled_at_each_of_its_awaits_and_the_writer_goes_on
 
 
 async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, tmp_path: Path) -> None:
-    held: list[Held] = []
+    held: list[ClaimedSource] = []
     async with opened(database_url, tmp_path / "spool") as destination:
 
         async def life(spool: Path) -> None:
@@ -236,7 +236,7 @@ async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, 
 
             look = _Folders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
 
-            def look_and_note(but: Collection[str]) -> Found:
+            def look_and_note(but: Collection[str]) -> ScanResult:
                 found = look(but)
                 held.extend(found.held)
                 return found

@@ -60,7 +60,7 @@ def recover(url: str, spool: Path, _say: object) -> None:
                 recovered.release()
 
 
-def set_aside(spool: Path) -> list[Record]:
+def dead_letter(spool: Path) -> list[Record]:
     """What is kept of the first episode, which must be all that is in the spool."""
     folders = Spool(spool).recorders()
     if not folders:
@@ -98,7 +98,7 @@ def test_killed_at_any_step_and_once_more_no_event_of_a_refused_episode_is_lost_
             for number in (1, 2)
         }
         found = {number: {row[0]: row[2].encode() for row in stored(url, number)} for number in (1, 2)}
-        aside = set_aside(spool)
+        aside = dead_letter(spool)
         sequences = [each.sequence for each in aside]
         assert sequences == list(range(sequences[0], sequences[0] + len(aside)) if aside else ()), (step, after)
         assert set(sequences) & set(found[1]) <= {1, 2}

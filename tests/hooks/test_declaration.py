@@ -210,7 +210,9 @@ def test_a_class_with_the_name_of_a_built_in_one_is_refused() -> None:
         async def perform(self) -> None:
             """Nothing."""
 
-    with pytest.raises(DeclarationRefused, match=r"pycrorm_async\.plan\.actions\.basic\.NavigateActionPerformable is 'Nav"):
+    with pytest.raises(
+        DeclarationRefused, match=r"pycrorm_async\.plan\.actions\.basic\.NavigateActionPerformable is 'Nav"
+    ):
         Declarations().of(NavigateAction, lambda _: None)
 
 

@@ -29,7 +29,7 @@ from pycrorm_async.queue import Spool
 from pycrorm_async.queue.files.spool import RecorderFolder
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.queue.sources.live_source import LiveQueue
-from pycrorm_async.writer.ports import Held
+from pycrorm_async.writer.ports import ClaimedSource
 from tests.databases import ask, ask_to_change
 from tests.memory.daemons import QUICK, Daemon
 from tests.memory.notes import NoteActionPerformable, texts
@@ -299,7 +299,7 @@ async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folder
 ) -> None:
     looking, cancelled = threading.Event(), threading.Event()
 
-    def take(folder: RecorderFolder, stored: StoredSegments, *, again: bool) -> Held | None:
+    def take(folder: RecorderFolder, stored: StoredSegments, *, again: bool) -> ClaimedSource | None:
         looking.set()
         assert cancelled.wait(60)
         return _take(folder, stored, again=again)

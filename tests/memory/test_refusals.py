@@ -251,7 +251,7 @@ async def test_a_spool_that_nobody_will_empty_fails_a_start_instead_of_making_it
         other.execute("BEGIN IMMEDIATE")  # nothing can be stored, so nothing is freed
         with pytest.raises(SpoolStuck, match="the writer has stopped"):
             async with memory.episode(description="e"):
-                memory._now.queue.give_up("the writer has stopped")
+                memory._now.queue.fail("the writer has stopped")
                 while True:
                     await asyncio.wait_for(NoteActionPerformable("x" * 2_000).perform(), 30)
                     reached += 1

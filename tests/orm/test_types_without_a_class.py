@@ -182,7 +182,7 @@ async def test_a_type_that_appears_after_the_question_was_first_asked_is_in_the_
         for question in (select(Action), select(Designator), select(PickUpAction)):
             assert await every(log, question) == []
         await log.append([*KINDS, *all_kinds().records])
-        await projector.fold_behind()
+        await projector.catch_up()
         assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
         classes.learn(await accepted(log))
         assert names(await every(log, select(Action).order_by(Action.id))) == ["CarefulPickUpAction", "SayingAction"]
@@ -198,7 +198,7 @@ async def test_a_field_that_appears_later_is_an_attribute_of_the_class_there_is(
         assert [each.text for each in await every(log, select(saying))] == ["hi"]
         script.put(NodeStarted("action", None, name_of(louder), {"text": "HI", "volume": 0.5}))
         await log.append([*declarations(louder), *script.records])
-        await projector.fold_behind()
+        await projector.catch_up()
         classes.learn(await accepted(log))
         grown: Any = classes.of("SayingAction")
         assert grown is saying

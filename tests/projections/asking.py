@@ -20,7 +20,7 @@ async def stored_and_folded(log: EventLog, records: Sequence[Record]) -> Project
     projector = Projector(log)
     await projector.open()
     await log.append(records)
-    await projector.fold_behind()
+    await projector.catch_up()
     return projector
 
 

@@ -217,7 +217,7 @@ async def test_the_columns_and_the_types_of_a_memory_have_a_bound_that_parks(
     [(leaves,)] = [(len(projector._folding.generation.layout.leaves),)] if projector._folding else []
     monkeypatch.setattr(layout, "LEAVES_MAX", leaves)
     await log.append([*declarations(SAYING), *performing(4, SAYING, text="too many")])
-    await projector.fold_behind()
+    await projector.catch_up()
     assert (await told(log))[1:] == [
         (4, f"event 3: SayingAction would be type {leaves + 1:,}, a memory has tables for {leaves:,}")
     ]
@@ -241,7 +241,7 @@ async def test_a_table_in_the_way_parks_that_type_alone_until_it_is_renamed(log:
         await change(log, "CREATE TABLE memory_tables.kind5_action__1 (mine integer)")
     records: Sequence[Record] = [each for n, type_ in enumerate(types) for each in performing(n + 1, type_, size=n)]
     await log.append([*declarations(*types), *records])
-    await projector.fold_behind()
+    await projector.catch_up()
     [(number, reason)] = await told(log)
     assert number == 6
     assert reason.startswith("event 3: the database makes no tables for Kind5Action: ")
@@ -267,9 +267,9 @@ async def test_a_lock_that_is_not_given_is_no_fault_of_a_type(log: EventLog) -> 
     async with log.reading() as reader:
         await reader.execute(text("SELECT * FROM saying_action"))
         with pytest.raises(DatabaseUnavailable, match="lock timeout"):
-            await projector.fold_behind()
+            await projector.catch_up()
     assert await told(log) == []
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await ask(log, "SELECT text, volume FROM saying_action ORDER BY text") == [("a", None), ("b", 2.0)]
 
 

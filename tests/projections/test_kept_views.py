@@ -49,7 +49,7 @@ async def test_it_shows_at_every_flush_what_the_plain_view_shows(log: EventLog, 
     records = mixed(talk(1, 3), talk(2, 5), talk(3, 0))
     for start in range(0, len(records), step):
         await log.append(records[start : start + step])
-        await projector.fold_behind()
+        await projector.catch_up()
         assert await shown(log, "said") == await shown(log, "said_plainly")
     assert len(await shown(log, "said")) == 8
     assert {status for _, _, status, _ in await shown(log, "said")} == {"SUCCEEDED"}
@@ -60,7 +60,7 @@ async def test_a_process_that_does_not_know_it_keeps_it_up_to_date(log: EventLog
     other = Projector(log)
     await other.open()
     await log.append([*declarations(SAYING), *talk(1, 4).records])
-    await other.fold_behind()
+    await other.catch_up()
     assert len(await shown(log, "said")) == 4
 
 
@@ -68,10 +68,10 @@ async def test_one_registered_later_shows_what_was_there_before(log: EventLog) -
     first = Projector(log)
     await first.open()
     await log.append([*declarations(SAYING), *mixed(*(talk(each, 2) for each in range(1, 501)))])
-    await first.fold_behind()
+    await first.catch_up()
     later = Projector(log, views=[KEPT])
     await later.open()
-    await later.fold_behind()
+    await later.catch_up()
     assert len(await shown(log, "said")) == 1000
 
 
@@ -81,11 +81,11 @@ async def test_another_meaning_of_the_same_name_is_shown_and_the_old_rows_go_wit
     projector = Projector(log, views=[KEPT])
     await projector.open()
     await log.append([*declarations(SAYING), *talk(1, 4).records])
-    await projector.fold_behind()
+    await projector.catch_up()
     roots = UserView("said", select(TaskTreeNode.process_metadata_id, TaskTreeNode.kind), materialised=True)
     changed = Projector(log, views=[roots])
     await changed.open()
-    await changed.fold_behind()
+    await changed.catch_up()
     assert await ask(log, "SELECT kind, count(*) FROM said GROUP BY kind ORDER BY kind") == [("action", 4), ("root", 1)]
     assert len(await kept_tables_of(log)) == 4
     await rebuild_memory(log.address.to_type)
@@ -98,7 +98,7 @@ async def test_it_can_become_a_plain_view_and_kept_again(log: EventLog) -> None:
     for view in (KEPT, UserView("said", MEANING), KEPT):
         projector = Projector(log, views=[view])
         await projector.open()
-        await projector.fold_behind()
+        await projector.catch_up()
         assert len(await shown(log, "said")) == 4
 
 
@@ -106,14 +106,14 @@ async def test_a_rebuild_makes_it_anew_and_it_goes_on(log: EventLog) -> None:
     projector = Projector(log, views=[KEPT, PLAIN])
     await projector.open()
     await log.append([*declarations(SAYING), *mixed(talk(1, 4), talk(2, 7))])
-    await projector.fold_behind()
+    await projector.catch_up()
     before = await shown(log, "said")
     old = set(await kept_tables_of(log))
     await rebuild_memory(log.address.to_type)
     assert await shown(log, "said") == before
     assert old.isdisjoint(await kept_tables_of(log))
     await log.append(talk(3, 2).records)
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await shown(log, "said") == await shown(log, "said_plainly")
     assert len(await shown(log, "said")) == 13
 

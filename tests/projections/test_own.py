@@ -18,7 +18,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.custom.projection import Changes, Event, Projection
-from pycrorm_async.projections.custom.projection_rows import OwnRows
+from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.custom.projection_tables import states
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.projector import Projector
@@ -85,7 +85,7 @@ async def folded(log: EventLog, records: Sequence[Any], *projections: Projection
     projector = Projector(log, projections=projections, **options)
     await projector.open()
     await log.append(records)
-    await projector.fold_behind()
+    await projector.catch_up()
     return projector
 
 
@@ -114,7 +114,7 @@ async def test_it_follows_event_by_event_as_the_daemon_folds(log: EventLog) -> N
     projector = await folded(log, [*declarations(PICK_UP), *tries().records[:4]], GraspRate())
     assert [row[-1] for row in await shown(log)] == ["SUCCEEDED"]
     await log.append(tries().records)
-    while await projector.fold_some():
+    while await projector.fold_next_batch():
         pass
     assert await shown(log) == rows_of(1)
 
@@ -153,7 +153,7 @@ async def test_a_declaration_that_cannot_be_read_stops_nothing_else(log: EventLo
     await log.append([*declarations(PICK_UP), strange, *tries().records])
     projector = Projector(log, projections=[GraspRate()])
     await projector.open()
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await ask(log, "SELECT * FROM grasp_try ORDER BY id") == rows_of(1)
 
 
@@ -165,7 +165,7 @@ async def test_two_that_fold_at_once_show_every_event_once(log: EventLog) -> Non
         both = [Projector(each, projections=[GraspRate()], batch_events=1_000) for each in (log, other)]
         for each in both:
             await each.open()
-        await asyncio.gather(*(each.fold_behind() for each in both))
+        await asyncio.gather(*(each.catch_up() for each in both))
     finally:
         await other.close()
     assert Counter(await shown(log)) == Counter(each for episode in range(1, 21) for each in rows_of(episode))
@@ -217,10 +217,10 @@ async def test_another_version_is_not_folded_before_it_is_rebuilt(
     assert "grasp_tries_per_arm" not in await names(log, "view")
     caplog.clear()
     await log.append(tries(3).records)
-    await before.fold_behind()  # it knows version 1 only, and leaves it
+    await before.catch_up()  # it knows version 1 only, and leaves it
     assert await shown(log) == new
     assert "not kept up to date any more" in caplog.text
-    assert await projector.fold_behind() == 0
+    assert await projector.catch_up() == 0
 
 
 async def test_rebuilt_it_is_what_it_was_live(log: EventLog) -> None:
@@ -230,7 +230,7 @@ async def test_rebuilt_it_is_what_it_was_live(log: EventLog) -> None:
     assert "pycrorm_own_grasp_try__2" in await names(log, "table")
     assert not [each for each in await names(log, "table") if "grasp_" in each and each.endswith("__1")]
     await log.append(tries(3).records)  # who folded the old tables goes on with the new ones
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await shown(log) == [*rows_of(1), *rows_of(2), *rows_of(3)]
 
 
@@ -248,7 +248,7 @@ async def test_a_rebuild_that_broke_off_is_taken_up(log: EventLog, monkeypatch: 
     monkeypatch.setattr("pycrorm_async.projections.rebuild._BATCH_EVENTS", 5)
     async with claimed(log):
         broken = await Rebuild.begin(log, projection=GraspRate())
-        assert await broken.fold_some() == 5
+        assert await broken.fold_next_batch() == 5
     assert await shown(log) == [*rows_of(1), *rows_of(2)]
     async with claimed(log):
         again = await Rebuild.begin(log, projection=GraspRate())
@@ -291,7 +291,7 @@ async def test_a_type_that_is_declared_later_has_its_table_all_the_same(
     script.put(EpisodeStarted("", "me", "host", "", "3.11"))
     node = script.put(NodeStarted("action", designator=name_of(trying), parameters={"text": "again"}))
     await log.append([*declarations(trying), *script.records])
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await ask(log, "SELECT id, text FROM grasp_try") == [(row(node, number=2), "again")]
     assert "the projection grasp_rate is not shown: the memory itself has grasp_try" in caplog.text
     assert await ask(log, "SELECT count(*) FROM episode WHERE parked IS NOT NULL") == [(0,)]
@@ -328,7 +328,7 @@ class Wrong(Projection):
     ],
 )
 def test_a_row_that_cannot_be_kept_is_refused_on_every_database_alike(changes: Any, reason: str) -> None:
-    rows = OwnRows(Wrong(("wrong_row", row(1, slot=1), {"n": 1}), *changes), {})
+    rows = CustomRows(Wrong(("wrong_row", row(1, slot=1), {"n": 1}), *changes), {})
     with pytest.raises(CannotFold, match=reason):
         rows.fold(tries().stored()[0])
     assert rows.to_insert() == {}
@@ -414,9 +414,9 @@ async def test_verify_tells_of_a_fold_that_means_something_else_under_the_same_v
 
 def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
     """Folds four events at a time; dies when the rows of that many batches are written, the last not committed."""
-    write, count = OwnRows.write, 0
+    write, count = CustomRows.write, 0
 
-    async def written(self: OwnRows, connection: AsyncConnection, generation: int) -> None:
+    async def written(self: CustomRows, connection: AsyncConnection, generation: int) -> None:
         nonlocal count
         await write(self, connection, generation)
         count += 1
@@ -431,7 +431,7 @@ def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
         await folded(log, [], GraspRate(), batch_events=4)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OwnRows, "write", written)
+        patch.setattr(CustomRows, "write", written)
         patch.setattr("pycrorm_async.projections.rebuild._BATCH_EVENTS", 4)
         asyncio.run(fold())
 

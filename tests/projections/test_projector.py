@@ -93,7 +93,7 @@ async def test_batches_of_any_size_show_the_same_rows(log: EventLog, batch_event
     await log.append(records)
     projector = Projector(log, batch_events=batch_events)
     await projector.open()
-    assert await projector.fold_behind() == len(records) - 4
+    assert await projector.catch_up() == len(records) - 4
     nodes = await ask(log, "SELECT id, status, end_time FROM task_tree_node ORDER BY id")
     expected = []
     for number in (1, 2):
@@ -122,7 +122,7 @@ async def test_one_batch_and_event_by_event_give_the_same_tables(log: EventLog, 
         await projector.open()
         for record in records:
             await other.append([record])
-            await projector.fold_behind()
+            await projector.catch_up()
         assert await all_rows(other) == at_once
     finally:
         await other.close()
@@ -130,7 +130,7 @@ async def test_one_batch_and_event_by_event_give_the_same_tables(log: EventLog, 
 
 async def test_nothing_behind_is_nothing_to_do(log: EventLog) -> None:
     projector = await stored_and_folded(log, rich_episode(1).records[:2])
-    assert await projector.fold_behind() == 0
+    assert await projector.catch_up() == 0
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_g
         (row(3, number=2), "RUNNING"),
     ]
     assert await ask(log, "SELECT * FROM saying_action") == [(row(3, number=2), "hi")]
-    assert await projector.fold_behind() == 0
+    assert await projector.catch_up() == 0
 
 
 @pytest.mark.parametrize("batch_events", [1, 2, 10_000])
@@ -203,7 +203,7 @@ async def test_an_event_whose_row_is_there_already_parks_its_episode_and_changes
     await log.append(script.records)
     projector = Projector(log, batch_events=batch_events)
     await projector.open()
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await ask(log, "SELECT description FROM process_metadata") == [("the first",)]
     assert await ask(log, "SELECT status FROM task_tree_node") == [("RUNNING",)]
     assert await ask(log, "SELECT folded FROM episode") == [(2,)]
@@ -219,7 +219,7 @@ async def test_a_type_that_grows_gets_a_column_and_older_rows_stay(log: EventLog
     script.put(NodeStarted("action", None, name_of(louder), {"text": "HI", "volume": 0.5}))
     script.put(NodeStarted("action", None, name_of(SAYING), {"text": "ho"}))
     await log.append([*declarations(louder), *script.records])
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await ask(log, "SELECT id, text, volume FROM saying_action ORDER BY id") == [
         (row(1), "hi", None),
         (row(2), "HI", 0.5),
@@ -238,7 +238,7 @@ async def test_a_descendant_is_among_its_base_also_when_the_base_came_later(log:
     projector = await stored_and_folded(log, [*declarations(careful), *script.records])
     script.put(NodeStarted("action", None, name_of(base), {"arm": "RIGHT"}))
     await log.append([*declarations(base), *script.records])
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await ask(log, "SELECT * FROM grab_action ORDER BY id") == [
         (row(1), None, "LEFT"),
         (row(2), None, "RIGHT"),
@@ -252,7 +252,7 @@ async def test_several_projectors_show_every_event_once(log: EventLog) -> None:
         await each.open()
     episodes = [rich_episode(number) for number in range(1, 9)]
     await log.append([*declarations(NAVIGATE, PICK_UP, VIA), *mixed(*episodes)])
-    counts = await asyncio.gather(*(each.fold_behind() for each in projectors))
+    counts = await asyncio.gather(*(each.catch_up() for each in projectors))
     assert sum(counts) == 8 * 17
     assert await ask(
         log, "SELECT count(*), sum(CASE WHEN status = 'SUCCEEDED' THEN 1 ELSE 0 END) FROM task_tree_node"
@@ -267,10 +267,10 @@ async def test_a_projector_that_knows_older_tables_learns_of_the_new_ones(log: E
     script = Script()
     script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
     await log.append([*declarations(SAYING), *script.records])
-    assert await first.fold_behind() == 1
+    assert await first.catch_up() == 1
     script.put(NodeStarted("action", None, name_of(SAYING), {"text": "ho"}))
     await log.append(script.records)
-    assert await second.fold_behind() == 1
+    assert await second.catch_up() == 1
     assert await ask(log, "SELECT text FROM saying_action ORDER BY id") == [("hi",), ("ho",)]
 
 
@@ -323,6 +323,6 @@ async def test_an_event_that_is_missing_parks_its_episode_and_the_others_go_on(l
         trigger, place = ("event_is_not_changed", " ON event") if postgresql else ("event_is_not_deleted", "")
         await connection.exec_driver_sql(f"DROP TRIGGER {trigger}{place}")
         await connection.exec_driver_sql(f"DELETE FROM event WHERE episode = 1 AND sequence = {missing}")
-    assert await projector.fold_behind() == 3 + missing - 1
+    assert await projector.catch_up() == 3 + missing - 1
     rows = [(row.number, row.folded, row.parked) for row in await log.episodes()]
     assert rows == [(1, missing - 1, f"event {missing} is missing in the log"), (2, 3, None)]

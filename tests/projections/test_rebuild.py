@@ -159,10 +159,10 @@ async def beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
             records = whispering(number) if number == 40 else picking(number).records
             for place in range(0, len(records), 4):
                 assert await log.append(records[place : place + 4]) == {}
-                await projector.fold_some()
+                await projector.fold_next_batch()
             await asyncio.sleep(0.01)
             number += 1
-        await projector.fold_behind()
+        await projector.catch_up()
         await log.close()
 
     async def read() -> None:
@@ -211,7 +211,7 @@ async def test_what_is_shown_while_the_new_tables_are_put_in_place_is_in_them(
             count = (13, 11, 3)[done - 1]
             records = [each for number in range(first + 2, first + 2 + count) for each in picking(number).records[:1]]
             assert await log.append(records) == {}
-            await projector.fold_behind()
+            await projector.catch_up()
         return await original(self)
 
     monkeypatch.setattr(Rebuild, "_show_if_complete", late)
@@ -222,7 +222,7 @@ async def test_what_is_shown_while_the_new_tables_are_put_in_place_is_in_them(
     assert differences(tables_of(database_url), await folded_elsewhere(database_url, tmp_path)) == []
     # And who folded before goes on in the new ones.
     assert await log.append(picking(999).records) == {}
-    await projector.fold_behind()
+    await projector.catch_up()
     assert ask(database_url, "SELECT count(*) FROM process_metadata") == [(29,)]
     await log.close()
 
@@ -271,7 +271,7 @@ async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.M
     async with claimed(log):
         rebuild = await Rebuild.begin(log)
         total, counts = await rebuild.left(), []
-        while (count := await rebuild.fold_some()) is not None:
+        while (count := await rebuild.fold_next_batch()) is not None:
             counts.append(count)
         assert (sum(counts), min(counts) > 0) == (total, True)
         await rebuild.show()
@@ -288,7 +288,7 @@ async def test_cancelled_at_any_moment_it_is_taken_up_where_it_was(
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
 
     async def fold(rebuild: Rebuild) -> None:
-        while await rebuild.fold_some() is not None:
+        while await rebuild.fold_next_batch() is not None:
             pass
 
     async with claimed(log):

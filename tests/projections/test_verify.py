@@ -119,7 +119,7 @@ async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault
         other = await opened(database_url)
         projector = Projector(other, batch_events=6)
         await projector.open()
-        await projector.fold_some()
+        await projector.fold_next_batch()
         await other.close()
 
     while (await log.behind()) and looks < 50:
@@ -170,7 +170,7 @@ async def test_an_episode_that_grows_between_two_parts_is_no_fault(
         await other.append(whole.records[stored : stored + 6])
         projector = Projector(other)
         await projector.open()
-        await projector.fold_behind()
+        await projector.catch_up()
         await other.close()
 
     def tell(_done: int, _total: int) -> None:
@@ -333,7 +333,7 @@ async def test_while_robots_record_and_tables_are_folded_and_made_anew_nothing_f
     batch: list[Record] = []
     reader = await EventLog.open(log.address, create=False)
     async with asyncio.TaskGroup() as beside:
-        for step in (record, projector.fold_some, lambda: rebuilt(other)):
+        for step in (record, projector.fold_next_batch, lambda: rebuilt(other)):
             beside.create_task(again_and_again(step))
         for _ in range(3):
             assert_clean(await look(reader))

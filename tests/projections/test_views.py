@@ -104,9 +104,9 @@ async def test_it_has_those_of_descendants_and_of_former_names_whatever_came_fir
         rows.append(row(script.put(NodeStarted("action", None, name_of(each), parameters, robot))))
         if not at_once:
             await log.append([*declarations(each), *script.records])
-            await projector.fold_behind()
+            await projector.catch_up()
     await log.append([*declarations(*types), *script.records])
-    await projector.fold_behind()
+    await projector.catch_up()
     assert await ask(log, 'SELECT id FROM "PickUpWithContextView" ORDER BY id') == [(each,) for each in rows]
 
 

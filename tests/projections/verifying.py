@@ -180,7 +180,7 @@ def at_once(call: Callable[[], Awaitable[None]]) -> None:
 async def rebuilt(log: EventLog) -> None:
     async with claimed(log):
         rebuild = await Rebuild.begin(log)
-        while await rebuild.fold_some() is not None:
+        while await rebuild.fold_next_batch() is not None:
             pass
         await rebuild.show()
         await clear(log)
@@ -195,7 +195,7 @@ async def fold_in_batches(log: EventLog, scripts: Sequence[Script], events: int)
     projector = Projector(log, batch_events=events)
     await projector.open()
     await log.append([*TYPES, *(each for script in scripts for each in script.records)])
-    await projector.fold_behind()
+    await projector.catch_up()
 
 
 # --- changing ---------------------------------------------------------------------------------------------------

@@ -93,7 +93,7 @@ async def remembered(log: EventLog, *scripts: Script) -> None:
     projector = Projector(log, views=[REACHED])
     await projector.open()
     await log.append([*declarations(*TYPES), *(record for script in scripts for record in script.records)])
-    await projector.fold_behind()
+    await projector.catch_up()
 
 
 async def shown(log: EventLog) -> dict[str, list[Any]]:
@@ -193,7 +193,7 @@ async def test_what_came_since_is_seen_with_thoughts_too(log: EventLog) -> None:
         projector = Projector(log)
         await projector.open()
         await log.append([*declarations(*TYPES, new), *script.records])
-        await projector.fold_behind()
+        await projector.catch_up()
         async with reading.session(simulated=True) as session:
             wave: Any = reading.mapped("WaveAction")
             assert [each.times for each in await session.scalars(select(wave))] == [3]

@@ -12,7 +12,7 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.errors import InternalError, SpoolFull
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.queue.files.segment import Segment
-from pycrorm_async.queue.live.notifier import Bell
+from pycrorm_async.queue.live.notifier import Notifier
 from tests.queue.writing import DECLARED, MONOTONIC_NS, WALL_NS, drain, make, node, started
 
 PATIENCE_S = 20.0
@@ -145,7 +145,7 @@ async def test_a_plan_that_is_collected_while_a_segment_is_made_may_need_that_se
 
 @pytest.mark.usefixtures("busy_collector")
 def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
-    bell = Bell()
+    bell = Notifier()
     waits: list[bool] = []
 
     def work() -> None:
@@ -159,7 +159,7 @@ def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
 
 
 def test_of_many_who_ring_at_once_each_waiter_is_woken_once() -> None:
-    bell = Bell()
+    bell = Notifier()
     over = threading.Event()
     failures: list[BaseException] = []
 

@@ -314,7 +314,7 @@ async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_t
     assert first is not None
     [one] = await first.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)
     await first.acknowledge(1)
-    first.note_shown(1, {})
+    first.mark_visible(1, {})
     displace(queue)
     put(queue, 2)
     with pytest.raises(SpoolUnavailable, match=GONE):
@@ -330,7 +330,7 @@ async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_t
     assert events(again) == [(1, 1), (2, 2), (3, 3)]
     assert again[0] == one
     await second.acknowledge(3)
-    second.note_shown(3, {})
+    second.mark_visible(3, {})
     queue.close()
     await queue.synced_to()
     assert queue.drained_outside is not None

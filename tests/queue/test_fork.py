@@ -73,11 +73,11 @@ def test_the_collector_runs_in_a_child_that_was_forked_while_another_thread_was_
 async def test_a_child_that_lets_go_takes_nothing_from_the_parent(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
 
-    def let_go() -> None:
+    def release_folder() -> None:
         queue.close()
         queue.release()
 
-    assert in_child(let_go) == 0
+    assert in_child(release_folder) == 0
     assert is_locked(queue.folder / "alive")
     queue.put_nowait(ended(), b"{}")
     queue.close()

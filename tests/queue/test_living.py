@@ -17,7 +17,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue import LiveQueue, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.files.drain_status import Drained, Progress, Recorded
+from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
 from tests.queue.test_room import ALL, ORDINARY, PAYLOAD, fill
 from tests.queue.writing import (
     DECLARED,
@@ -255,8 +255,8 @@ async def test_who_waits_is_told_why_nothing_more_is_stored_and_waits_again_for_
     source = taken(offered)
     waiting = asyncio.ensure_future(offered.room())
     await asyncio.sleep(0.1)
-    source.give_up("the episode was refused")
-    source.give_up("a second reason")
+    source.fail("the episode was refused")
+    source.fail("a second reason")
     with pytest.raises(SpoolStuck, match="cannot be emptied: the episode was refused"):
         await asyncio.wait_for(waiting, 30)
     source.release()
@@ -276,12 +276,12 @@ async def test_what_cannot_be_true_is_not_believed(offered: RecorderQueue) -> No
     await offered.synced_to()
     lying = Progress.open(offered.folder, writing=True)
     assert lying is not None
-    lying.tell_drained(Drained(stored=2, folded=2))
-    assert (offered.stored, offered.drained_outside) == (0, Drained())
-    lying.tell_drained(Drained(stored=1, folded=1))
-    assert (offered.stored, offered.drained_outside) == (1, Drained(1, 1))
+    lying.tell_drained(DrainStatus(stored=2, folded=2))
+    assert (offered.stored, offered.drained_outside) == (0, DrainStatus())
+    lying.tell_drained(DrainStatus(stored=1, folded=1))
+    assert (offered.stored, offered.drained_outside) == (1, DrainStatus(1, 1))
     source = taken(offered)
-    lying.tell_recorded(Recorded(synced=9))
+    lying.tell_recorded(RecorderStatus(synced=9))
     with pytest.raises(SpoolDamaged, match="position 2 is missing"):
         await some(source)
     source.release()
@@ -293,13 +293,13 @@ async def test_what_shows_and_what_stopped_is_heard_at_once(offered: RecorderQue
     await offered.synced_to()
     source = taken(offered)
     assert await some(source) == [1]
-    source.note_away("locked")
-    source.note_shown(1, {"an episode": "parked"})
+    source.mark_unavailable("locked")
+    source.mark_visible(1, {"an episode": "parked"})
     said = offered.drained_outside
     assert said is not None
     assert (said.stored, said.folded) == (0, 1)
     assert (said.note.away, said.note.stopped) == ("locked", {"an episode": "parked"})
-    source.note_away(None)
+    source.mark_unavailable(None)
     said = offered.drained_outside
     assert said is not None
     assert said.note.away is None
@@ -321,7 +321,7 @@ async def test_a_queue_that_is_closed_ends_and_deletes_itself_when_all_is_stored
     assert LiveQueue.take(queue.folder) is None
     queue.release()
     assert not queue.folder.exists()
-    source.note_shown(2, {})  # said into a file that is gone, which is nobody's harm
+    source.mark_visible(2, {})  # said into a file that is gone, which is nobody's harm
     source.release()
 
 
@@ -402,7 +402,7 @@ async def test_a_forked_child_says_nothing_in_the_name_of_its_parent(offered: Re
         offered.release()
         os._exit(0)
     os.waitpid(child, 0)  # noqa: ASYNC222
-    assert source._progress.recorded() == Recorded(1, closed=False)
+    assert source._progress.recorded() == RecorderStatus(1, closed=False)
     assert await some(source) == [1]
     with contextlib.suppress(SpoolFull):
         offered.put_nowait(ended(), b"{}")

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.queue.files.drain_status import Drained, Note, Progress, Recorded
+from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus, Progress, RecorderStatus
 
-SAID = Drained(7, 5, Note(given_up="refused", away="locked", stopped={"an episode": "why"}))
+SAID = DrainStatus(7, 5, DrainNote(given_up="refused", away="locked", stopped={"an episode": "why"}))
 
 
 def both(folder: Path) -> tuple[Progress, Progress]:
@@ -19,22 +19,22 @@ def both(folder: Path) -> tuple[Progress, Progress]:
 
 def test_each_side_reads_what_the_other_said_last(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
-    assert (drainer.recorded(), recorder.drained()) == (Recorded(0, closed=False), Drained(0, 0, Note()))
-    recorder.tell_recorded(Recorded(2**63, closed=True))
+    assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(0, closed=False), DrainStatus(0, 0, DrainNote()))
+    recorder.tell_recorded(RecorderStatus(2**63, closed=True))
     drainer.tell_drained(SAID)
-    assert drainer.recorded() == Recorded(2**63, closed=True)
+    assert drainer.recorded() == RecorderStatus(2**63, closed=True)
     assert recorder.drained() == SAID
-    drainer.tell_drained(Drained(8, 8))
-    assert recorder.drained() == Drained(8, 8, Note())
+    drainer.tell_drained(DrainStatus(8, 8))
+    assert recorder.drained() == DrainStatus(8, 8, DrainNote())
 
 
 def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
-    recorder.tell_recorded(Recorded(1000, closed=False))
+    recorder.tell_recorded(RecorderStatus(1000, closed=False))
     drainer.tell_drained(SAID)
     before = (tmp_path / "progress").read_bytes()
-    recorder.tell_recorded(Recorded(2**40 + 77, closed=True))
-    drainer.tell_drained(Drained(2**40, 2**33, Note(given_up="another reason")))
+    recorder.tell_recorded(RecorderStatus(2**40 + 77, closed=True))
+    drainer.tell_drained(DrainStatus(2**40, 2**33, DrainNote(given_up="another reason")))
     after = (tmp_path / "progress").read_bytes()
     changed = [place for place in range(len(after)) if before[place] != after[place]]
     for place in changed:
@@ -42,24 +42,28 @@ def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_pa
         (tmp_path / "progress").write_bytes(torn)  # the same file: both sides have it open
         reader = Progress.open(tmp_path, writing=False)
         assert reader is not None
-        assert reader.recorded() in (Recorded(), Recorded(1000), Recorded(2**40 + 77, closed=True))
-        assert reader.drained() in (Drained(), SAID, Drained(2**40, 2**33, Note(given_up="another reason")))
+        assert reader.recorded() in (RecorderStatus(), RecorderStatus(1000), RecorderStatus(2**40 + 77, closed=True))
+        assert reader.drained() in (
+            DrainStatus(),
+            SAID,
+            DrainStatus(2**40, 2**33, DrainNote(given_up="another reason")),
+        )
         reader.close()
     (tmp_path / "progress").write_bytes(before)
-    assert (drainer.recorded(), recorder.drained()) == (Recorded(1000), SAID)
+    assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(1000), SAID)
     (tmp_path / "progress").write_bytes(before[:70] + b"\xff" + before[71:132] + b"\xff" + before[133:])
-    assert (drainer.recorded(), recorder.drained()) == (Recorded(1000), SAID)
+    assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(1000), SAID)
 
 
 def test_a_file_that_is_cut_while_both_use_it_kills_nobody(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
-    recorder.tell_recorded(Recorded(3))
+    recorder.tell_recorded(RecorderStatus(3))
     drainer.tell_drained(SAID)
-    assert (drainer.recorded(), recorder.drained()) == (Recorded(3), SAID)
+    assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(3), SAID)
     os.truncate(tmp_path / "progress", 0)
-    assert (drainer.recorded(), recorder.drained()) == (Recorded(3), SAID)
-    recorder.tell_recorded(Recorded(4))
-    assert drainer.recorded() == Recorded(4)
+    assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(3), SAID)
+    recorder.tell_recorded(RecorderStatus(4))
+    assert drainer.recorded() == RecorderStatus(4)
 
 
 @pytest.mark.parametrize("size", [0, 8, 16, 100, 4095])
@@ -77,11 +81,11 @@ def test_a_short_file_and_one_of_another_format_are_as_good_as_none(tmp_path: Pa
 def test_a_note_that_is_too_long_is_cut_and_the_numbers_are_said(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     stopped = {f"episode {number}": "é" * 10_000 for number in range(1000)}
-    drainer.tell_drained(Drained(9, 8, Note(given_up="ü" * 10_000, stopped=stopped)))
+    drainer.tell_drained(DrainStatus(9, 8, DrainNote(given_up="ü" * 10_000, stopped=stopped)))
     said = recorder.drained()
     assert (said.stored, said.folded) == (9, 8)
     assert said.note.given_up == "ü" * 300
     assert said.note.stopped
     assert set(said.note.stopped.values()) == {"é" * 300}
-    drainer.tell_drained(Drained(9, 8, Note(given_up="\U0001f916" * 10_000, away="\U0001f916" * 10_000)))
+    drainer.tell_drained(DrainStatus(9, 8, DrainNote(given_up="\U0001f916" * 10_000, away="\U0001f916" * 10_000)))
     assert recorder.drained().note.given_up == "\U0001f916" * 300

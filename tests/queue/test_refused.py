@@ -144,7 +144,7 @@ async def test_what_is_refused_again_stays_where_it_is_and_a_part_that_is_stored
         *placed(some(5, 9)),
         lost(6, 1, 10),
     ]
-    assert recovered.set_aside(some(5, 9)) is False
+    assert recovered.dead_letter(some(5, 9)) is False
     await recovered.acknowledge(4)
     recovered.release()
     assert [each.name for each in Spool(own.parent).recorders()] == [kept_in(own).name]
@@ -159,7 +159,7 @@ async def test_a_dead_recorders_refused_events_and_computed_end_go_aside_and_its
         recovered = open_dead(author.folder)
         assert recovered is not None
         batch = await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0)
-        assert recovered.set_aside([each for each in batch if each.episode is not None]) is True
+        assert recovered.dead_letter([each for each in batch if each.episode is not None]) is True
         recovered.release()
     recovered = open_dead(author.folder)
     assert recovered is not None

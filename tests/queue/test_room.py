@@ -117,8 +117,8 @@ async def test_who_waits_for_room_in_a_queue_that_nobody_empties_is_told_why(fil
     await asyncio.sleep(0.01)
     assert not waiting.done()
     assert not blocked.done()
-    filled.give_up("the log is damaged")
-    filled.give_up("and something else happened later")
+    filled.fail("the log is damaged")
+    filled.fail("and something else happened later")
     async with asyncio.timeout(20):
         for each in (waiting, blocked, filled.room()):
             with pytest.raises(SpoolStuck, match=r"is full .* and cannot be emptied: the log is damaged$"):
@@ -131,7 +131,7 @@ async def test_who_waits_for_room_in_a_queue_that_nobody_empties_is_told_why(fil
 
 async def test_a_queue_that_nobody_empties_takes_what_it_has_room_for(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
-    queue.give_up("the log is damaged")
+    queue.fail("the log is damaged")
     for _ in range(ORDINARY):
         await asyncio.wait_for(queue.room(), 20)
         queue.put_nowait(node(), PAYLOAD)

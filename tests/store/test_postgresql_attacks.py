@@ -172,7 +172,7 @@ async def test_the_owner_is_refused_at_the_tables_and_another_login_folds_what_t
     log = await EventLog.open(DatabaseAddress.parse(folder), create=True)
     projector = Projector(log)
     await projector.open()
-    assert await projector.fold_behind() > 0
+    assert await projector.catch_up() > 0
     assert (await verify(log)).drift == 0
     await log.close()
     assert ask(reader, "SELECT step FROM memory.step_action ORDER BY step") == [(1,), (2,)]

@@ -209,7 +209,7 @@ async def test_a_folder_appends_and_folds_also_what_another_folder_made(
     projector = Projector(log)
     await projector.open()
     assert await log.append([started(2)]) == {}
-    assert await projector.fold_behind() == 2
+    assert await projector.catch_up() == 2
     await log.close()
     assert ask(database_url, "SELECT count(*) FROM memory.process_metadata") == [(2,)]
     assert ask(database_url, "SELECT number, folded FROM episode ORDER BY 1") == [(1, 1), (2, 1)]
@@ -358,10 +358,10 @@ async def test_nothing_is_skipped_when_an_earlier_number_is_committed_later(data
     await rolled_back.execute("SELECT nextval('pycrorm.episode_number')")  # a number that nobody will have
     await rolled_back.close()
     assert await log.append([started(3)]) == {}
-    assert await projector.fold_behind() == 2
+    assert await projector.catch_up() == 2
     await transaction.commit()
     await slow.close()
-    assert await projector.fold_behind() == 1
+    assert await projector.catch_up() == 1
     rows = ask(database_url, "SELECT number, head, folded FROM episode ORDER BY number")
     assert rows == [(1, 1, 1), (2, 1, 1), (4, 1, 1)]
     assert ask(database_url, "SELECT count(*) FROM memory.process_metadata") == [(3,)]

@@ -76,13 +76,13 @@ class KeptSource(Source):
             self._given -= len(forgotten)
             self.acknowledgements.append(position)
 
-    def set_aside(self, records: Sequence[Record]) -> bool:
+    def dead_letter(self, records: Sequence[Record]) -> bool:
         if self.aside is None:
             return False
         self.aside += records
         return True
 
-    def give_up(self, reason: str) -> None:
+    def fail(self, reason: str) -> None:
         self.given_up.append(reason)
 
     def reopened(self) -> KeptSource:

@@ -100,13 +100,13 @@ async def test_what_is_refused_of_many_dead_recorders_is_told_in_one_line(
 
 
 async def test_closing_does_not_wait_for_somebody_elses_records(address: DatabaseAddress) -> None:
-    let_go: list[str] = []
+    release_folder: list[str] = []
 
     def found() -> Iterator[Source]:
         try:
             yield KeptSource(run_of(episode(2), 1, 5), name="never closed")
         finally:
-            let_go.append("never closed")
+            release_folder.append("never closed")
 
     folders = found()
     source = KeptSource(run_of(episode(1), 1, 3))
@@ -116,5 +116,5 @@ async def test_closing_does_not_wait_for_somebody_elses_records(address: Databas
     source.close()
     await writer.close()
     assert writers_alive() == []
-    assert let_go == ["never closed"]
+    assert release_folder == ["never closed"]
     assert ask(address.path, "SELECT id, folded FROM episode ORDER BY id") == [(name(1), 3), (name(2), 5)]

@@ -16,7 +16,7 @@ from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.backoff import Backoff
-from pycrorm_async.writer.drain import Drain, to_the_end
+from pycrorm_async.writer.drain import Drain, run_to_completion
 from tests.databases import ask
 from tests.store.making import episode, record, run_of
 from tests.writer.ends import CountingFold, KeptSource, LosesReplies, Passing
@@ -202,7 +202,7 @@ async def test_a_source_that_cannot_set_aside_is_told_once_and_at_once_that_it_c
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Full(KeptSource):
-        def set_aside(self, records: Sequence[Record]) -> bool:
+        def dead_letter(self, records: Sequence[Record]) -> bool:
             raise SpoolUnavailable(Path("/spool/1.refused"), "No space left on device")
 
     source = Full([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9, position=5)])
@@ -329,7 +329,7 @@ async def test_what_is_not_to_be_left_half_done_is_done_also_when_it_is_cancelle
         may_end.wait(30)
         ended.set()
 
-    task = asyncio.create_task(to_the_end(asyncio.to_thread(work)))
+    task = asyncio.create_task(run_to_completion(asyncio.to_thread(work)))
     for _ in range(3):
         await asyncio.sleep(0.01)
         task.cancel()

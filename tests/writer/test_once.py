@@ -67,7 +67,7 @@ async def test_a_gap_is_reported_with_its_reason(log: EventLog) -> None:
 
 async def test_what_is_refused_and_cannot_be_set_aside_is_a_failure_of_its_source(log: EventLog) -> None:
     class Full(KeptSource):
-        def set_aside(self, records: Sequence[Record]) -> bool:
+        def dead_letter(self, records: Sequence[Record]) -> bool:
             raise SpoolUnavailable(Path("/spool/1.refused"), "No space left on device")
 
     full = Full([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True, name="robot 1")

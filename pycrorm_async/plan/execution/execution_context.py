@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from pycrorm_async.plan.language.monitor_watch import Watch
     from pycrorm_async.plan.language.resource_arbiter import Arbiter, Claim
 
-__all__ = ["Surroundings", "surroundings"]
+__all__ = ["ExecutionContext", "surroundings"]
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class ExecutionContext:
     """Inherited by asyncio tasks, as the current node is.
 
     Attributes:
@@ -52,4 +52,4 @@ class Surroundings:
         return await self.arbiter.claimed(designator, self)
 
 
-surroundings: ContextVar[Surroundings | None] = ContextVar("surroundings", default=None)
+surroundings: ContextVar[ExecutionContext | None] = ContextVar("surroundings", default=None)

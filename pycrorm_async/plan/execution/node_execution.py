@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 from pycrorm_async.clock import monotonic_ns
-from pycrorm_async.plan.execution.execution_context import Surroundings, surroundings
+from pycrorm_async.plan.execution.execution_context import ExecutionContext, surroundings
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import Unstarted, called_performs
 from pycrorm_async.plan.failures import is_plan_failure
@@ -132,7 +132,7 @@ async def _turn() -> int:
     return now_ns
 
 
-def _status(error: BaseException, around: Surroundings | None) -> TaskStatus:
+def _status(error: BaseException, around: ExecutionContext | None) -> TaskStatus:
     """What it means for a node that this was raised in it."""
     if isinstance(error, asyncio.CancelledError):
         interrupted = around is not None and around.interrupted

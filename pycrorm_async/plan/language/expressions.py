@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Self, TypeAlias
 
 from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.execution.execution_context import Surroundings, surroundings
+from pycrorm_async.plan.execution.execution_context import ExecutionContext, surroundings
 from pycrorm_async.plan.failures import NotALanguageExpression, in_words
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import Attempt, Outcome, attempted, together
@@ -226,9 +226,9 @@ def name_of(value: Any) -> str:
 
 async def _at_once(expression: Expression) -> list[Attempt]:
     """All operands as tasks, in order of the operands; what needs the same part of the robot takes turns."""
-    around = surroundings.get() or Surroundings()
+    around = surroundings.get() or ExecutionContext()
     if around.arbiter is None or around.arbiter.loop is not asyncio.get_running_loop():
-        around = Surroundings(around.watches, Arbiter())
+        around = ExecutionContext(around.watches, Arbiter())
 
     async def branch(operand: Operand) -> Attempt:
         surroundings.set(around)

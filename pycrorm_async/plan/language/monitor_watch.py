@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable, Generator
 from contextvars import Context, copy_context
 from typing import Any, TypeAlias
 
-from pycrorm_async.plan.execution.execution_context import Surroundings, surroundings
+from pycrorm_async.plan.execution.execution_context import ExecutionContext, surroundings
 
 __all__ = ["Condition", "Watch"]
 
@@ -39,10 +39,10 @@ class Watch:
         """This task is to be interrupted."""
         self._task = task
 
-    def inside(self) -> Surroundings:
+    def inside(self) -> ExecutionContext:
         """The surroundings of what it watches."""
-        outside = self._context.get(surroundings) or Surroundings()
-        return Surroundings((*outside.watches, self), outside.arbiter, outside.claim)
+        outside = self._context.get(surroundings) or ExecutionContext()
+        return ExecutionContext((*outside.watches, self), outside.arbiter, outside.claim)
 
     async def check(self) -> None:
         """Raise `CancelledError` if the condition holds, and interrupt the task that is watched."""

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextvars import Token
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from pycrorm_async.plan.execution.execution_context import Surroundings, surroundings
+from pycrorm_async.plan.execution.execution_context import ExecutionContext, surroundings
 from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.plan.language.resources import Resource
 from pycrorm_async.world.observers import current_world
@@ -38,7 +38,7 @@ class Claim:
         self.granted: asyncio.Future[None] | None = None
         """Only while it waits."""
         self._arbiter = arbiter
-        self._token: Token[Surroundings | None] | None = None
+        self._token: Token[ExecutionContext | None] | None = None
 
     def above(self) -> Iterator[Claim]:
         """Those of the nodes it is inside of."""
@@ -47,9 +47,9 @@ class Claim:
             yield each
             each = each.parent
 
-    def enter(self, around: Surroundings) -> None:
+    def enter(self, around: ExecutionContext) -> None:
         """From now on what starts in this context is inside."""
-        self._token = surroundings.set(Surroundings(around.watches, self._arbiter, self))
+        self._token = surroundings.set(ExecutionContext(around.watches, self._arbiter, self))
 
     def release(self) -> None:
         """The node ended: the next ones may go on."""
@@ -70,7 +70,7 @@ class Arbiter:
         self._held: list[Claim] = []
         self._waiting: list[Claim] = []
 
-    async def claimed(self, designator: Designator, around: Surroundings) -> Claim | None:
+    async def claimed(self, designator: Designator, around: ExecutionContext) -> Claim | None:
         """What the designator needs is its own; None if it needs nothing. Raises `ResourceDeadlock`."""
         wanted = designator.resources()
         if not wanted or asyncio.get_running_loop() is not self.loop:

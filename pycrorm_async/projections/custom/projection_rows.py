@@ -19,12 +19,12 @@ from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["OwnRows"]
+__all__ = ["CustomRows"]
 
 _INTEGER_MAX = 2**63 - 1
 
 
-class OwnRows:
+class CustomRows:
     """Rows to insert, and changes of rows that came with an earlier batch; by table and id. Implements `Batch`."""
 
     def __init__(self, projection: Projection, declared: Mapping[str, DesignatorTypeDeclared]) -> None:

@@ -18,10 +18,10 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.projections.custom.projection import Projection, columns_of
-from pycrorm_async.projections.custom.projection_rows import OwnRows
+from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch
-from pycrorm_async.projections.run.catch_up import Beside, CatchUp
+from pycrorm_async.projections.run.catch_up import CatchUp, SideTarget
 from pycrorm_async.projections.schema.generations import (
     PROJECTION,
     Generation,
@@ -37,10 +37,10 @@ from pycrorm_async.projections.schema.user_views import with_user_views
 from pycrorm_async.store.log import EventLog
 
 __all__ = [
-    "OwnTables",
+    "CustomTables",
     "ProjectionState",
     "states",
-    "OwnMeaning",
+    "CustomFoldDefinition",
     "layout_of",
     "make_own",
     "refuse_taken",
@@ -53,7 +53,7 @@ _LOOK_S = 1.0
 _log = logging.getLogger("pycrorm_async.projections")
 
 
-class OwnMeaning:
+class CustomFoldDefinition:
     """What events mean to this projection. Implements `Meaning`."""
 
     def __init__(self, projection: Projection) -> None:
@@ -66,7 +66,7 @@ class OwnMeaning:
                 declared[fingerprint(payload)] = declaration_of(payload)
             except ValueError:  # a newer version's: its nodes cannot be folded
                 continue
-        return layout, lambda: OwnRows(self._projection, declared)
+        return layout, lambda: CustomRows(self._projection, declared)
 
 
 def layout_of(projection: Projection, dialect: Dialect) -> Layout:
@@ -142,7 +142,7 @@ def fault_in_version(projection: Projection, found: Generation, layout: Layout) 
     return None
 
 
-class OwnTables:
+class CustomTables:
     """The projections that a process knows, each kept up to date. What is wrong with one is told, once."""
 
     def __init__(
@@ -170,18 +170,18 @@ class OwnTables:
                 _log.warning("%s", fault)
                 continue
             changed = changed or is_new
-            goal = Beside(f"{PROJECTION}{each.name}", each.name, each.version)
+            goal = SideTarget(f"{PROJECTION}{each.name}", each.name, each.version)
             self._folded[each.name] = CatchUp(
                 self._log,
                 goal,
                 generation,
-                meaning=OwnMeaning(each),
+                meaning=CustomFoldDefinition(each),
                 after_tables=True,
                 batch_events=self._batch_events,
             )
         return changed
 
-    async def fold_some(self, *, now: bool) -> bool:
+    async def fold_next_batch(self, *, now: bool) -> bool:
         """A batch of each; False if nothing was behind. Without `now` it is enough to look from time to time."""
         time_s = asyncio.get_running_loop().time()
         if not self._folded or (not now and time_s < self._looked_s + _LOOK_S):
@@ -189,7 +189,7 @@ class OwnTables:
         count = 0
         for name, each in [*self._folded.items()]:
             try:
-                count += await each.fold_some() is not None
+                count += await each.fold_next_batch() is not None
             except DatabaseUnavailable:
                 raise
             except PycrormError as fault:

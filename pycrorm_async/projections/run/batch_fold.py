@@ -3,8 +3,8 @@
 Reading and folding hold no lock. The write transaction then checks that both the tables and the progress are as they
 were taken to be; if somebody else was quicker it is rolled back, and the events are read again. So any number may fold
 one memory, and none of them ever shows an event twice or half. Which generation it is and where its progress is noted
-is the `Goal`'s: of what people see (`projector`), or of what is made beside it (`rebuild`). What events mean
-is the `Meaning`'s: our tables here, or a projection of one's own (`own_tables`).
+is the `FoldTarget`'s: of what people see (`projector`), or of what is made beside it (`rebuild`). What events mean
+is the `FoldDefinition`'s: our tables here, or a projection of one's own (`own_tables`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["Folding", "Goal", "Meaning", "Batch", "Prepared", "TABLES"]
+__all__ = ["Folding", "FoldTarget", "FoldDefinition", "Batch", "Prepared", "TABLES"]
 
 _REASON_LENGTH_MAX = 2_000
 """Characters of the reason that an episode is parked for: `status` shows it, and a value may be megabytes long."""
@@ -39,7 +39,7 @@ _SLICE_EVENTS = 100
 """So many are folded before others of the loop get their turn; some 0.4 ms."""
 
 
-class Goal(Growing, Protocol):
+class FoldTarget(Growing, Protocol):
     """A generation that is folded into. Everything happens in the caller's transaction."""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
@@ -69,7 +69,7 @@ class Batch(Protocol):
         ...
 
 
-class Meaning(Protocol):
+class FoldDefinition(Protocol):
     """What events mean."""
 
     def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
@@ -142,7 +142,7 @@ class _TableRows:
 
 
 class _Tables:
-    """Our own tables. Implements `Meaning`."""
+    """Our own tables. Implements `FoldDefinition`."""
 
     def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
         layout, accepted, refused = unite(layout, payloads)
@@ -156,7 +156,9 @@ TABLES = _Tables()
 class Folding:
     """Folds events of one log into one goal. `generation` is how it was when last looked at."""
 
-    def __init__(self, log: EventLog, goal: Goal, generation: Generation, meaning: Meaning = TABLES) -> None:
+    def __init__(
+        self, log: EventLog, goal: FoldTarget, generation: Generation, meaning: FoldDefinition = TABLES
+    ) -> None:
         self._log = log
         self._goal = goal
         self._meaning = meaning

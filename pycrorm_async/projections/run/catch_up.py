@@ -11,14 +11,14 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign, InternalError, LogDamaged
 from pycrorm_async.projections.run import checkpoints
-from pycrorm_async.projections.run.batch_fold import TABLES, Folding, Meaning, Prepared
+from pycrorm_async.projections.run.batch_fold import TABLES, FoldDefinition, Folding, Prepared
 from pycrorm_async.projections.schema.generations import Generation, Hold, grow_tables, note, noted
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent, beyond, share_out
 
-__all__ = ["Beside", "CatchUp", "Share", "WHOLE"]
+__all__ = ["SideTarget", "CatchUp", "Share", "WHOLE"]
 
 _log = logging.getLogger("pycrorm_async.projections")
 
@@ -36,7 +36,7 @@ class Share(NamedTuple):
 WHOLE = Share()
 
 
-class Beside:
+class SideTarget:
     """A generation that is noted under a name of its own. Implements `Goal`.
 
     Args:
@@ -82,10 +82,10 @@ class CatchUp:
     def __init__(
         self,
         log: EventLog,
-        goal: Beside,
+        goal: SideTarget,
         generation: Generation,
         *,
-        meaning: Meaning = TABLES,
+        meaning: FoldDefinition = TABLES,
         share: Share = WHOLE,
         after_tables: bool = False,
         batch_events: int,
@@ -99,7 +99,7 @@ class CatchUp:
         self._after = 0
         self._ready: Prepared | None = None
 
-    async def fold_some(self) -> int | None:
+    async def fold_next_batch(self) -> int | None:
         """Folds a batch; the number of events, None when none is left of this share. Raises `LogDamaged`."""
         batch, self._ready = self._ready or await self._prepared({}), None
         if batch is None:

@@ -18,13 +18,13 @@ from pycrorm_async.projections.schema.tables import COLUMNS
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["Rereading"]
+__all__ = ["EpisodeCheck"]
 
 _STATUS = COLUMNS["task_tree_node"].index("status")
 _SIMULATED = COLUMNS["process_metadata"].index("simulated")
 
 
-class Rereading:
+class EpisodeCheck:
     """What is known of the episode of this number, up to where it was read.
 
     Attributes:

@@ -22,7 +22,7 @@ from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation, current_generation
 from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.projections.schema.unmade_types import unmade_types
-from pycrorm_async.projections.verify.episode_check import Rereading
+from pycrorm_async.projections.verify.episode_check import EpisodeCheck
 from pycrorm_async.projections.verify.findings import Damage, Stopped, Verified
 from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
 from pycrorm_async.projections.verify.verify_custom import compared, not_compared
@@ -101,7 +101,7 @@ class _Check:
         self._stopped: list[Stopped] = []
         self._unmade: dict[str, str] = {}
         self.outdated: str | None = None
-        self._unfinished = Rereading(0)
+        self._unfinished = EpisodeCheck(0)
         self._comparison: Comparison | None = None
 
     def found(self) -> Verified:
@@ -225,10 +225,10 @@ class _Check:
             settled = self._unfinished.carried.intersection(rows.nodes)
             if self._unfinished.compared:
                 low = _Place(at.number + 1, 0)
-        read: dict[int, Rereading] = {}
+        read: dict[int, EpisodeCheck] = {}
         for span in spans:
             if span.after == 0:
-                self._unfinished = Rereading(span.number)
+                self._unfinished = EpisodeCheck(span.number)
                 self._episodes += 1
             read[span.number] = self._unfinished
             self._unfinished.read(span, events.get(span.number, {}), folded[span.number], designators, rows)
@@ -264,7 +264,7 @@ class _Check:
         within: Range,
         carried: Collection[int],
         settled: Collection[int],
-        read: Mapping[int, Rereading],
+        read: Mapping[int, EpisodeCheck],
     ) -> None:
         try:
             with self._log.translated():
@@ -279,7 +279,7 @@ class _Check:
 
     # --- findings -----------------------------------------------------------------------------------------------
 
-    def _take_over(self, episodes: Iterable[Rereading]) -> None:
+    def _take_over(self, episodes: Iterable[EpisodeCheck]) -> None:
         """What was found in this part of each."""
         for each in episodes:
             for sequence, reason in each.damages:

@@ -11,8 +11,8 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.custom.projection_rows import OwnRows
-from pycrorm_async.projections.custom.projection_tables import OwnMeaning, fault_in_version, layout_of
+from pycrorm_async.projections.custom.projection_rows import CustomRows
+from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, fault_in_version, layout_of
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch
@@ -87,9 +87,9 @@ async def _look(
 ) -> tuple[int | None, Compared]:
     folded = await _folded(connection, projection, comparison.generation, first, end)
     payloads = await dialect_of(connection).declarations(connection)
-    _, batch = OwnMeaning(projection).learn(comparison.generation.layout, payloads)
+    _, batch = CustomFoldDefinition(projection).learn(comparison.generation.layout, payloads)
     rows = batch()
-    assert isinstance(rows, OwnRows)
+    assert isinstance(rows, CustomRows)
     findings: list[Difference] = []
     count = 0
     following = end

@@ -35,7 +35,7 @@ import msgspec
 from pycrorm_async.queue.files.file_access import open_file
 from pycrorm_async.queue.files.locks import in_forked_child
 
-__all__ = ["PROGRESS", "Progress", "Recorded", "Drained", "Note"]
+__all__ = ["PROGRESS", "Progress", "RecorderStatus", "DrainStatus", "DrainNote"]
 
 PROGRESS: Final = "progress"
 _MAGIC: Final = b"PYCRPROG" + (1).to_bytes(8, "little")
@@ -46,14 +46,14 @@ _NOTE_BYTES_MAX: Final = _FILE_BYTES - _DRAINER_AT - _DRAINER.size
 _REASON_CHARACTERS_MAX: Final = 300
 
 
-class Recorded(NamedTuple):
+class RecorderStatus(NamedTuple):
     """What the recorder says."""
 
     synced: int = 0
     closed: bool = False
 
 
-class Note(msgspec.Struct, frozen=True, omit_defaults=True):
+class DrainNote(msgspec.Struct, frozen=True, omit_defaults=True):
     """What the drainer says in words.
 
     Attributes:
@@ -67,15 +67,15 @@ class Note(msgspec.Struct, frozen=True, omit_defaults=True):
     stopped: Mapping[str, str] = {}
 
 
-class Drained(NamedTuple):
+class DrainStatus(NamedTuple):
     """What the drainer says."""
 
     stored: int = 0
     folded: int = 0
-    note: Note = Note()
+    note: DrainNote = DrainNote()
 
 
-_NOTHING: Final = Drained()
+_NOTHING: Final = DrainStatus()
 
 
 class Progress:
@@ -83,12 +83,12 @@ class Progress:
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
-        self._recorded = Recorded()
-        self._drained = Drained()
+        self._recorded = RecorderStatus()
+        self._drained = DrainStatus()
         in_forked_child(self.close)
 
     @classmethod
-    def make(cls, folder: Path, drained: Drained = _NOTHING) -> Progress:
+    def make(cls, folder: Path, drained: DrainStatus = _NOTHING) -> Progress:
         """A new one; it has its name only when it is whole. Raises `OSError`."""
         path = folder / PROGRESS
         unfinished = path.with_suffix(".making")
@@ -97,7 +97,7 @@ class Progress:
             os.posix_fallocate(descriptor, 0, _FILE_BYTES)
             os.pwrite(descriptor, _MAGIC, 0)
             made = cls(descriptor)
-            made.tell_recorded(Recorded())
+            made.tell_recorded(RecorderStatus())
             made.tell_drained(drained)
             unfinished.rename(path)
         except BaseException:
@@ -119,21 +119,21 @@ class Progress:
             return None
         return cls(descriptor)
 
-    def recorded(self) -> Recorded:
+    def recorded(self) -> RecorderStatus:
         """What the recorder said last, as far as it could be read."""
         content = self._read(_RECORDER_AT, _RECORDER.size)
         if len(content) == _RECORDER.size:
             synced, closed, checksum = _RECORDER.unpack(content)
             if checksum == crc32(content[:-4]):
-                self._recorded = Recorded(synced, bool(closed))
+                self._recorded = RecorderStatus(synced, bool(closed))
         return self._recorded
 
-    def tell_recorded(self, said: Recorded) -> None:
+    def tell_recorded(self, said: RecorderStatus) -> None:
         """For the recorder alone. Raises `OSError`."""
         content = _RECORDER.pack(said.synced, said.closed, 0)[:-4]
         self._write(content + crc32(content).to_bytes(4, _ORDER), _RECORDER_AT)
 
-    def drained(self) -> Drained:
+    def drained(self) -> DrainStatus:
         """What the drainer said last, as far as it could be read."""
         content = self._read(_DRAINER_AT, _FILE_BYTES - _DRAINER_AT)
         if len(content) < _DRAINER.size:
@@ -142,12 +142,12 @@ class Progress:
         note = content[_DRAINER.size : _DRAINER.size + length]
         if len(note) == length and checksum == crc32(note, crc32(content[: _DRAINER.size - 4])):
             try:
-                self._drained = Drained(stored, folded, msgspec.json.decode(note, type=Note))
+                self._drained = DrainStatus(stored, folded, msgspec.json.decode(note, type=DrainNote))
             except ValueError:  # a newer program says it in other words; the numbers are the same
-                self._drained = Drained(stored, folded)
+                self._drained = DrainStatus(stored, folded)
         return self._drained
 
-    def tell_drained(self, said: Drained) -> None:
+    def tell_drained(self, said: DrainStatus) -> None:
         """For the holder of `drain` alone. A note that is too long is cut. Raises `OSError`."""
         note = _fitting(said.note)
         content = _DRAINER.pack(said.stored, said.folded, len(note), 0)[:-4]
@@ -174,16 +174,16 @@ class Progress:
 _ORDER: Final = "little" if Struct("=H").pack(1)[0] else "big"
 
 
-def _fitting(note: Note) -> bytes:
+def _fitting(note: DrainNote) -> bytes:
     """The note as JSON, its reasons cut, and no more episodes than there is room for."""
     stopped = {episode: reason[:_REASON_CHARACTERS_MAX] for episode, reason in note.stopped.items()}
     while True:
-        short = Note(_cut(note.given_up), _cut(note.away), stopped)
+        short = DrainNote(_cut(note.given_up), _cut(note.away), stopped)
         encoded = msgspec.json.encode(short)
         if len(encoded) <= _NOTE_BYTES_MAX:
             return encoded
         if not stopped:  # even these few words are too long in bytes
-            return msgspec.json.encode(Note("the reason is too long to be told here" if note.given_up else None))
+            return msgspec.json.encode(DrainNote("the reason is too long to be told here" if note.given_up else None))
         stopped = dict(list(stopped.items())[: len(stopped) // 2])
 
 

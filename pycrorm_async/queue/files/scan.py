@@ -40,14 +40,23 @@ from pycrorm_async.queue.files.segment import (
     segment_path,
 )
 
-__all__ = ["Kept", "Survey", "Walk", "scan", "survey", "whole_frames", "checked_header", "check_record"]
+__all__ = [
+    "ValidPrefix",
+    "Survey",
+    "SegmentScanner",
+    "scan",
+    "survey",
+    "whole_frames",
+    "checked_header",
+    "check_record",
+]
 
 _SALT_OFFSET = HEADER_BYTES - 8
 _CLOSES = CLOSES.encode()
 _DECLARES = "DesignatorTypeDeclared"
 
 
-class Kept(NamedTuple):
+class ValidPrefix(NamedTuple):
     """What of a folder is kept.
 
     Attributes:
@@ -74,12 +83,12 @@ class Survey(NamedTuple):
         unsaid: the checksums of the last kept records, those that no commit frame covers.
     """
 
-    kept: Kept
+    kept: ValidPrefix
     damage: SpoolDamaged | None
     unsaid: tuple[int, ...]
 
 
-def scan(folder: Path, recorder: bytes) -> Kept:
+def scan(folder: Path, recorder: bytes) -> ValidPrefix:
     """Looks at every byte of the folder's segments once.
 
     Raises `SpoolDamaged` with file and offset, `SpoolForeign` for a segment of a newer format or another recorder, and
@@ -93,7 +102,7 @@ def scan(folder: Path, recorder: bytes) -> Kept:
 
 def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] | None = None) -> Survey:
     """What `scan` looks at, with damage as an answer. `seen` is told of each kept frame and its segment's number."""
-    walk = Walk(folder, recorder, seen=seen)
+    walk = SegmentScanner(folder, recorder, seen=seen)
     damage: SpoolDamaged | None = None
     try:
         while walk.step():
@@ -103,7 +112,7 @@ def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] 
     return Survey(walk.kept, damage, walk.unsaid)
 
 
-class Walk:
+class SegmentScanner:
     """Goes from the oldest segment to the first hole, a segment at each step.
 
     `seen` is told of each kept frame and its segment's number, `found` is given each kept record.
@@ -162,10 +171,10 @@ class Walk:
         return False
 
     @property
-    def kept(self) -> Kept:
+    def kept(self) -> ValidPrefix:
         """All before the cut, as far as it has gone."""
         opened = {EpisodeId(episode): Last(*last) for episode, last in self._open.items()}
-        return Kept(self._start, self._cut, self._bases, opened, self._numbers)
+        return ValidPrefix(self._start, self._cut, self._bases, opened, self._numbers)
 
     @property
     def settled(self) -> int:
@@ -300,7 +309,7 @@ def whole_frames(buffer: Buffer, start: int, salt: int) -> Iterator[tuple[int, F
         found = buffer.find(salted, max(found + 1, end))
 
 
-def _refuse_damage(folder: Path, recorder: bytes, kept: Kept) -> None:
+def _refuse_damage(folder: Path, recorder: bytes, kept: ValidPrefix) -> None:
     """Raises if anything behind the cut says that something in the hole was safe."""
     for number in kept.numbers:
         if number < kept.cut.number:

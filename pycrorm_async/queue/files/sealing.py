@@ -7,13 +7,13 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from pycrorm_async.queue.files.recorder_folder import TAIL, write_safely
-from pycrorm_async.queue.files.scan import Kept
+from pycrorm_async.queue.files.scan import ValidPrefix
 from pycrorm_async.queue.files.segment import read_segment, segment_path, sync_folder
 
 __all__ = ["seal", "make_safe", "tails"]
 
 
-def seal(folder: Path, kept: Kept) -> None:
+def seal(folder: Path, kept: ValidPrefix) -> None:
     """Cuts the files where the records end; what is cut off is copied aside first, to `<segment>.tail`.
 
     Twice is once, and killed at any point it can be done again. Raises `OSError`.
@@ -47,7 +47,7 @@ def make_safe(folder: Path, numbers: Iterable[int]) -> None:
     sync_folder(folder)
 
 
-def tails(folder: Path, kept: Kept) -> list[tuple[Path, bytes]]:
+def tails(folder: Path, kept: ValidPrefix) -> list[tuple[Path, bytes]]:
     """For each file that reaches behind the cut what is there, without the zeros at its end. Raises `OSError`."""
     cut = kept.cut
     return [

@@ -37,7 +37,7 @@ from pycrorm_async.queue.files.frame import (
 from pycrorm_async.queue.files.segment import CLOSES, OPENS, Last, Segment, SegmentHeader, salt_of
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.declarations import Declarations, Repeated
-from pycrorm_async.queue.live.gc_safe_lock import Alone
+from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
 
 __all__ = ["Appender", "Span", "Begun"]
 
@@ -92,7 +92,7 @@ class Appender:
         self._wake = wake
         self._hurry = hurry
         self._make_room = make_room
-        self._alone = Alone()
+        self._alone = GcSafeLock()
         self._making = threading.Lock()
         self._type_names: dict[str, bytes] = {}
 
@@ -428,6 +428,6 @@ class Appender:
     def abandon(self, refusal: Callable[[], PycrormError]) -> None:
         """In a forked child: nothing here is this process's; the locks may be held by threads it does not have."""
         self._alone.abandon()
-        self._alone, self._making = Alone(), threading.Lock()
+        self._alone, self._making = GcSafeLock(), threading.Lock()
         self._refusal = refusal
         self.close()

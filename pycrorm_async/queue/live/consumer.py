@@ -21,7 +21,7 @@ from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.reader import Batch, Cursor, Reader
 from pycrorm_async.queue.files.recorder_folder import DRAIN, available
 from pycrorm_async.queue.files.segment import map_segment, segment_path
-from pycrorm_async.queue.live.notifier import Bell
+from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.sources.dead_letters import RefusedRecords
 
 __all__ = ["Consumer", "Place", "Written"]
@@ -59,9 +59,9 @@ class Written(Protocol):
 class Consumer:
     """Reads, and holds the lock `drain` from its first batch on."""
 
-    def __init__(self, queue: Written, bell: Bell) -> None:
+    def __init__(self, queue: Written, bell: Notifier) -> None:
         self._queue = queue
-        self._bell = bell
+        self._notifier = bell
         self._place = queue.place
         self._drain: FileLock | None = None
         self._released = False
@@ -86,8 +86,8 @@ class Consumer:
                 if self._queue.place is self._place:
                     raise self._queue.failure or error from None
 
-    def set_aside(self, records: Sequence[Record]) -> None:
-        """As `RecorderQueue.set_aside`."""
+    def dead_letter(self, records: Sequence[Record]) -> None:
+        """As `RecorderQueue.dead_letter`."""
         self._refused.put(records)
 
     def release(self) -> None:
@@ -115,12 +115,12 @@ class Consumer:
 
     async def _batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
         self._take_drain()
-        await self._bell.until(partial(self._further, self.reader.cursor.position))
+        await self._notifier.until(partial(self._further, self.reader.cursor.position))
         batch = self._read(None, events_max, bytes_max)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(age_s_max):
                 while not batch.complete and not self._queue.ends_at(batch.after.position):
-                    await self._bell.until(partial(self._further, batch.after.position))
+                    await self._notifier.until(partial(self._further, batch.after.position))
                     batch = self._read(batch, events_max, bytes_max)
         if not batch.records and self._queue.failure is not None:
             raise self._queue.failure

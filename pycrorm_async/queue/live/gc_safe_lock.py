@@ -14,12 +14,12 @@ from typing import TypeVar
 
 from pycrorm_async.errors import InternalError
 
-__all__ = ["Alone"]
+__all__ = ["GcSafeLock"]
 
 _T = TypeVar("_T")
 
 
-class Alone:
+class GcSafeLock:
     """One lock, and the pause of the collector that belongs to it. `Appender.put` does by itself what `run` does.
 
     The lock is taken first, then the collector is paused, for two threads that switch it without a lock could leave it

@@ -15,9 +15,9 @@ from pathlib import Path
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import DamageError, FilesError, InternalError, PycrormError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_id
-from pycrorm_async.queue.files.drain_status import Drained
+from pycrorm_async.queue.files.drain_status import DrainStatus
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
-from pycrorm_async.queue.files.outside import Outside
+from pycrorm_async.queue.files.outside import DrainStatusReader
 from pycrorm_async.queue.files.reader import Cursor
 from pycrorm_async.queue.files.recorder_folder import ALIVE, available
 from pycrorm_async.queue.files.segment import Last, Segment, header_bytes
@@ -25,8 +25,8 @@ from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.appender import NOTHING_OPEN
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.consumer import Place
-from pycrorm_async.queue.live.notifier import Bell
-from pycrorm_async.queue.live.relocatable_appender import MovableAppender
+from pycrorm_async.queue.live.notifier import Notifier
+from pycrorm_async.queue.live.relocatable_appender import RelocatableAppender
 from pycrorm_async.queue.live.relocation import Home, move
 from pycrorm_async.queue.live.sync_thread import Syncer
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
@@ -54,8 +54,8 @@ class QueueFiles:
         self._clock = clock
         self._left: list[FileLock] = []  # the `alive` of folders this queue has moved from
         self._log_id: str | None = None
-        self._bell = Bell()
-        self._room_bell = Bell()
+        self._notifier = Notifier()
+        self._room_notifier = Notifier()
         self._synced = 0
         self._stored = 0
         self._failure: PycrormError | None = None
@@ -76,7 +76,7 @@ class QueueFiles:
         with available(folder):
             self._appender = self._appender_in(folder, recorder)
             self._disk_was_full = self._appender.prepare()
-            self._outside = Outside(folder) if offered else None
+            self._outside = DrainStatusReader(folder) if offered else None
             place = Place(folder, recorder, Cursor(1, header_bytes(0), 0))
             self._home = Home(place, alive, FileIdentity.of(folder.stat()), self._appender, self._outside)
 
@@ -127,7 +127,7 @@ class QueueFiles:
         return max(self._stored, self._outside.believed(synced=self._synced).stored)
 
     @property
-    def drained_outside(self) -> Drained | None:
+    def drained_outside(self) -> DrainStatus | None:
         """What the process that drains this queue says, as far as it can be true; None if it is this one."""
         return None if self._outside is None else self._outside.believed(synced=self._synced)
 
@@ -163,23 +163,23 @@ class QueueFiles:
             raise
         if full:
             return self._sync_interval_s
-        waiting = self._outside is not None and (self._room_bell.awaited or len(self._appender.begun) > 1)
+        waiting = self._outside is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
         return LOOK_S if waiting or not told else None
 
-    def _exchange(self, outside: Outside) -> bool:
+    def _exchange(self, outside: DrainStatusReader) -> bool:
         """Tells whoever drains this queue what is synced, hears what is stored; False if it could not be told."""
         told = self._tell(outside)
         said = outside.believed(synced=self._synced)
         self._stored = max(self._stored, said.stored)
         if said.note.given_up != self._appender.stuck:
             self._appender.stuck = said.note.given_up
-            self._room_bell.ring()
+            self._room_notifier.ring()
         return told
 
     def _answer(self, *, asked: bool) -> None:
         if asked:
             self._answers += 1
-            self._bell.ring()
+            self._notifier.ring()
 
     def _sync(self, *, look: bool = False) -> None:
         span = self._appender.begin_sync()
@@ -200,7 +200,7 @@ class QueueFiles:
         self._synced = span.position
         if self._outside is not None:
             self._tell(self._outside)  # first, so that who waited for the disk need not wait for this
-        self._bell.ring()
+        self._notifier.ring()
 
     # --- moving ------------------------------------------------------------------------------------------------
 
@@ -223,7 +223,7 @@ class QueueFiles:
             _log.error("%s", setback)
         self._setback = setback
         self._setbacks += 1
-        self._bell.ring()
+        self._notifier.ring()
 
     def _move(self) -> bool:
         """Goes on in a new folder, and syncs there; False if that cannot be made now. What can be read is kept."""
@@ -275,8 +275,8 @@ class QueueFiles:
 
     def _appender_in(
         self, folder: Path, recorder: bytes, after: int = 0, opened: Mapping[EpisodeId, Last] = NOTHING_OPEN
-    ) -> MovableAppender:
-        return MovableAppender(
+    ) -> RelocatableAppender:
+        return RelocatableAppender(
             folder=folder,
             recorder=recorder,
             capacity=Capacity.of(self._settings),
@@ -288,7 +288,7 @@ class QueueFiles:
             opened=opened,
         )
 
-    def _tell(self, outside: Outside) -> bool:
+    def _tell(self, outside: DrainStatusReader) -> bool:
         return outside.tell(synced=self._synced, closed=self._closed and self._synced == self.written)
 
     def _trimmable(self) -> bool:
@@ -300,14 +300,14 @@ class QueueFiles:
             self._kept.keep(segment.path)
         if gone:
             self._appender.trimmed(gone)
-            self._room_bell.ring()
+            self._room_notifier.ring()
 
     def _prepare(self) -> bool:
         if self._closed:
             return False
         refused = self._appender.prepare()
         if not refused and self._disk_was_full:
-            self._room_bell.ring()
+            self._room_notifier.ring()
         self._disk_was_full = refused
         return refused
 
@@ -315,5 +315,5 @@ class QueueFiles:
         _log.error("nothing more is recorded: %s", error)
         self._failure = error
         self._appender.refuse(lambda: error)
-        self._bell.ring()
-        self._room_bell.ring()
+        self._notifier.ring()
+        self._room_notifier.ring()

@@ -28,7 +28,7 @@ from pycrorm_async.queue.files.recorder_folder import DRAIN, available, make_fol
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.consumer import Consumer
-from pycrorm_async.queue.live.notifier import Bell
+from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.live.queue_files import LOOK_S, QueueFiles
 from pycrorm_async.queue.live.relocatable_appender import Relocated
 from pycrorm_async.settings import Settings
@@ -54,7 +54,7 @@ class RecorderQueue(QueueFiles):
     ) -> None:
         """Used by `create`, which made and locked the folder. Raises `SpoolUnavailable`."""
         super().__init__(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
-        self._consumer = Consumer(self, self._bell)
+        self._consumer = Consumer(self, self._notifier)
         in_forked_child(self._forked)
         self._syncer.start()
 
@@ -84,7 +84,7 @@ class RecorderQueue(QueueFiles):
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
         From any thread, but not from a signal handler. Raises `SpoolFull` when less than the reserve would stay free,
-        with `reserved` when nothing would, and `SpoolStuck` instead after `give_up`; `SpoolClosed` after `close` and in
+        with `reserved` when nothing would, and `SpoolStuck` instead after `fail`; `SpoolClosed` after `close` and in
         a forked child; `SpoolUnavailable` after the disk failed; `EpisodeRefused` for a start when no more open
         episodes fit into a segment's header. `InternalError` for what our own hooks never put: an event of an episode
         that is not between its `EpisodeStarted` and its `EpisodeEnded`, for it could have no sequence, and a record
@@ -103,11 +103,11 @@ class RecorderQueue(QueueFiles):
     async def room(self) -> None:
         """Done when such an ordinary event fits again, or nothing may be put any more: putting says why.
 
-        Raises `SpoolStuck` when there is no use in waiting (`give_up`).
+        Raises `SpoolStuck` when there is no use in waiting (`fail`).
         """
         saying = asyncio.get_running_loop().call_later(_SAY_S, self._say_it_waits)
         try:
-            await self._room_bell.until(lambda: self._room_is_decided(reserved=False))
+            await self._room_notifier.until(lambda: self._room_is_decided(reserved=False))
         finally:
             saying.cancel()
         self._refuse_to_wait(reserved=False)
@@ -127,7 +127,7 @@ class RecorderQueue(QueueFiles):
         if self._syncer.is_this_thread:
             return False
         end_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
-        decided = self._room_bell.block_until(
+        decided = self._room_notifier.block_until(
             lambda: self._room_is_decided(reserved=True),
             remaining_s=lambda: (end_ns - self._clock.monotonic_ns()) / 1e9,
         )
@@ -179,7 +179,7 @@ class RecorderQueue(QueueFiles):
         if self._synced < target or looking:
             self._asked = self._asked or looking
             self._syncer.hurry()
-            await self._bell.until(
+            await self._notifier.until(
                 lambda: (
                     self._failure is not None
                     or self._setbacks != setbacks
@@ -200,7 +200,7 @@ class RecorderQueue(QueueFiles):
             return
         answers, self._asked = self._answers, True
         self._syncer.hurry()
-        await self._bell.until(
+        await self._notifier.until(
             lambda: self._failure is not None or (self._answers > answers and self._displaced is None)
         )
 
@@ -226,21 +226,21 @@ class RecorderQueue(QueueFiles):
         if self._trimmable():
             self._syncer.hurry()
 
-    def set_aside(self, records: Sequence[Record]) -> bool:
+    def dead_letter(self, records: Sequence[Record]) -> bool:
         """These are refused, and kept in a folder of their episode's own when it returns (`refused.py`): True.
 
         From one thread at a time; blocks. Raises `FilesError` or `SpoolDamaged` when they can only stay here.
         """
-        self._consumer.set_aside(records)
+        self._consumer.dead_letter(records)
         return True
 
-    def give_up(self, reason: str) -> None:
+    def fail(self, reason: str) -> None:
         """Nothing more will be acknowledged: from any thread. The first reason stays.
 
         What fits is put all the same; whoever waits for room, now or later, gets `SpoolStuck`.
         """
         self._appender.stuck = self._appender.stuck or reason
-        self._room_bell.ring()
+        self._room_notifier.ring()
 
     def ends_at(self, position: int) -> bool:
         """Whether nothing will come after this position any more."""
@@ -258,8 +258,8 @@ class RecorderQueue(QueueFiles):
             appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
         self._closed = True
         self._syncer.hurry()
-        self._bell.ring()
-        self._room_bell.ring()
+        self._notifier.ring()
+        self._room_notifier.ring()
 
     def release(self) -> None:
         """Closes, waits for the last sync, and gives up files and locks. Twice is once.
@@ -303,4 +303,4 @@ class RecorderQueue(QueueFiles):
         failure = self._failure
         self._appender.abandon(lambda: failure)
         self._consumer.reader.close()
-        self._bell, self._room_bell = Bell(), Bell()
+        self._notifier, self._room_notifier = Notifier(), Notifier()

@@ -23,7 +23,7 @@ from pycrorm_async.queue.files.frame import (
 from pycrorm_async.queue.files.segment import CLOSES, Segment
 from pycrorm_async.queue.live.appender import Appender
 
-__all__ = ["MovableAppender", "Relocated"]
+__all__ = ["RelocatableAppender", "Relocated"]
 
 _CLOSES: Final = CLOSES.encode()
 _LATE_BYTES: Final = 2**16
@@ -34,7 +34,7 @@ class Relocated(InternalError):
     """This appender takes nothing any more: its successor does. Never leaves the queue."""
 
 
-class MovableAppender(Appender):
+class RelocatableAppender(Appender):
     """Adds to an appender what it takes to be the successor of another one, and to have one."""
 
     @property
@@ -47,7 +47,7 @@ class MovableAppender(Appender):
         self._alone.run(partial(self._carry, record))
 
     def hand_over(
-        self, successor: MovableAppender, segment: Segment, offset: int, *, switch: Callable[[], None]
+        self, successor: RelocatableAppender, segment: Segment, offset: int, *, switch: Callable[[], None]
     ) -> bool:
         """Carry what was put behind `offset` of this segment, refuse more with `Relocated`, and call `switch`.
 
@@ -97,7 +97,9 @@ class MovableAppender(Appender):
             if name == _CLOSES:
                 del self.open[EpisodeId(episode)]
 
-    def _hand_over(self, successor: MovableAppender, segment: Segment, offset: int, switch: Callable[[], None]) -> bool:
+    def _hand_over(
+        self, successor: RelocatableAppender, segment: Segment, offset: int, switch: Callable[[], None]
+    ) -> bool:
         late_bytes = self._offset - offset
         if segment is not self._current or late_bytes > min(_LATE_BYTES, successor.free_bytes):
             return False

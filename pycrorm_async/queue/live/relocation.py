@@ -33,13 +33,13 @@ from pycrorm_async.errors import PycrormError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.frame import COMMIT, Buffer, decode_each
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
-from pycrorm_async.queue.files.outside import Outside
+from pycrorm_async.queue.files.outside import DrainStatusReader
 from pycrorm_async.queue.files.reader import Cursor
 from pycrorm_async.queue.files.recorder_folder import begin_folder, finish_folder, remove_folder
 from pycrorm_async.queue.files.segment import Last, Segment, decode_header, header_bytes, read_segment, salt_of
 from pycrorm_async.queue.live.appender import Begun
 from pycrorm_async.queue.live.consumer import Place
-from pycrorm_async.queue.live.relocatable_appender import MovableAppender
+from pycrorm_async.queue.live.relocatable_appender import RelocatableAppender
 from pycrorm_async.settings import FileAccess
 
 __all__ = ["Home", "Remains", "move"]
@@ -56,8 +56,8 @@ class Home(NamedTuple):
     place: Place
     alive: FileLock
     identity: FileIdentity
-    appender: MovableAppender
-    outside: Outside | None
+    appender: RelocatableAppender
+    outside: DrainStatusReader | None
 
     @property
     def is_in_place(self) -> bool:
@@ -90,7 +90,7 @@ def move(
     access: FileAccess,
     recorder: EpisodeId,
     stored: int,
-    appender_in: Callable[[Path, bytes, int, Mapping[EpisodeId, Last]], MovableAppender],
+    appender_in: Callable[[Path, bytes, int, Mapping[EpisodeId, Last]], RelocatableAppender],
     settle: Callable[[Home, tuple[str, ...]], None],
 ) -> None:
     """Make a folder for this recorder below the spool, and go on in it.
@@ -100,12 +100,12 @@ def move(
     and after it the queue is in a folder with an unfinished name, from which it can move once more.
     """
     unfinished, alive = begin_folder(spool, episode_text(recorder), access)
-    appender: MovableAppender | None = None
+    appender: RelocatableAppender | None = None
     settled = False
     try:
         remains = _remains_of(home.appender, home.place.recorder, stored=stored)
         appender = appender_in(unfinished, recorder, remains.after, remains.opened)
-        outside = None if home.outside is None else Outside(unfinished, before=remains.after)
+        outside = None if home.outside is None else DrainStatusReader(unfinished, before=remains.after)
         place = Place(unfinished, recorder, Cursor(1, header_bytes(len(remains.opened)), remains.after))
         moved = Home(place, alive, FileIdentity.of(unfinished.stat()), appender, outside)
 
@@ -145,7 +145,7 @@ def _leave(home: Home, folder: Path | None) -> None:
         home.outside.close()
 
 
-def _remains_of(appender: MovableAppender, recorder: bytes, *, stored: int) -> Remains:
+def _remains_of(appender: RelocatableAppender, recorder: bytes, *, stored: int) -> Remains:
     """Look for what is not stored, in the mappings and in the old folder."""
     mapped = {segment.number: segment for segment in appender.segments}
     contents: list[tuple[int, Buffer]] = []
@@ -173,8 +173,8 @@ def _remains_of(appender: MovableAppender, recorder: bytes, *, stored: int) -> R
 
 def _carry(
     remains: Remains,
-    old: MovableAppender,
-    new: MovableAppender,
+    old: RelocatableAppender,
+    new: RelocatableAppender,
     *,
     recorder: bytes,
     switch: Callable[[], None],
@@ -210,12 +210,12 @@ def _first_frame(content: Buffer) -> int:
     return header_bytes(len(header.open))
 
 
-def _after(appender: MovableAppender, segment: Segment) -> Segment | None:
+def _after(appender: RelocatableAppender, segment: Segment) -> Segment | None:
     """The segment that was begun behind this one, which is full then."""
     return next((each for each in appender.segments if each.number == segment.number + 1), None)
 
 
-def _carry_from(content: Buffer, offset: int, salt: int, new: MovableAppender) -> int:
+def _carry_from(content: Buffer, offset: int, salt: int, new: RelocatableAppender) -> int:
     for record in decode_each(content, offset, salt):
         if record[0] != COMMIT:
             new.carry(record)

@@ -17,7 +17,7 @@ from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.files.locks import is_locked
 from pycrorm_async.queue.files.recorder_folder import ALIVE, DRAIN, MAKING, MENDED, TAIL, available, fault_in, held_by
-from pycrorm_async.queue.files.scan import Kept, Survey, survey
+from pycrorm_async.queue.files.scan import Survey, ValidPrefix, survey
 from pycrorm_async.queue.files.segment import read_segment, segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 
@@ -262,13 +262,13 @@ def _surveyed(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
     return count, found
 
 
-def _segment(folder: Path, number: int, kept: Kept, count: _Count) -> SegmentReport:
+def _segment(folder: Path, number: int, kept: ValidPrefix, count: _Count) -> SegmentReport:
     path = segment_path(folder, number)
     size = path.stat().st_size if path.exists() else 0
     return SegmentReport(path.name, size, kept.bases.get(number), count.segments[number])
 
 
-def _open(kept: Kept) -> list[OpenEpisode]:
+def _open(kept: ValidPrefix) -> list[OpenEpisode]:
     return [
         OpenEpisode(episode_text(EpisodeId(episode)), last.sequence, last.wall_ns)
         for episode, last in sorted(kept.open.items())
@@ -280,7 +280,7 @@ def _late(folder: Path) -> set[str]:
     return {segment_path(folder, number).name for number in segment_numbers(folder)}
 
 
-def _tail_bytes(folder: Path, kept: Kept) -> int:
+def _tail_bytes(folder: Path, kept: ValidPrefix) -> int:
     """What is not zero behind the last whole record."""
     size = 0
     for number in kept.numbers:

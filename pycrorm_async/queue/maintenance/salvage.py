@@ -15,7 +15,7 @@ from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame, encode_span
 from pycrorm_async.queue.files.recorder_folder import held_by, write_safely
-from pycrorm_async.queue.files.scan import Kept, Survey, check_record, whole_frames
+from pycrorm_async.queue.files.scan import Survey, ValidPrefix, check_record, whole_frames
 from pycrorm_async.queue.files.segment import (
     CLOSES,
     Last,
@@ -163,7 +163,7 @@ class Rescue:
         write_safely(segment_path(self._mended, self._number), b"".join((header, *span)))
 
 
-def _is_headless(kept: Kept) -> bool:
+def _is_headless(kept: ValidPrefix) -> bool:
     return not kept.bases and bool(kept.numbers) and kept.numbers[0] > 1
 
 

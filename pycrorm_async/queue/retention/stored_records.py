@@ -13,7 +13,7 @@ from typing import NamedTuple
 from pycrorm_async.errors import FilesError, SpoolDamaged
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue.files.recorder_folder import held_by
-from pycrorm_async.queue.files.scan import Walk
+from pycrorm_async.queue.files.scan import SegmentScanner
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.retention.stored_segments import stored_in
@@ -53,7 +53,7 @@ def stored_records(recorder: StoredRecorder) -> Iterator[list[Record]]:
     Ends early where a file is gone or damaged.
     """
     ready: list[Record] = []
-    walk = Walk(Path(), held_by(recorder.name).recorder, found=ready.append, segments=recorder.segments)
+    walk = SegmentScanner(Path(), held_by(recorder.name).recorder, found=ready.append, segments=recorder.segments)
     given = 0
     more = True
     try:

@@ -29,7 +29,7 @@ from pycrorm_async.queue.files.recorder_folder import (
     remove_folder,
     remove_made_ahead,
 )
-from pycrorm_async.queue.files.scan import Kept, Walk, scan
+from pycrorm_async.queue.files.scan import SegmentScanner, ValidPrefix, scan
 from pycrorm_async.queue.files.sealing import make_safe
 from pycrorm_async.queue.files.segment import CLOSES, segment_path
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
@@ -87,7 +87,7 @@ class RecoveredQueue:
         self._ready: list[Record] = []
         """What was found and not given yet. Given is what `_settled` covers."""
         self._settled = 0
-        self._walk = Walk(folder, recorder, found=self._ready.append)
+        self._walk = SegmentScanner(folder, recorder, found=self._ready.append)
         while self._look_further() and self._settled == self._walk.kept.start.position:
             pass
         self._locks = locks
@@ -149,14 +149,14 @@ class RecoveredQueue:
                     break
                 self._forget(segment_path(self.folder, number))
 
-    def set_aside(self, records: Sequence[Record]) -> bool:
-        """As `RecorderQueue.set_aside`; what was refused before stays where it is."""
+    def dead_letter(self, records: Sequence[Record]) -> bool:
+        """As `RecorderQueue.dead_letter`; what was refused before stays where it is."""
         if self.holds_refused:
             return False
         self._refused.put(records)
         return True
 
-    def give_up(self, reason: str) -> None:
+    def fail(self, reason: str) -> None:
         """Nobody puts into it, so nobody waits for room."""
 
     def remove(self) -> None:
@@ -221,7 +221,7 @@ class _Batch(NamedTuple):
     complete: bool
 
 
-def computed_ends(kept: Kept) -> tuple[Record, ...]:
+def computed_ends(kept: ValidPrefix) -> tuple[Record, ...]:
     """An end of status LOST for each episode that is open, behind the last record."""
     return tuple(
         Record(

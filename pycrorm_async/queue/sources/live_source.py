@@ -18,7 +18,7 @@ import msgspec
 from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
-from pycrorm_async.queue.files.drain_status import Drained, Note, Progress
+from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus, Progress
 from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileLock, is_locked
 from pycrorm_async.queue.files.reader import Cursor, Reader
@@ -46,7 +46,7 @@ class LiveQueue:
         self._progress = progress
         self._refused = RefusedRecords(folder)
         before = progress.drained()
-        self._said = before._replace(note=Note())  # what a drainer before said in words is not ours to repeat
+        self._said = before._replace(note=DrainNote())  # what a drainer before said in words is not ours to repeat
         self._reader = Reader(recorder=recorder, start=self._segment_of(before.stored), load=self._load)
         self._reader.skip_to(min(before.stored, progress.recorded().synced))
         self._until: int | None = None
@@ -122,12 +122,12 @@ class LiveQueue:
         if position > self._said.stored:
             self._say(self._said._replace(stored=position))
 
-    def set_aside(self, records: Sequence[Record]) -> bool:
-        """As `RecorderQueue.set_aside`."""
+    def dead_letter(self, records: Sequence[Record]) -> bool:
+        """As `RecorderQueue.dead_letter`."""
         self._refused.put(records)
         return True
 
-    def give_up(self, reason: str) -> None:
+    def fail(self, reason: str) -> None:
         """Whoever waits for room there is told; the first reason stays."""
         if self._said.note.given_up is None:
             self._say_in_words(given_up=reason)
@@ -136,7 +136,7 @@ class LiveQueue:
         """Nothing is given any more beyond what is synced now."""
         self._until = self._progress.recorded().synced
 
-    def note_shown(self, position: int, stopped: Mapping[str, str]) -> None:
+    def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None:
         """Everything up to this position shows in the tables, or never will: of the episodes that are `stopped`, by id.
 
         Raises `SpoolUnavailable`.
@@ -147,7 +147,7 @@ class LiveQueue:
         if said != self._said:
             self._say(said)
 
-    def note_away(self, reason: str | None) -> None:
+    def mark_unavailable(self, reason: str | None) -> None:
         """Why the database takes nothing now; None when it does again. Raises `SpoolUnavailable`."""
         self._say_in_words(away=reason)
 
@@ -199,7 +199,7 @@ class LiveQueue:
         if said != self._said:
             self._say(said)
 
-    def _say(self, said: Drained) -> None:
+    def _say(self, said: DrainStatus) -> None:
         with available(self.folder):
             self._progress.tell_drained(said)
         self._said = said
