@@ -23,8 +23,8 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.drain import Drain
+from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask
 from tests.proxy import Proxy, proxy_before
 from tests.store.making import episode, run_of

@@ -25,8 +25,8 @@ from pycrorm_async.queue import open_dead
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.drain import Drain
+from pycrorm_async.writer.retry import Backoff
 from tests.crash.test_queue_power import Machine, machine_on
 from tests.databases import ask
 from tests.writer.ends import CountingFold, Passing

@@ -25,7 +25,8 @@ from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import destination
 from pycrorm_async.operations.destination import Rebinding
 from pycrorm_async.projections.custom.discovery import named
-from pycrorm_async.queue.files.recorder_folder import REFUSED, fault_in
+from pycrorm_async.queue.files.names import REFUSED
+from pycrorm_async.queue.files.recorder_folder import fault_in
 from pycrorm_async.queue.maintenance.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
 from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
 from pycrorm_async.queue.maintenance.salvage import Range

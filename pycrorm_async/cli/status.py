@@ -22,7 +22,8 @@ from pycrorm_async.projections.custom.projection_tables import ProjectionState, 
 from pycrorm_async.projections.schema.unmade_types import unmade_types
 from pycrorm_async.queue.files.drain_status import Progress
 from pycrorm_async.queue.files.locks import is_locked
-from pycrorm_async.queue.files.recorder_folder import DRAIN, available, fault_in
+from pycrorm_async.queue.files.names import DRAIN
+from pycrorm_async.queue.files.recorder_folder import available, fault_in
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.store.address import DatabaseAddress

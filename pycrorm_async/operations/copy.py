@@ -27,8 +27,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
-from pycrorm_async.writer.backoff import BRIEF
-from pycrorm_async.writer.retry import retry
+from pycrorm_async.writer.retry import BRIEF, retry
 
 __all__ = ["copy_episodes", "CopySummary", "EpisodeCopy"]
 

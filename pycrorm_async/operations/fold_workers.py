@@ -38,8 +38,8 @@ from pycrorm_async.operations.fold_worker import Assignment, Failure, FoldRest, 
 from pycrorm_async.projections.run.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPipeline, Outlook
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.stored import Span
-from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.ports import Tables
+from pycrorm_async.writer.retry import Backoff
 
 __all__ = ["WORKERS", "DaemonNote", "FoldWorkers", "FoldWorkerTables", "FoldWorkerState", "FoldWorkerLost", "verdict"]
 

@@ -31,8 +31,7 @@ from pycrorm_async.projections.schema.materialised_views import refresh_some
 from pycrorm_async.projections.schema.user_views import UserView, with_user_views
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.folded_progress import advance_folded, park
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.stored import Span
 
 __all__ = ["Projector"]

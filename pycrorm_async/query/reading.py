@@ -22,14 +22,13 @@ from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.projections.schema.generations import Generation, current_generation
-from pycrorm_async.projections.schema.session_views import with_views
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import unite
+from pycrorm_async.projections.schema.session_views import all_views, with_views
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.dataframes import dataframe
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.snapshot import Moment
-from pycrorm_async.query.thoughts import all_views
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 

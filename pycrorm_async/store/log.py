@@ -26,7 +26,7 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.settings import FileAccess
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import Appending
-from pycrorm_async.store.dialect import Dialect, StoredOn
+from pycrorm_async.store.dialect import Dialect, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.limits import EVENTS_MANY, events_warning, number_warning
 from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
@@ -43,7 +43,7 @@ from pycrorm_async.store.stored import (
     share_out,
 )
 
-__all__ = ["EventLog"]
+__all__ = ["EventLog", "advance_folded", "park"]
 
 _log = logging.getLogger("pycrorm_async")
 _MANY_EVENTS = 1_000
@@ -310,3 +310,16 @@ def _translated(dialect: Dialect, name: str) -> Iterator[None]:
         raise
     except dialect.faults as error:
         raise dialect.ours(error, name) from error
+
+
+async def advance_folded(connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
+    """Notes (episode number, folded before, folded now) of each episode.
+
+    False if one of them is not where the caller believed: someone else folded it, and the caller must roll back.
+    """
+    return await dialect_of(connection).advance_folded(connection, steps) == len(steps)
+
+
+async def park(connection: AsyncConnection, number: int, reason: str | None) -> None:
+    """Stops folding an episode, with the reason; None releases it. The log goes on taking its events."""
+    await dialect_of(connection).park(connection, number, reason)

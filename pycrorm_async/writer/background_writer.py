@@ -13,11 +13,10 @@ from typing import NamedTuple, TypeVar
 
 from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.backoff import PATIENT
 from pycrorm_async.writer.drain import Drain, DrainState, run_to_completion
 from pycrorm_async.writer.patience import Patience
 from pycrorm_async.writer.ports import Destination, Source
-from pycrorm_async.writer.retry import retry
+from pycrorm_async.writer.retry import PATIENT, retry
 
 __all__ = ["LiveWriter", "WriterState"]
 

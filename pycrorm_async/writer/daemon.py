@@ -16,9 +16,9 @@ from typing import Final, NamedTuple
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.availability import AvailabilityMonitor
-from pycrorm_async.writer.backoff import PATIENT, Backoff
 from pycrorm_async.writer.drain import run_to_completion
 from pycrorm_async.writer.ports import ClaimedSource, ScanResult, SourceScanner, Tables
+from pycrorm_async.writer.retry import PATIENT, Backoff
 from pycrorm_async.writer.visibility import VisibilityTracker
 
 __all__ = ["Daemon", "DaemonSummary", "LEAVE_S"]

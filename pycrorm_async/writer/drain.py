@@ -20,9 +20,8 @@ from pycrorm_async.errors import DamageError, DatabaseUnavailable, FilesError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.backoff import PATIENT, Backoff
 from pycrorm_async.writer.ports import Destination, Source
-from pycrorm_async.writer.retry import retry
+from pycrorm_async.writer.retry import PATIENT, Backoff, retry
 
 __all__ = ["Drain", "DrainState", "run_to_completion"]
 

@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 from pycrorm_async.errors import DatabaseError, InternalError, PycrormError
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.backoff import BRIEF
 from pycrorm_async.writer.drain import Drain, DrainState
 from pycrorm_async.writer.ports import Destination, Source
-from pycrorm_async.writer.retry import retry
+from pycrorm_async.writer.retry import BRIEF, retry
 
 __all__ = ["DrainSummary", "drain_once"]
 

@@ -181,7 +181,7 @@ def test_a_queue_that_calls_synced_what_it_did_not_sync_is_seen(
     def careless(queue: RecorderQueue, **_: object) -> None:
         span = queue._appender.begin_sync()
         queue._safe_number, queue._synced = span.segments[-1].number, span.position
-        queue._notifier.ring()
+        queue._notifier.notify_all()
 
     monkeypatch.setattr(RecorderQueue, "_sync", careless)
     assert files.power_cuts(40, random.Random(1), tmp_path, lambda: None).lost > 0

@@ -18,8 +18,7 @@ from pycrorm_async.events.types import (
     PoseValue,
 )
 from pycrorm_async.events.upcasters import UPCASTERS
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import Layout, unite
 
 LINES = (Path(__file__).parent.parent / "golden" / "events_v1.jsonl").read_text().splitlines()
 GOLDEN = [(kind, payload.encode()) for kind, _, payload in (line.partition(" ") for line in LINES)]

@@ -27,8 +27,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.orm import Action, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms

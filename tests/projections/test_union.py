@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import Layout, unite
 from tests.projections.script import declared, field, name_of
 
 TEXT = declared("NoteAction", "note_action", field("text", "text", 2))

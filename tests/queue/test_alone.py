@@ -151,7 +151,7 @@ def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
     def work() -> None:
         Dropped(lambda: waits.append(bell.block_until(lambda: True, remaining_s=lambda: 0.0)), again=30)
         for _ in range(30):
-            bell.ring()
+            bell.notify_all()
             bell.block_until(lambda: True, remaining_s=lambda: 0.0)
 
     assert finishes(work)
@@ -163,14 +163,14 @@ def test_of_many_who_ring_at_once_each_waiter_is_woken_once() -> None:
     over = threading.Event()
     failures: list[BaseException] = []
 
-    def ring() -> None:
+    def notify_all() -> None:
         try:
             while not over.is_set():
-                bell.ring()
+                bell.notify_all()
         except BaseException as error:  # noqa: BLE001  # shown below
             failures.append(error)
 
-    ringing = [threading.Thread(target=ring) for _ in range(3)]
+    ringing = [threading.Thread(target=notify_all) for _ in range(3)]
     for thread in ringing:
         thread.start()
     for _ in range(500):

@@ -19,7 +19,8 @@ from pycrorm_async.errors import (
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.files.drain_status import PROGRESS, Progress
+from pycrorm_async.queue.files.drain_status import Progress
+from pycrorm_async.queue.files.names import PROGRESS
 from pycrorm_async.queue.files.scan import scan
 from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, read_segment, segment_numbers
 from pycrorm_async.queue.live.capacity import Capacity

@@ -12,8 +12,7 @@ from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.files.frame import CHECKSUM, EVENT, encode
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.recorder_folder import held_by
-from pycrorm_async.queue.files.scan import scan
-from pycrorm_async.queue.files.sealing import seal, tails
+from pycrorm_async.queue.files.scan import scan, seal, tails
 from pycrorm_async.queue.files.segment import salt_of
 from tests.queue.writing import (
     DECLARED,

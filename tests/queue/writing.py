@@ -9,7 +9,7 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.queue import LiveQueue, RecorderQueue, RecoveredQueue, open_dead
-from pycrorm_async.queue.files.recorder_folder import MAKING
+from pycrorm_async.queue.files.names import MAKING
 from pycrorm_async.queue.live.appender import Appender
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.settings import Settings

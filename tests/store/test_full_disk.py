@@ -16,8 +16,8 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.drain import Drain
+from pycrorm_async.writer.retry import Backoff
 from tests.databases import ask
 from tests.store.making import episode, record
 from tests.writer.ends import CountingFold, KeptSource

@@ -17,8 +17,8 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.drain import Drain
+from pycrorm_async.writer.retry import Backoff
 from tests.crash.walking import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask
 from tests.store.making import declaration, episode, run_of

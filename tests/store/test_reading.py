@@ -7,8 +7,7 @@ from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.folded_progress import advance_folded, park
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.sqlite import statements
 from pycrorm_async.store.sqlite.engine import Connection
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent

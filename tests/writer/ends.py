@@ -12,8 +12,7 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.folded_progress import advance_folded
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.log import EventLog, advance_folded
 from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["KeptSource", "CountingFold", "Passing", "LosesReplies", "opener"]

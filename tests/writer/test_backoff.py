@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from pycrorm_async.writer.backoff import Backoff
+from pycrorm_async.writer.retry import Backoff
 
 
 def test_each_pause_is_twice_the_one_before_up_to_the_longest() -> None:

@@ -15,8 +15,8 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.backoff import Backoff
 from pycrorm_async.writer.drain import Drain, run_to_completion
+from pycrorm_async.writer.retry import Backoff
 from tests.databases import ask
 from tests.store.making import episode, record, run_of
 from tests.writer.ends import CountingFold, KeptSource, LosesReplies, Passing

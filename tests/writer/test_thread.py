@@ -19,8 +19,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.folded_progress import park
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.log import EventLog, park
 from pycrorm_async.writer.ports import Destination
 from pycrorm_async.writer.writer_thread import WriterThread
 from tests.databases import ask

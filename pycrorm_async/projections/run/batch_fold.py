@@ -24,8 +24,7 @@ from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.fold.row_writer import insertion_of, write_rows
 from pycrorm_async.projections.schema.generations import Generation, Hold
 from pycrorm_async.projections.schema.growth import Growing, grow
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialect import Insertion, Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog

@@ -17,9 +17,9 @@ from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation
 from pycrorm_async.projections.schema.growth import Growing, grow
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.folded_progress import park
+from pycrorm_async.store.log import park
 
 __all__ = ["release_parked"]
 

@@ -27,8 +27,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.projections.schema.generations import Generation
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialects import dialect_of
 
 __all__ = ["Growing", "grow"]

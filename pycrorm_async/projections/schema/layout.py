@@ -10,16 +10,17 @@ of them are its tables, and each of their views shows all of it, whichever decla
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple, Self
 
 import msgspec
 
-from pycrorm_async.events.fields import fault_in_declaration, table_name
+from pycrorm_async.events.codec import UnknownShape, declaration_of, fingerprint
+from pycrorm_async.events.fields import fault_in_declaration, mapped_declaration, table_name
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldType
 from pycrorm_async.projections.schema.tables import Storage
 
-__all__ = ["Layout", "DesignatorType", "Leaf", "Kept", "Contradictory", "STORED_AS"]
+__all__ = ["Layout", "DesignatorType", "Leaf", "Kept", "Contradictory", "STORED_AS", "Union", "unite"]
 
 STORED_AS: dict[FieldType, Storage] = {
     "integer": "integer",
@@ -228,3 +229,43 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
                 f"{dtype}.{column} is declared as {present[column]} and as {storage}"
                 " (types that share a name must agree: rename one field or set another dtype)"
             )
+
+
+class Union(NamedTuple):
+    """The layout with all that was accepted; by fingerprint, what was accepted and why the others were refused."""
+
+    layout: Layout
+    accepted: dict[str, DesignatorTypeDeclared]
+    refused: dict[str, str]
+
+
+def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
+    """The layout with these declarations, as far as they can share the tables."""
+    accepted: dict[str, DesignatorTypeDeclared] = {}
+    refused: dict[str, str] = {}
+    for payload in payloads:
+        name = fingerprint(payload)
+        if name in layout.unmade:
+            refused[name] = layout.unmade[name]
+            continue
+        try:
+            declared = mapped_declaration(declaration_of(payload))
+            layout = layout.with_declaration(declared)
+            accepted[name] = declared
+        except Contradictory as reason:
+            refused[name] = str(reason)
+        except (UnknownShape, msgspec.DecodeError) as error:  # a newer version's, or damaged
+            refused[name] = f"this version cannot read the declaration of its type: {error}"
+    unreadable = [fingerprint(each) for each in payloads if not _is_readable(each)]
+    return Union(layout.with_unreadable(unreadable) if unreadable else layout, accepted, refused)
+
+
+def _is_readable(payload: bytes) -> bool:
+    """Whether a database can take a member out of it: it is JSON without U+0000, which PostgreSQL has in no text."""
+    if b"\\u0000" in payload:
+        return False
+    try:
+        msgspec.json.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return False
+    return True

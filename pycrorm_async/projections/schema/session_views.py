@@ -7,9 +7,10 @@ from contextlib import asynccontextmanager
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.projections.schema.generations import Generation, all_noted, projections_in, view_texts_of
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["with_views"]
+__all__ = ["with_views", "all_views"]
 
 
 @asynccontextmanager
@@ -25,3 +26,9 @@ async def with_views(engine: AsyncEngine, views: Mapping[str, str]) -> AsyncIter
             yield connection
         finally:
             await connection.invalidate()  # it never goes back to the pool
+
+
+async def all_views(connection: AsyncConnection, generation: Generation) -> dict[str, str]:
+    """Name and SQL of every view there is, as it is without anything left out; a view stands on those before it."""
+    projections = projections_in(await all_noted(connection))
+    return view_texts_of(connection, generation, projections, simulated=True)

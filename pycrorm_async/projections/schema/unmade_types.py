@@ -6,8 +6,7 @@ import msgspec
 
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.projections.schema.generations import SHOWN, noted
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 

@@ -20,7 +20,7 @@ from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation, current_generation
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.projections.schema.unmade_types import unmade_types
 from pycrorm_async.projections.verify.episode_check import EpisodeCheck
 from pycrorm_async.projections.verify.findings import Damage, Stopped, Verified

@@ -10,25 +10,18 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from pycrorm_async.errors import PycrormError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
-from pycrorm_async.queue.files.drain_status import PROGRESS
 from pycrorm_async.queue.files.file_access import create_folder, create_spool, rewrite
 from pycrorm_async.queue.files.file_system import check_file_system
 from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, PROGRESS, REFUSED, TAIL
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path, sync_folder
 from pycrorm_async.settings import FileAccess
 
 __all__ = [
-    "ALIVE",
-    "DRAIN",
-    "MAKING",
-    "MENDED",
-    "REFUSED",
-    "STORED",
-    "TAIL",
     "Holding",
     "available",
     "begin_folder",
@@ -40,16 +33,6 @@ __all__ = [
     "remove_made_ahead",
     "write_safely",
 ]
-
-ALIVE: Final = "alive"
-DRAIN: Final = "drain"
-MAKING: Final = ".making"
-MENDED: Final = f".mended{MAKING}"
-"""What `repair` adds to the name of a new folder until it is whole."""
-REFUSED: Final = ".refused"
-TAIL: Final = ".tail"
-STORED: Final = "stored"
-"""Below the spool: segments whose records are all stored (`stored.py`)."""
 
 
 class Holding(NamedTuple):

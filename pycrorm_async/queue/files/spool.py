@@ -10,7 +10,8 @@ from pycrorm_async.errors import SpoolForeign, SpoolTaken, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue.files.file_access import create_spool
 from pycrorm_async.queue.files.locks import FileLock, is_locked, note_in, one_at_a_time
-from pycrorm_async.queue.files.recorder_folder import ALIVE, DRAIN, STORED, available, held_by, write_safely
+from pycrorm_async.queue.files.names import ALIVE, DRAIN, STORED
+from pycrorm_async.queue.files.recorder_folder import available, held_by, write_safely
 from pycrorm_async.queue.retention.acknowledged_heads import forget_numbers
 from pycrorm_async.settings import FileAccess
 

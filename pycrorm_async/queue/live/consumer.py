@@ -18,8 +18,9 @@ from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.names import DRAIN
 from pycrorm_async.queue.files.reader import Batch, Cursor, Reader
-from pycrorm_async.queue.files.recorder_folder import DRAIN, available
+from pycrorm_async.queue.files.recorder_folder import available
 from pycrorm_async.queue.files.segment import map_segment, segment_path
 from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.sources.dead_letters import RefusedRecords

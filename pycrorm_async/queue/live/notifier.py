@@ -23,7 +23,7 @@ class Notifier:
     def __init__(self) -> None:
         self._tickets: set[Future[None]] = set()
 
-    def ring(self) -> None:
+    def notify_all(self) -> None:
         """Wakes everybody. From any thread."""
         for ticket in list(self._tickets):
             try:

@@ -15,11 +15,11 @@ from pathlib import Path
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import DamageError, FilesError, InternalError, PycrormError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_id
-from pycrorm_async.queue.files.drain_status import DrainStatus
+from pycrorm_async.queue.files.drain_status import DrainStatus, DrainStatusReader
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
-from pycrorm_async.queue.files.outside import DrainStatusReader
+from pycrorm_async.queue.files.names import ALIVE
 from pycrorm_async.queue.files.reader import Cursor
-from pycrorm_async.queue.files.recorder_folder import ALIVE, available
+from pycrorm_async.queue.files.recorder_folder import available
 from pycrorm_async.queue.files.segment import Last, Segment, header_bytes
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.appender import NOTHING_OPEN
@@ -173,13 +173,13 @@ class QueueFiles:
         self._stored = max(self._stored, said.stored)
         if said.note.given_up != self._appender.stuck:
             self._appender.stuck = said.note.given_up
-            self._room_notifier.ring()
+            self._room_notifier.notify_all()
         return told
 
     def _answer(self, *, asked: bool) -> None:
         if asked:
             self._answers += 1
-            self._notifier.ring()
+            self._notifier.notify_all()
 
     def _sync(self, *, look: bool = False) -> None:
         span = self._appender.begin_sync()
@@ -200,7 +200,7 @@ class QueueFiles:
         self._synced = span.position
         if self._outside is not None:
             self._tell(self._outside)  # first, so that who waited for the disk need not wait for this
-        self._notifier.ring()
+        self._notifier.notify_all()
 
     # --- moving ------------------------------------------------------------------------------------------------
 
@@ -223,7 +223,7 @@ class QueueFiles:
             _log.error("%s", setback)
         self._setback = setback
         self._setbacks += 1
-        self._notifier.ring()
+        self._notifier.notify_all()
 
     def _move(self) -> bool:
         """Goes on in a new folder, and syncs there; False if that cannot be made now. What can be read is kept."""
@@ -300,14 +300,14 @@ class QueueFiles:
             self._kept.keep(segment.path)
         if gone:
             self._appender.trimmed(gone)
-            self._room_notifier.ring()
+            self._room_notifier.notify_all()
 
     def _prepare(self) -> bool:
         if self._closed:
             return False
         refused = self._appender.prepare()
         if not refused and self._disk_was_full:
-            self._room_notifier.ring()
+            self._room_notifier.notify_all()
         self._disk_was_full = refused
         return refused
 
@@ -315,5 +315,5 @@ class QueueFiles:
         _log.error("nothing more is recorded: %s", error)
         self._failure = error
         self._appender.refuse(lambda: error)
-        self._notifier.ring()
-        self._room_notifier.ring()
+        self._notifier.notify_all()
+        self._room_notifier.notify_all()

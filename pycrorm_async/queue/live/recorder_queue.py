@@ -24,7 +24,8 @@ from pycrorm_async.errors import FilesError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.locks import FileLock, in_forked_child, is_locked
-from pycrorm_async.queue.files.recorder_folder import DRAIN, available, make_folder, remove_folder, remove_made_ahead
+from pycrorm_async.queue.files.names import DRAIN
+from pycrorm_async.queue.files.recorder_folder import available, make_folder, remove_folder, remove_made_ahead
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.consumer import Consumer
@@ -240,7 +241,7 @@ class RecorderQueue(QueueFiles):
         What fits is put all the same; whoever waits for room, now or later, gets `SpoolStuck`.
         """
         self._appender.stuck = self._appender.stuck or reason
-        self._room_notifier.ring()
+        self._room_notifier.notify_all()
 
     def ends_at(self, position: int) -> bool:
         """Whether nothing will come after this position any more."""
@@ -258,8 +259,8 @@ class RecorderQueue(QueueFiles):
             appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
         self._closed = True
         self._syncer.hurry()
-        self._notifier.ring()
-        self._room_notifier.ring()
+        self._notifier.notify_all()
+        self._room_notifier.notify_all()
 
     def release(self) -> None:
         """Closes, waits for the last sync, and gives up files and locks. Twice is once.

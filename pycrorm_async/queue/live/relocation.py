@@ -31,9 +31,9 @@ from typing import NamedTuple
 
 from pycrorm_async.errors import PycrormError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue.files.drain_status import DrainStatusReader
 from pycrorm_async.queue.files.frame import COMMIT, Buffer, decode_each
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
-from pycrorm_async.queue.files.outside import DrainStatusReader
 from pycrorm_async.queue.files.reader import Cursor
 from pycrorm_async.queue.files.recorder_folder import begin_folder, finish_folder, remove_folder
 from pycrorm_async.queue.files.segment import Last, Segment, decode_header, header_bytes, read_segment, salt_of

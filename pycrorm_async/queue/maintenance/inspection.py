@@ -16,7 +16,8 @@ from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.files.locks import is_locked
-from pycrorm_async.queue.files.recorder_folder import ALIVE, DRAIN, MAKING, MENDED, TAIL, available, fault_in, held_by
+from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, MENDED, PROGRESS, TAIL
+from pycrorm_async.queue.files.recorder_folder import available, fault_in, held_by
 from pycrorm_async.queue.files.scan import Survey, ValidPrefix, survey
 from pycrorm_async.queue.files.segment import read_segment, segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
@@ -34,7 +35,6 @@ __all__ = [
 SET_ASIDE: Final = ".damaged"
 """What `repair` adds to the name of a folder it has put aside."""
 
-_PROGRESS = "progress"
 """How far another process has drained a living recorder's folder."""
 _LOOKS = 20
 
@@ -219,7 +219,7 @@ class _Count:
 def _looked_at(recorder: RecorderFolder, *, being_drained: bool) -> RecorderReport:
     folder = recorder.path
     count, (kept, damage, _) = _surveyed(folder, changing=recorder.alive or being_drained)
-    ours = {ALIVE, DRAIN, _PROGRESS, *(segment_path(folder, number).name for number in kept.numbers)}
+    ours = {ALIVE, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in kept.numbers)}
     others = sorted(_text(each.name) for each in folder.iterdir() if each.name not in ours)
     return RecorderReport(
         recorder.name,

@@ -19,7 +19,8 @@ from pycrorm_async.errors import InternalError, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue.files.file_access import create_folder, open_file
 from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.recorder_folder import ALIVE, DRAIN, MENDED, available, held_by
+from pycrorm_async.queue.files.names import ALIVE, DRAIN, MENDED
+from pycrorm_async.queue.files.recorder_folder import available, held_by
 from pycrorm_async.queue.files.scan import Survey, scan, survey
 from pycrorm_async.queue.files.segment import sync_folder
 from pycrorm_async.queue.maintenance.inspection import SET_ASIDE, Damage

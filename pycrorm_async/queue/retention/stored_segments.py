@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue.files.file_access import create_folders
-from pycrorm_async.queue.files.recorder_folder import STORED
+from pycrorm_async.queue.files.names import STORED
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.settings import Settings

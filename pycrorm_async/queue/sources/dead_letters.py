@@ -22,9 +22,9 @@ from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.file_access import create_folder
 from pycrorm_async.queue.files.frame import EVENT, Frame, encode_span
 from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.recorder_folder import ALIVE, REFUSED, available, held_by, write_safely
-from pycrorm_async.queue.files.scan import survey
-from pycrorm_async.queue.files.sealing import make_safe, seal
+from pycrorm_async.queue.files.names import ALIVE, REFUSED
+from pycrorm_async.queue.files.recorder_folder import available, held_by, write_safely
+from pycrorm_async.queue.files.scan import make_safe, seal, survey
 from pycrorm_async.queue.files.segment import (
     CLOSES,
     Last,

@@ -20,17 +20,14 @@ from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.names import ALIVE, DRAIN, MENDED
 from pycrorm_async.queue.files.recorder_folder import (
-    ALIVE,
-    DRAIN,
-    MENDED,
     available,
     held_by,
     remove_folder,
     remove_made_ahead,
 )
-from pycrorm_async.queue.files.scan import SegmentScanner, ValidPrefix, scan
-from pycrorm_async.queue.files.sealing import make_safe
+from pycrorm_async.queue.files.scan import SegmentScanner, ValidPrefix, make_safe, scan
 from pycrorm_async.queue.files.segment import CLOSES, segment_path
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.queue.sources.dead_letters import RefusedRecords

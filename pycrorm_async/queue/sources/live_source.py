@@ -21,8 +21,9 @@ from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus, Progress
 from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileLock, is_locked
+from pycrorm_async.queue.files.names import ALIVE, DRAIN
 from pycrorm_async.queue.files.reader import Cursor, Reader
-from pycrorm_async.queue.files.recorder_folder import ALIVE, DRAIN, available
+from pycrorm_async.queue.files.recorder_folder import available
 from pycrorm_async.queue.files.scan import checked_header
 from pycrorm_async.queue.files.segment import header_bytes, map_segment, segment_numbers, segment_path
 from pycrorm_async.queue.sources.dead_letters import RefusedRecords
