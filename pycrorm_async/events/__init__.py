@@ -1,1 +1,1 @@
-"""What happened: frozen values, their envelope, their ids, their bytes. Pure: no I/O, no clock, no loop."""
+"""The events package defines event types, envelopes, ids and the codec, without I/O, clock or event loop."""

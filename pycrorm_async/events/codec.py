@@ -1,8 +1,9 @@
-"""Events to bytes and back: JSON, UTF-8, one object, the same bytes in the queue, the log and an export.
+"""The codec encodes each event as one JSON object in UTF-8 and decodes it again.
 
-`encode` is the border. What JSON cannot hold without changing its meaning is refused with the path to it: NaN and
-infinities (which the encoder alone would turn into null), lone surrogates, U+0000 (which PostgreSQL text refuses),
-and a payload above the limit. `decode` reads what any version wrote up to the present one (`upcasters`).
+The payload bytes are the same in the queue, in the log and in an export. `encode` refuses every value that JSON cannot
+hold without changing its meaning, and names the path to it: NaN and infinities (msgspec alone would write null), lone
+surrogates, U+0000 (PostgreSQL text refuses it) and a payload above the limit. `decode` reads the payloads of this and
+all earlier versions (see `upcasters`).
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ __all__ = [
 
 
 class NotEncodable(ValueError):
-    """`path` inside the event holds what JSON cannot; `reason` says what."""
+    """JSON cannot hold the value at `path` inside the event; `reason` states why."""
 
     def __init__(self, path: str, reason: str) -> None:
         super().__init__(f"{path}: {reason}" if path else reason)
@@ -40,43 +41,44 @@ class NotEncodable(ValueError):
 
 
 class UnknownShape(ValueError):
-    """This version knows no such event, or not in this version of it; most likely a newer one wrote it."""
+    """This software has no such event type, or not in that version; most likely newer software wrote it."""
 
 
 class Decoder:
-    """Reads payloads of these event types, those of older versions through their upcasters.
+    """Decodes payloads of the given event types; payloads of older versions pass through their upcasters first.
 
     Args:
-        types: event types by name, in their present shape.
-        upcasters: for each older version of each of them, what makes it the next one.
+        types: event types by name, in their current shape.
+        upcasters: for each older version of each type, the function that converts its JSON to the next version.
     """
 
     def __init__(self, types: Mapping[str, type[Happening]], upcasters: Mapping[tuple[str, int], Upcaster]) -> None:
-        self._present = {name: (kind.version, msgspec.json.Decoder(kind).decode) for name, kind in types.items()}
+        self._current = {name: (kind.version, msgspec.json.Decoder(kind).decode) for name, kind in types.items()}
         self._upcasters = dict(upcasters)
-        older = {(name, each) for name, (version, _) in self._present.items() for each in range(1, version)}
+        older = {(name, each) for name, (version, _) in self._current.items() for each in range(1, version)}
         assert self._upcasters.keys() == older, self._upcasters.keys() ^ older
 
     def decode(self, type_name: str, payload: bytes, version: int | None = None) -> Happening:
-        """The event in these bytes, which are of this version (None: the present one), in its present shape.
+        """Decode a payload of `version` (None: the current version) into the current shape of its type.
 
-        Raises `UnknownShape`; `msgspec.DecodeError` for bytes that are not of that shape. Both are a `ValueError`.
+        Raises `UnknownShape` for an unknown type or version, and `msgspec.DecodeError` for bytes of another shape.
+        Both are a `ValueError`.
         """
-        known = self._present.get(type_name)
-        if known is None:
+        current_shape = self._current.get(type_name)
+        if current_shape is None:
             raise UnknownShape(f"{type_name} is not an event this version knows")
-        present, read = known
+        current, decode_current = current_shape
         try:
-            if version != present and version is not None:
-                if not 1 <= version < present:
-                    raise UnknownShape(f"{type_name} has version {version}, this version knows {present}")
-                payload = self._upcast(type_name, payload, version, present)
-            return read(payload)
-        except (UnicodeDecodeError, RecursionError) as error:  # no UTF-8, or nested too deep
+            if version != current and version is not None:
+                if not 1 <= version < current:
+                    raise UnknownShape(f"{type_name} has version {version}, this version knows {current}")
+                payload = self._upcast(type_name, payload, version, current)
+            return decode_current(payload)
+        except (UnicodeDecodeError, RecursionError) as error:  # invalid UTF-8, or nesting too deep
             raise msgspec.DecodeError(str(error)) from None
 
     def declaration_of(self, payload: bytes) -> DesignatorTypeDeclared:
-        """The declaration in these bytes. Raises as `decode` does."""
+        """Decode a declaration, whose payload carries its own version. Raises as `decode` does."""
         try:
             version = msgspec.json.decode(payload, type=_Versioned).version
         except (UnicodeDecodeError, RecursionError) as error:
@@ -85,13 +87,13 @@ class Decoder:
         assert isinstance(event, DesignatorTypeDeclared)
         return event
 
-    def _upcast(self, type_name: str, payload: bytes, version: int, present: int) -> bytes:
+    def _upcast(self, type_name: str, payload: bytes, version: int, current: int) -> bytes:
         document = msgspec.json.decode(payload, type=dict[str, Any])
-        for old in range(version, present):
+        for old in range(version, current):
             try:
                 document = self._upcasters[type_name, old](document)
             except (LookupError, TypeError, ValueError, AttributeError) as error:
-                raise msgspec.DecodeError(f"not of version {old}: {error!r}") from error
+                raise msgspec.DecodeError(f"the payload is not of version {old}: {error!r}") from error
         return msgspec.json.encode(document)
 
 
@@ -100,31 +102,34 @@ class _Versioned(msgspec.Struct):
 
 
 _encoder = msgspec.json.Encoder()
-_present = Decoder(EVENT_TYPES, UPCASTERS)
-decode = _present.decode
-declaration_of = _present.declaration_of
+_decoder = Decoder(EVENT_TYPES, UPCASTERS)
+decode = _decoder.decode
+declaration_of = _decoder.declaration_of
 
 
 def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
-    """The event's payload. Raises `NotEncodable`; the bytes of one event never differ between processes."""
+    """Encode an event as its payload; the same event gives the same bytes in every process.
+
+    Raises `NotEncodable`, also for a payload of more than `bytes_max` bytes.
+    """
     try:
         payload = _encoder.encode(event)
     except UnicodeEncodeError:
         raise _first_fault(event) or NotEncodable("", "holds a lone surrogate") from None
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise _first_fault(event) or NotEncodable("", str(error)) from None
-    # The encoder writes NaN as null and U+0000 as an escape: only payloads that hold one of these are looked at.
+    # The encoder writes NaN as null and U+0000 as an escape, so only payloads that hold one of these need a search.
     if b"null" in payload or b"\\u0000" in payload:
         fault = _first_fault(event)
         if fault is not None:
             raise fault
     if len(payload) > bytes_max:
-        raise NotEncodable("", f"takes {len(payload):,} bytes, {bytes_max:,} are allowed (record_bytes_max)")
+        raise NotEncodable("", f"the record takes {len(payload):,} bytes, {bytes_max:,} are allowed (record_bytes_max)")
     return payload
 
 
 def encoded_bytes(value: Any) -> int:
-    """How many bytes a part of an event takes. Raises `NotEncodable`."""
+    """Return the size in bytes of one part of an event once encoded. Raises `NotEncodable`."""
     fault = _first_fault(value)
     if fault is not None:
         raise fault
@@ -135,12 +140,12 @@ def encoded_bytes(value: Any) -> int:
 
 
 def fingerprint(declaration: bytes) -> str:
-    """The name of a declaration: 128 bits of BLAKE2b over its payload, as 32 hexadecimal digits."""
+    """Compute the content address of a declaration: 128 bits of BLAKE2b over its payload, as 32 hexadecimal digits."""
     return hashlib.blake2b(declaration, digest_size=16).hexdigest()
 
 
 def unwritable(value: Any) -> str | None:
-    """Why JSON cannot hold this scalar as it is; None if it can."""
+    """Return the reason why JSON cannot hold this scalar unchanged; None if it can."""
     if isinstance(value, float) and not math.isfinite(value):
         return f"{value} is not a finite number"
     if isinstance(value, str):
@@ -163,16 +168,16 @@ def _first_fault(value: Any, path: str = "") -> NotEncodable | None:
     elif isinstance(value, dict):
         for key in value:
             if not isinstance(key, str):
-                return NotEncodable(path, f"has a key of type {type(key).__name__}")
-            if unwritable(key):
-                return NotEncodable(path, f"has a key of which {unwritable(key)}")
+                return NotEncodable(path, f"a key is a {type(key).__name__}, not a str")
+            if (fault_in_key := unwritable(key)) is not None:
+                return NotEncodable(path, f"in a key, {fault_in_key}")
         children = list(value.items())
     elif isinstance(value, list | tuple):
         children = [(str(index), child) for index, child in enumerate(value)]
     elif value is None or isinstance(value, str | int | float):
         return None
     else:
-        return NotEncodable(path, f"a {type(value).__name__} is not JSON")
+        return NotEncodable(path, f"JSON cannot hold a {type(value).__name__}")
     for name, child in children:
         fault = _first_fault(child, f"{path}.{name}" if path else name)
         if fault is not None:

@@ -1,8 +1,7 @@
-"""What travels from a hook to the log: a heading, then the record it becomes.
+"""An envelope carries an event from a hook to the log: first as a `Heading`, then as a `Record`.
 
-The caller of the queue gives a `Heading` and the payload's bytes. Under the queue's lock these get their position,
-sequence and both times, and are a `Record` from then on: in the queue's files, in the writer's batches and in the
-database, always the same payload bytes.
+The caller of the queue passes a `Heading` and the payload's bytes. The queue, under its lock, adds position, sequence
+and both times, which makes them a `Record`. Queue files, writer batches and database hold the same payload bytes.
 """
 
 from __future__ import annotations
@@ -14,11 +13,17 @@ from pycrorm_async.events.ids import EpisodeId
 __all__ = ["Heading", "Record", "LOST", "is_computed_end"]
 
 LOST: Final = b'{"status":"LOST"}'
-"""The payload of the end that recovery computes for an episode left open, version 1 of `EpisodeEnded` for ever."""
+"""Payload of the `EpisodeEnded` that recovery computes for an episode left open.
+
+It stays at version 1 of `EpisodeEnded`, so that recovering a folder twice gives the same bytes.
+"""
 
 
 class Heading(NamedTuple):
-    """Where an event belongs and what it is. `episode` is None for a record of the recorder itself (a declaration)."""
+    """The envelope without position, sequence and times.
+
+    `episode` is None for a recorder-level record (a declaration).
+    """
 
     episode: EpisodeId | None
     type: str
@@ -26,14 +31,14 @@ class Heading(NamedTuple):
 
 
 class Record(NamedTuple):
-    """One event, whole. A recorder-level record has no episode and sequence 0.
+    """One event with its complete envelope. A recorder-level record has no episode and sequence 0.
 
     Attributes:
-        position: 1, 2, 3 … over everything this recorder wrote.
+        position: 1, 2, 3 … over all records of one recorder.
         episode: 16 bytes of a UUIDv7, or None.
         sequence: 1, 2, 3 … inside the episode, without gaps; 0 without an episode.
-        type: name of the event's type, as in `pycrorm_async.events.types`.
-        version: of that type's shape.
+        type: name of the event type, as in `pycrorm_async.events.types`.
+        version: version of that type's shape.
         wall_ns: UTC, ns since 1970.
         monotonic_ns: ns, comparable inside one process life only.
         payload: the event as JSON, UTF-8.
@@ -50,5 +55,8 @@ class Record(NamedTuple):
 
 
 def is_computed_end(record: Record) -> bool:
-    """Whether recovery made this end up: it says how far its folder knew, and not that nothing came after."""
+    """Return whether recovery computed this end.
+
+    Such an end marks the last record kept in one folder; later events of the episode may exist elsewhere.
+    """
     return record.type == "EpisodeEnded" and record.payload == LOST

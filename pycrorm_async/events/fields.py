@@ -1,4 +1,4 @@
-"""Names of tables and columns: how a designator's name becomes a table, a field a column, and which names are taken.
+"""This module maps designator names to tables and field names to columns, and rejects names that cannot be mapped.
 
 | field | column |
 |---|---|
@@ -6,14 +6,15 @@
 | pose, object | `<field>_id`, the row's id in `pose` or `object` |
 | field of a nested dataclass | `<outer>_<inner>` |
 | list, dict | none: rows in `parameter_item` |
-| `true`, `false`, in any case | `_true`, `_false`: SQLite shows no column under these names |
+| `true`, `false`, in any case | `_true`, `_false`, because SQLite cannot name a view's column `true` or `false` |
 | a name of more than 60 bytes | its beginning, `_` and 12 hexadecimal digits of the whole name's BLAKE2b |
 
-A mapped name depends on the field's name alone, so it is the same in every process and on both databases. No field's
-name begins with an underscore, so `_true` is no other field's column. Mapped classes offer each field under its own
-name, whatever its column is called.
+A mapped name depends on the field's name alone, so it is the same in every process and on both databases. Field names
+never begin with an underscore, so `_true` cannot collide with another field's column. A mapped class exposes each field
+under the field's own name, even if the column has another.
 
-The first pose field is also offered as `pose`, the first object field as `object`, so these names are kept for them.
+A mapped class also exposes the first pose field as `pose` and the first object field as `object`, so these names are
+reserved for them.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ RESERVED_COLUMNS = frozenset(
     "id dtype kind process_metadata process_metadata_id robot_state robot_state_id parameters items node node_id"
     " metadata registry awaitable_attrs".split()
 )
-"""Every designator has these already."""
+"""Column and attribute names that every designator's table or mapped class already has."""
 
 _RESERVED_TABLES = frozenset(
     "event episode process_metadata task_tree_node designator action motion language robot_state pose position"
@@ -52,26 +53,26 @@ _RESERVED_TABLES = frozenset(
     " location_resolution location_candidate detection state_sample simulated_episode designator_type"
     " pick_up_with_context_view pickupwithcontextview".split()
 )
-"""Tables and views of the memory itself, the planned ones too."""
+"""The memory's own tables and views, including planned ones."""
 _RESERVED_BEGINNINGS = ("pycrorm_", "sqlite_", "pg_")
 _OF_A_GENERATION = re.compile(r"__[0-9]+$")
 
 _NAME_LENGTH_MAX = 60
-"""Bytes of a table's or column's name as people see it. PostgreSQL keeps 63 bytes of a name."""
+"""Bounds the bytes of a table's or column's public name, because PostgreSQL truncates names to 63 bytes."""
 _MAPPED_TABLE_LENGTH_MAX = 48
-"""Bytes of a table's name that had to be shortened: there is room for the number of any generation behind it."""
+"""Bounds the bytes of a shortened table name, to leave room for the generation number behind it."""
 _DTYPE_LENGTH_MAX = 255
-"""Bytes of a dtype: longer than any class is called, and short enough for every message that names it."""
+"""Bounds the bytes of a dtype: longer than real class names, and short enough to quote in a message."""
 _BASES_MAX = 32
-"""Recorded types that a type may descend from. A mapped class joins the views of all of them, and SQLite joins 64."""
+"""Bounds the recorded ancestors of a type: a mapped class joins all their views, and SQLite joins at most 64."""
 _KINDS = ("action", "motion", "language")
-_SHOWN_BY_NO_VIEW = ("true", "false")
-"""SQLite takes a column of these names for the truth value, and calls it `column1` in a view."""
+_SQL_TRUTH_VALUES = ("true", "false")
+"""SQLite reads a column of such a name as the truth value, and names it `column1` in a view."""
 _WORD_START = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 
 def table_name(dtype: str) -> str:
-    """The leaf table of a type.
+    """Return the name of a type's leaf table.
 
     >>> table_name("SayingAction"), table_name("MoveTCPMotion")
     ('saying_action', 'move_tcp_motion')
@@ -80,7 +81,7 @@ def table_name(dtype: str) -> str:
 
 
 def column_name(field: str, kind: FieldType) -> str:
-    """The column of a field.
+    """Return the column name of a field of the given type.
 
     >>> column_name("target", "pose"), column_name("xmin", "real"), column_name("true", "boolean")
     ('target_id', 'xmin', '_true')
@@ -89,13 +90,13 @@ def column_name(field: str, kind: FieldType) -> str:
 
 
 def _mapped_column(name: str) -> str:
-    if name.lower() in _SHOWN_BY_NO_VIEW:
+    if name.lower() in _SQL_TRUTH_VALUES:
         return f"_{name}"
     return bounded(name, _NAME_LENGTH_MAX)
 
 
 def bounded(name: str, bytes_max: int, shortened_bytes_max: int | None = None) -> str:
-    """The name itself, or its beginning and a hash of all of it if it takes more than so many bytes.
+    """Return the name, or its beginning and a hash of the whole name if it takes more than `bytes_max` bytes.
 
     >>> bounded("pose__7_by_time", 63), bounded("a" * 80, 20)
     ('pose__7_by_time', 'aaaaaaa_01285d4c77f1')
@@ -109,7 +110,7 @@ def bounded(name: str, bytes_max: int, shortened_bytes_max: int | None = None) -
 
 
 def mapped_declaration(declared: DesignatorTypeDeclared) -> DesignatorTypeDeclared:
-    """The declaration with columns that every database takes, also if an earlier version named them otherwise."""
+    """Rename the declaration's columns to names every database accepts; earlier versions declared others."""
     if all(each.column == _mapped_column(each.column) for each in declared.fields):
         return declared
     fields = tuple(msgspec.structs.replace(each, column=_mapped_column(each.column)) for each in declared.fields)
@@ -117,7 +118,7 @@ def mapped_declaration(declared: DesignatorTypeDeclared) -> DesignatorTypeDeclar
 
 
 def is_reserved(name: str) -> bool:
-    """Whether a table or view of this name is the memory's own, or the database's.
+    """Return whether the memory or the database itself uses this name for a table or view.
 
     >>> is_reserved("Pose"), is_reserved("pose__1"), is_reserved("saying_action")
     (True, True, False)
@@ -131,14 +132,14 @@ def is_reserved(name: str) -> bool:
 
 
 def fault_in_declaration(declared: DesignatorTypeDeclared) -> str | None:
-    """Why this type cannot have a table, a view and a mapped class; None if it can. Names the field.
+    """Return the reason, naming the field, why this type cannot have a table, a view and a mapped class; else None.
 
-    A class is checked with it before it is recorded for the first time, and every declaration that is read from a log.
+    The hooks check each class before recording it for the first time; readers check each declaration in a log.
     """
     if declared.kind not in _KINDS:
-        return f"its kind {declared.kind!r} is none of a designator ({', '.join(_KINDS)})"
+        return f"its kind {declared.kind!r} is not a kind of designator ({', '.join(_KINDS)})"
     if len(declared.bases) > _BASES_MAX:
-        return f"it descends from {len(declared.bases)} recorded types, {_BASES_MAX} are the most"
+        return f"it descends from {len(declared.bases)} recorded types, at most {_BASES_MAX} are allowed"
     for name in (declared.dtype, *declared.bases, *declared.aliases):
         fault = fault_in_dtype(name)
         if fault is not None:
@@ -149,16 +150,22 @@ def fault_in_declaration(declared: DesignatorTypeDeclared) -> str | None:
     slots: dict[int, str] = {}
     for field in declared.fields:
         if not field.name.isidentifier() or field.name.startswith("_"):
-            return f"field {field.name!r} is not a name that a field can have"
-        if field.column.lower() != column_name(field.name, field.type).lower():
-            return f"field {field.name!r} has the column {field.column!r}, and must have its own"
+            return f"field {field.name!r} is not a valid field name"
+        if field.column.lower() != (column := column_name(field.name, field.type)).lower():
+            return f"field {field.name!r} has the column {field.column!r}, must be {column!r}"
         if not SLOT_FIRST_FIELD <= field.slot <= SLOT_MAX or slots.setdefault(field.slot, field.name) != field.name:
-            return f"field {field.name!r} has the slot {field.slot}, and must have one of its own"
+            return (
+                f"field {field.name!r} has the slot {field.slot}, must have one from {SLOT_FIRST_FIELD} to {SLOT_MAX}"
+                " that no other field has"
+            )
     return None
 
 
 def fault_in_dtype(dtype: str) -> str | None:
-    """The name must work as one of a class and of a table; two underscores are kept for tables of a generation."""
+    """Return the reason why a dtype cannot name a class and a table; None if it can.
+
+    Two underscores are reserved: they separate the generation number in the names of generation tables.
+    """
     if not dtype.isidentifier() or "__" in dtype:
         return f"its dtype {dtype!r} is not a name (letters, digits and single underscores)"
     if len(dtype.encode()) > _DTYPE_LENGTH_MAX:
@@ -167,7 +174,7 @@ def fault_in_dtype(dtype: str) -> str | None:
 
 
 def fault_in_table(table: str) -> str | None:
-    """Why a designator's table cannot have this name; None if it can."""
+    """Return the reason why a designator's table cannot have this name; None if it can."""
     if is_reserved(table):
         return f"its table would be {table!r}, which the memory itself uses (set another dtype)"
     if not table.isprintable() or not table.strip() or '"' in table:
@@ -178,10 +185,10 @@ def fault_in_table(table: str) -> str | None:
 
 
 def fault_in_fields(fields: Sequence[FieldDeclared]) -> str | None:
-    """Why these fields cannot be columns of one table; None if they can. Names the field."""
+    """Return the reason, naming the field, why these fields cannot be columns of one table; None if they can."""
     if len(fields) > SLOT_MAX - SLOT_FIRST_FIELD + 1:
-        return f"it has {len(fields)} fields, {SLOT_MAX - SLOT_FIRST_FIELD + 1} are the most"
-    taken: dict[str, str] = {}
+        return f"it has {len(fields)} fields, at most {SLOT_MAX - SLOT_FIRST_FIELD + 1} are allowed"
+    fields_by_name: dict[str, str] = {}
     for field in fields:
         names = {field.name.lower(), field.column.lower()}
         reserved = names & RESERVED_COLUMNS
@@ -190,16 +197,16 @@ def fault_in_fields(fields: Sequence[FieldDeclared]) -> str | None:
         if len(field.column.encode()) > _NAME_LENGTH_MAX:
             return f"field {field.name!r} has a name longer than {_NAME_LENGTH_MAX} bytes"
         for name in names:
-            if name in taken:
-                return f"fields {taken[name]!r} and {field.name!r} would share the name {name!r}"
-        taken |= dict.fromkeys(names, field.name)
+            if name in fields_by_name:
+                return f"fields {fields_by_name[name]!r} and {field.name!r} would share the name {name!r}"
+        fields_by_name |= dict.fromkeys(names, field.name)
     for kind in ("pose", "object"):
         first = next((field.name for field in fields if field.type == kind), None)
-        wrong = _keepers(fields, kind) - {first}
-        if wrong:
-            return f"field {wrong.pop()!r}: the name {kind!r} is kept for the first {kind} field"
+        misnamed = _fields_named(fields, kind) - {first}
+        if misnamed:
+            return f"field {misnamed.pop()!r}: the name {kind!r} is reserved for the first {kind} field"
     return None
 
 
-def _keepers(fields: Iterable[FieldDeclared], kind: str) -> set[str]:
+def _fields_named(fields: Iterable[FieldDeclared], kind: str) -> set[str]:
     return {field.name for field in fields if {field.name.lower(), field.column.lower()} & {kind, f"{kind}_id"}}

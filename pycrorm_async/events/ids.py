@@ -1,11 +1,11 @@
-"""Numbers that name things: episodes, events, rows.
+"""Ids identify episodes, events and rows.
 
-An episode is named by a UUIDv7, an event by (episode, sequence), a row by (episode number, sequence, slot) packed into
-53 bits, so that data frames (float64 where a column is nullable) and JSON hold every row id exactly:
+A UUIDv7 identifies an episode, (episode, sequence) an event, and (episode number, sequence, slot) a row. A row id packs
+these three into 53 bits, so that data frames (float64 where a column is nullable) and JSON hold it exactly:
 
     episode number 22 bits | sequence 26 bits | slot 5 bits
 
-The episode *number* is given by a database at first append and belongs to that database alone.
+A database assigns the episode *number* at the first append; it is valid in that database only.
 """
 
 from __future__ import annotations
@@ -41,19 +41,25 @@ Sequence = NewType("Sequence", int)
 Position = NewType("Position", int)
 """1, 2, 3 … inside a recorder, over all its episodes."""
 RowId = NewType("RowId", int)
+"""Episode number, sequence and slot in one integer of 53 bits (see `row_id`)."""
 
 EPISODE_NUMBER_MAX = 2**22 - 1
+"""Bounds the episodes of one database: the 22 bits of a row id that hold the episode number."""
 SEQUENCE_MAX = 2**26 - 1
+"""Bounds the events of one episode: the 26 bits of a row id that hold the sequence."""
 SLOT_MAX = 2**5 - 1
+"""Bounds the rows of one event: the 5 bits of a row id that hold the slot."""
 
 SLOT_NODE = 0
-"""The row of the event itself: a node and its designator, an object as it was, an attachment."""
+"""Slot of the event's own row: a node and its designator, an object's state, an attachment."""
 SLOT_ROBOT_POSE = 1
+"""Slot of the robot's pose at the start of a node."""
 SLOT_FIRST_FIELD = 2
+"""Slot of a designator's first declared field; the further fields follow in the order of declaration."""
 
 
 class RowKey(NamedTuple):
-    """What a row id is made of; with the episode's UUID in place of its number it compares across databases."""
+    """The three parts of a row id. To compare rows across databases, replace the number by the episode's UUID."""
 
     number: EpisodeNumber
     sequence: Sequence
@@ -61,7 +67,7 @@ class RowKey(NamedTuple):
 
 
 def row_id(number: int, sequence: int, slot: int) -> RowId:
-    """The id of the row that (episode number, sequence, slot) makes.
+    """Pack (episode number, sequence, slot) into a row id.
 
     >>> row_id(1, 2, 3)
     2147483715
@@ -73,12 +79,15 @@ def row_id(number: int, sequence: int, slot: int) -> RowId:
 
 
 def row_key(row: int) -> RowKey:
-    """The opposite of `row_id`."""
+    """Unpack a row id; the inverse of `row_id`."""
     return RowKey(EpisodeNumber(row >> 31), Sequence(row >> 5 & SEQUENCE_MAX), row & SLOT_MAX)
 
 
 def episode_id(wall_ns: int, randomness: bytes) -> EpisodeId:
-    """A UUIDv7 (RFC 9562) of that moment: 48 bits of milliseconds, then 10 bytes of randomness less six bits."""
+    """Build a UUIDv7 (RFC 9562) from a wall time in ns and 10 random bytes.
+
+    The first 48 bits are the milliseconds since 1970; six of the random bits make room for version and variant.
+    """
     assert len(randomness) == 10, len(randomness)
     value = (wall_ns // 1_000_000 & 2**48 - 1) << 80 | int.from_bytes(randomness)
     value = value & ~(0xF << 76) | 0x7 << 76
@@ -87,10 +96,10 @@ def episode_id(wall_ns: int, randomness: bytes) -> EpisodeId:
 
 
 def episode_text(episode: EpisodeId) -> str:
-    """The id as people read it: 8-4-4-4-12 hexadecimal digits."""
+    """Format an episode id as 8-4-4-4-12 hexadecimal digits."""
     return str(uuid.UUID(bytes=episode))
 
 
 def parse_episode_id(text: str) -> EpisodeId:
-    """The opposite of `episode_text`; a `ValueError` says what is no UUID."""
+    """Parse the text of an episode id; the inverse of `episode_text`. Raises `ValueError` if it is not a UUID."""
     return EpisodeId(uuid.UUID(text).bytes)

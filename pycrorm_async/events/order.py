@@ -1,19 +1,19 @@
-"""The legal order of an episode's events, as one table; and what breaks it.
+"""This module defines the legal order of an episode's events as one table, and checks episodes against it.
 
 | event | legal when | afterwards |
 |---|---|---|
-| EpisodeStarted | nothing was before | the episode is open |
-| NodeStarted | open; its parent started (the root has none, and is the only one without) | the node is open |
-| NodeEnded | open; the node is open | the node is ended |
-| ObjectAdded | open | the object is there |
+| EpisodeStarted | it is the first event | the episode is open |
+| NodeStarted | open; its parent started (the root alone has no parent) | the node is open |
+| NodeEnded | open; the node is open | the node has ended |
+| ObjectAdded | open | the object exists |
 | ObjectMoved, ObjectRemoved, ObjectAttached, ObjectDetached, JointsMoved | open; the objects they name were added | |
 | LocationResolved, ObjectDetected | open; the node it names, if any, started | |
-| StateSampled | open; the object and the node it names are known | |
-| EpisodeEnded | open | the episode is closed: nothing follows |
+| StateSampled | open; the object it names was added; the node it names, if any, started | |
+| EpisodeEnded | open | the episode is closed: no event follows |
 
-A structural break (a gap, an end without a start, an unknown parent) is *damage*; an order that is unusual but happens
-in honest plans (a child that ends after its cancelled parent, a child started by an ended node, nodes open at the end)
-is a *remark*. The hooks never enforce this: they write down what happened.
+A structural break (a gap, an end without a start, an unknown parent) is *damage*. An unusual order that correct plans
+do produce (a child that ends after its cancelled parent, a child started by an ended node, nodes open at the end) is a
+*remark*. The hooks never enforce this order: they record each event as it happens.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _NODE, _OBJECT = 1, 2
 
 
 class Finding(NamedTuple):
-    """What is wrong or unusual at one event."""
+    """A break of the legal order at one event: damage, or a remark."""
 
     kind: Literal["damage", "remark"]
     sequence: int
@@ -52,7 +52,9 @@ class Finding(NamedTuple):
 
 
 class OrderCheck:
-    """Reads one episode's events in order and finds what breaks the table above.
+    """Checks the events of one episode, read one by one, against the legal order in the module docstring.
+
+    It keeps one byte for each event, so a long episode takes no more memory than that.
 
     >>> check = OrderCheck()
     >>> check.read(2, NodeEnded(1, "SUCCEEDED"))[0].text
@@ -63,28 +65,28 @@ class OrderCheck:
         self._last = 0
         self._state: Literal["before", "open", "closed"] = "before"
         self._parents: dict[int, int | None] = {}
-        """Of the nodes that are open."""
+        """The parent of each open node."""
         self._any_node = False
-        self._made = bytearray()
-        """What each event made: a byte, so that a long episode takes no more memory than that."""
+        self._kinds = bytearray()
+        """For each sequence, one byte: `_NODE` or `_OBJECT` if that event created one, else 0."""
 
     def read(self, sequence: int, event: Happening) -> list[Finding]:
-        """The next event; what is found at it."""
-        found: list[Finding] = []
+        """Read the next event and return its findings, damage before remarks; empty if the event is in order."""
+        findings: list[Finding] = []
         if sequence != self._last + 1:
-            found.append(Finding("damage", sequence, _gap(self._last, sequence)))
+            findings.append(Finding("damage", sequence, _gap(self._last, sequence)))
         self._last = sequence
         if isinstance(event, EpisodeStarted):
             if self._state != "before":
-                found.append(Finding("damage", sequence, "the episode starts a second time"))
+                findings.append(Finding("damage", sequence, "the episode starts a second time"))
             self._state = "open"
-            return found
+            return findings
         if self._state == "before":
-            found.append(Finding("damage", sequence, "the episode has not started"))
+            findings.append(Finding("damage", sequence, "the episode has not started"))
         elif self._state == "closed":
-            found.append(Finding("damage", sequence, "the episode has ended already"))
-        found += [Finding(kind, sequence, text) for kind, text in self._faults(sequence, event)]
-        return found
+            findings.append(Finding("damage", sequence, "the episode has ended already"))
+        findings += [Finding(kind, sequence, text) for kind, text in self._faults(sequence, event)]
+        return findings
 
     def _faults(self, sequence: int, event: Happening) -> list[tuple[Literal["damage", "remark"], str]]:
         match event:
@@ -97,7 +99,7 @@ class OrderCheck:
                 if self._parents and event.status != "LOST":
                     return [("remark", f"{len(self._parents)} nodes are open at the end")]
             case ObjectAdded():
-                self._make(sequence, _OBJECT)
+                self._set_kind(sequence, _OBJECT)
             case ObjectMoved():
                 return self._unknown_objects(event.object)
             case ObjectRemoved() | JointsMoved():
@@ -111,17 +113,17 @@ class OrderCheck:
         return []
 
     def _start(self, sequence: int, event: NodeStarted) -> list[tuple[Literal["damage", "remark"], str]]:
-        known = event.parent is None or self._is(event.parent, _NODE)
-        alone = event.parent is not None or not self._any_node
-        running = event.parent is None or event.parent in self._parents
+        parent_started = event.parent is None or self._is(event.parent, _NODE)
+        is_second_root = event.parent is None and self._any_node
+        parent_open = event.parent is None or event.parent in self._parents
         self._parents[sequence] = event.parent
         self._any_node = True
-        self._make(sequence, _NODE)
-        if not known:
+        self._set_kind(sequence, _NODE)
+        if not parent_started:
             return [("damage", f"its parent {event.parent} never started")]
-        if not alone:
+        if is_second_root:
             return [("damage", "a second node without a parent")]
-        return [] if running else [("remark", f"its parent {event.parent} had ended")]
+        return [] if parent_open else [("remark", f"its parent {event.parent} had ended")]
 
     def _end(self, event: NodeEnded) -> list[tuple[Literal["damage", "remark"], str]]:
         if not self._is(event.node, _NODE):
@@ -134,22 +136,22 @@ class OrderCheck:
         return []
 
     def _unknown_node(self, node: int | None) -> list[tuple[Literal["damage", "remark"], str]]:
-        known = node is None or self._is(node, _NODE)
-        return [] if known else [("damage", f"node {node} never started")]
+        started = node is None or self._is(node, _NODE)
+        return [] if started else [("damage", f"node {node} never started")]
 
     def _unknown_objects(self, *objects: int) -> list[tuple[Literal["damage", "remark"], str]]:
         return [("damage", f"object {each} was never added") for each in objects if not self._is(each, _OBJECT)]
 
-    def _make(self, sequence: int, what: int) -> None:
-        self._made.extend(bytes(max(sequence + 1 - len(self._made), 0)))
-        self._made[sequence] = what
+    def _set_kind(self, sequence: int, kind: int) -> None:
+        self._kinds.extend(bytes(max(sequence + 1 - len(self._kinds), 0)))
+        self._kinds[sequence] = kind
 
-    def _is(self, sequence: int, what: int) -> bool:
-        return 0 < sequence < len(self._made) and self._made[sequence] == what
+    def _is(self, sequence: int, kind: int) -> bool:
+        return 0 < sequence < len(self._kinds) and self._kinds[sequence] == kind
 
 
 def _gap(last: int, sequence: int) -> str:
     if sequence <= last:
-        return f"event {sequence} stands after event {last}"
+        return f"event {sequence} follows event {last}"
     missing = f"event {last + 1} is" if sequence == last + 2 else f"events {last + 1} to {sequence - 1} are"
     return f"{missing} missing"

@@ -1,8 +1,8 @@
-"""What can happen, as frozen values: the payloads of the log.
+"""Event types are frozen values, the payloads of the log.
 
-Each class is one event type; its name is the type's name in the log and its `version` counts its shapes. Fields that
-are null or empty are left out of the JSON. World objects are named by the sequence of their `ObjectAdded`; nodes by the
-sequence of their `NodeStarted`; times come from the envelope.
+Each `Happening` class is one event type: its name is the type's name in the log and its `version` counts its shapes.
+The JSON omits fields that are null or empty. The sequence of its `ObjectAdded` identifies a world object, the sequence
+of its `NodeStarted` a node. The envelope holds the times.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ ItemType: TypeAlias = Literal["integer", "real", "text", "boolean", "datetime", 
 
 
 class _Value(msgspec.Struct, frozen=True, omit_defaults=True):
-    """A part of a payload."""
+    """The base of all parts of a payload."""
 
 
 class PoseValue(_Value, frozen=True):
-    """A pose as it was: metres, unit quaternion xyzw, frame name, moment it was made (UTC, ns)."""
+    """A copy of a pose: metres, unit quaternion xyzw, frame name, and the time it was created (UTC, ns)."""
 
     position: tuple[float, float, float]
     orientation: tuple[float, float, float, float]
@@ -69,17 +69,19 @@ class PoseValue(_Value, frozen=True):
 
 
 class ObjectReference(_Value, frozen=True):
-    """A world object at a moment: `object` is the sequence of its ObjectAdded, `row` that of the ObjectAdded or
-    ObjectMoved in force."""
+    """A world object at one moment.
+
+    `object` is the sequence of its ObjectAdded; `row` is the sequence of its latest ObjectAdded or ObjectMoved.
+    """
 
     object: int
     row: int
 
 
 class ObjectValue(_Value, frozen=True):
-    """An object that has no row of its own yet: a part of one, a believed one, one outside the recorded world.
+    """An object without a row of its own: a part of an object, a believed object, or one outside the recorded world.
 
-    `part_of` is the whole of an ObjectPart, and what the place of a LocatedObject is told relative to.
+    `part_of` is the object that an ObjectPart belongs to, or the reference object of a LocatedObject's place.
     """
 
     dtype: Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
@@ -99,7 +101,7 @@ class RobotValue(_Value, frozen=True):
 
 
 class FailureValue(_Value, frozen=True):
-    """Why something failed: qualified class, message, constructor arguments as JSON where they can be recorded."""
+    """The exception behind a failure: qualified class, message, and those arguments that JSON can hold."""
 
     type: str
     message: str
@@ -107,16 +109,16 @@ class FailureValue(_Value, frozen=True):
 
 
 class MissingValue(_Value, frozen=True):
-    """Stands where a value could not be recorded: the reason, and a cut, cleaned repr."""
+    """The substitute for a value that could not be recorded: the reason, and a shortened repr of the value."""
 
     missing: str
     repr: str = ""
 
 
 class CandidateValue(_Value, frozen=True):
-    """A pose that a location designator offered, with the arms that reach from there (names).
+    """A pose that a location designator offered, with the names of the arms that reach the target from there.
 
-    A place that comes from experience also says with which grasp and torso height (m) it went well.
+    A place taken from experience also holds the grasp and the torso height (m) that succeeded there.
     """
 
     pose: PoseValue
@@ -126,7 +128,7 @@ class CandidateValue(_Value, frozen=True):
 
 
 class SeenValue(_Value, frozen=True):
-    """An object that was perceived: as it was, and the share of it that was seen, 0 to 1 (None: not looked at)."""
+    """A perceived object and its visible share, 0 to 1 (None: not measured)."""
 
     name: str
     object_type: str
@@ -136,7 +138,7 @@ class SeenValue(_Value, frozen=True):
 
 
 class NodeReference(_Value, frozen=True):
-    """A node of another episode: the episode's UUID as text, the sequence of its NodeStarted."""
+    """A node of another episode: the episode's UUID as text, and the sequence of the node's NodeStarted."""
 
     episode: str
     node: int
@@ -146,12 +148,12 @@ class FieldDeclared(_Value, frozen=True):
     """One field of a designator type.
 
     Attributes:
-        name: its key in `NodeStarted.parameters`; a nested dataclass' field is `outer_inner`.
-        column: its column in the leaf table (`<name>_id` for poses and objects; unused for list and dict).
+        name: key in `NodeStarted.parameters`; the field of a nested dataclass is `outer_inner`.
+        column: column in the leaf table (`<name>_id` for poses and objects; unused for list and dict).
         type: see `FieldType`.
-        slot: 2 to 31, the same for the life of the declaration.
+        slot: 2 to 31, constant within one declaration.
         optional: whether null is a legal value.
-        enum: for an enum, the qualified name of its class (for people; members are stored by name).
+        enum: for an enum, the qualified name of its class (documentation only; members are stored by name).
         item: for list and dict, the type of the values.
     """
 
@@ -165,20 +167,21 @@ class FieldDeclared(_Value, frozen=True):
 
 
 class Happening(_Value, frozen=True):
-    """The root of all events."""
+    """The base class of all events."""
 
     version: ClassVar[int] = 1
 
 
 class EpisodeStarted(Happening, frozen=True):
-    """The first event of an episode: who, why, with what.
+    """The first event of an episode: its description, user, host and versions.
 
     Attributes:
-        plan, seed: its name, that of its random numbers.
-        world: described in a line.
-        simulated: it is thought through in a copy of the world, and nothing of it happens.
-        thought_by: the node that thinks it through.
-        continues: UUID of the episode that reached its last sequence, and of which this one is the rest.
+        plan: name of the plan.
+        seed: seed of the plan's random numbers.
+        world: description of the world in one line.
+        simulated: whether the episode is a simulation, performed in a copy of the world.
+        thought_by: the node that runs the simulation.
+        continues: UUID of the episode that ran out of sequences and that this one continues.
     """
 
     description: str
@@ -195,9 +198,9 @@ class EpisodeStarted(Happening, frozen=True):
 
 
 class EpisodeEnded(Happening, frozen=True):
-    """The last event of an episode. Status LOST is written by recovery, never by a plan.
+    """The last event of an episode. Only recovery writes the status LOST.
 
-    `continued_in` is the UUID of the episode that is its rest, if it reached its last sequence.
+    `continued_in` is the UUID of the episode that continues this one, if this one ran out of sequences.
     """
 
     status: EpisodeStatus
@@ -206,16 +209,16 @@ class EpisodeEnded(Happening, frozen=True):
 
 
 class DesignatorTypeDeclared(Happening, frozen=True):
-    """A designator type as it was declared in one process; named by the hash of its bytes (`fingerprint`).
+    """The declaration of a designator type by one process; the hash of its bytes identifies it (`fingerprint`).
 
     Attributes:
         kind: action, motion or language.
         dtype: the type's name in the memory, `SayingAction` for `SayingActionPerformable`.
-        table: its leaf table, `saying_action`.
-        concept: the SOMA concept, where one is known.
-        bases: dtypes of the recorded classes it descends from, nearest first.
-        fields: in the order of declaration.
-        aliases: dtypes it had before it was renamed.
+        table: name of its leaf table, `saying_action`.
+        concept: the SOMA concept, for types that have one.
+        bases: dtypes of its recorded base classes, nearest first.
+        fields: its fields in the order of declaration.
+        aliases: dtypes the type had before it was renamed.
     """
 
     kind: NodeKind
@@ -228,9 +231,10 @@ class DesignatorTypeDeclared(Happening, frozen=True):
 
 
 class ObjectAdded(Happening, frozen=True):
-    """An object is in the world. Its sequence is the object's identity in this episode. `joints` in rad or m.
+    """An object entered the world. The event's sequence identifies the object in this episode.
 
-    `node` put it there; None for what was there before, or came by no node.
+    `joints` are in rad or m. `node` is the node that added the object; None if no node did, or if the object was in the
+    world before the episode.
     """
 
     name: str
@@ -248,7 +252,7 @@ class ObjectRemoved(Happening, frozen=True):
 
 
 class ObjectMoved(Happening, frozen=True):
-    """An object has a new pose, once per motion; also for every attached object that the motion carried."""
+    """An object has a new pose. Recorded once per motion, and for every attached object that the motion carried."""
 
     object: int
     name: str
@@ -276,7 +280,7 @@ class ObjectDetached(Happening, frozen=True):
 
 
 class JointsMoved(Happening, frozen=True):
-    """Joints of an object have new positions (rad or m), all those that one motion set."""
+    """Joints of an object have new positions (rad or m). One event holds all joints that one motion set."""
 
     object: ObjectReference
     joints: dict[str, float]
@@ -284,7 +288,7 @@ class JointsMoved(Happening, frozen=True):
 
 
 class NodeStarted(Happening, frozen=True):
-    """A node of the task tree begins. Its sequence is the node's id in this episode.
+    """A node of the task tree started. The event's sequence is the node's id in this episode.
 
     Attributes:
         kind: root, action, motion, language.
@@ -293,10 +297,10 @@ class NodeStarted(Happening, frozen=True):
             declared.
         parameters: by `FieldDeclared.name`: scalars; enum members by name; datetimes as RFC 3339 in UTC with µs;
             poses as `PoseValue`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of these; a
-            `MissingValue` for what cannot be recorded, also for fields that the declaration leaves out.
-        robot: at this moment; None without a robot.
-        simulated: thought through in a copy of the world; so are all nodes of its episode.
-        continues: in an episode that continues another, the sequence there of the node of which this one is the rest.
+            `MissingValue` for a value that cannot be recorded and for a field that the declaration omits.
+        robot: the robot's state at this moment; None without a robot.
+        simulated: whether the node is part of a simulation; the same for all nodes of an episode.
+        continues: in a follow-up episode, the sequence that the continued node had in the former episode.
     """
 
     kind: NodeKind
@@ -309,7 +313,7 @@ class NodeStarted(Happening, frozen=True):
 
 
 class NodeEnded(Happening, frozen=True):
-    """A node of the task tree is over. `result` is JSON, or a `MissingValue`."""
+    """A node of the task tree ended. `result` is JSON, or a `MissingValue`."""
 
     node: int
     status: NodeStatus
@@ -318,14 +322,14 @@ class NodeEnded(Happening, frozen=True):
 
 
 class LocationResolved(Happening, frozen=True):
-    """A location designator was asked for a place.
+    """A location designator was resolved.
 
     Attributes:
-        location: its class, e.g. `CostmapLocation`.
-        offered: the candidates it gave, in order.
-        taken: index into `offered` of the one the plan went on with; None if it found none good.
-        considered: how many places it looked at to find them.
-        node: the node that asked.
+        location: class of the location designator, e.g. `CostmapLocation`.
+        offered: the candidates it offered, in order.
+        taken: index into `offered` of the candidate that the plan used; None if it used none.
+        considered: number of places the designator examined to find them.
+        node: the node that resolved it.
     """
 
     location: str
@@ -336,13 +340,13 @@ class LocationResolved(Happening, frozen=True):
 
 
 class ObjectDetected(Happening, frozen=True):
-    """Perception answered.
+    """Perception returned a result.
 
     Attributes:
         source: the head camera, or the state of the world itself.
-        object_type: what was looked for; None: anything.
-        seen: what was found, best seen first; empty if nothing.
-        node: the node that looked.
+        object_type: type of the objects searched for; None: any type.
+        seen: the perceived objects, most visible first.
+        node: the node that asked perception.
     """
 
     source: Literal["camera", "world_state"]
@@ -352,12 +356,12 @@ class ObjectDetected(Happening, frozen=True):
 
 
 class StateSampled(Happening, frozen=True):
-    """How the robot was at a moment of a motion: those channels that changed since its last sample.
+    """A sample of the robot's state during a motion: the channels that changed since its previous sample.
 
     Attributes:
         object: the robot.
         channels: `base.x`, `base.y`, `base.z` (m), `base.qx`, `base.qy`, `base.qz`, `base.qw`; joints by name (rad, m).
-        node: the motion.
+        node: the motion's node.
     """
 
     object: ObjectReference
@@ -384,4 +388,4 @@ EVENT_TYPES: dict[str, type[Happening]] = {
         StateSampled,
     )
 }
-"""The catalogue of event types by name: what a log of this version may hold."""
+"""The event types by name; a log of this version holds no others."""

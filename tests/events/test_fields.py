@@ -41,16 +41,16 @@ def test_two_fields_that_share_a_column_are_refused_with_both_names() -> None:
 def test_the_names_pose_and_object_are_kept_for_the_first_of_their_type() -> None:
     assert fault_in_fields([declared("pose", "pose"), declared("other", "pose")]) is None
     assert fault_in_fields([declared("other", "pose"), declared("pose", "pose")]) == (
-        "field 'pose': the name 'pose' is kept for the first pose field"
+        "field 'pose': the name 'pose' is reserved for the first pose field"
     )
     assert fault_in_fields([declared("object", "text")]) == (
-        "field 'object': the name 'object' is kept for the first object field"
+        "field 'object': the name 'object' is reserved for the first object field"
     )
 
 
 def test_more_fields_than_slots_are_refused() -> None:
     assert fault_in_fields([declared(f"f{n}") for n in range(30)]) is None
-    assert fault_in_fields([declared(f"f{n}") for n in range(31)]) == "it has 31 fields, 30 are the most"
+    assert fault_in_fields([declared(f"f{n}") for n in range(31)]) == "it has 31 fields, at most 30 are allowed"
 
 
 @pytest.mark.parametrize("table", ["action", "pose", "event", "pycrorm_log", "sqlite_master", "Object", "pose__1"])

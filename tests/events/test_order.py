@@ -47,7 +47,7 @@ def test_an_ordinary_episode_has_no_findings() -> None:
     [
         (((1, START), (3, DONE)), (3, "event 2 is missing")),
         (((1, START), (5, DONE)), (5, "events 2 to 4 are missing")),
-        (((1, START), (1, DONE)), (1, "event 1 stands after event 1")),
+        (((1, START), (1, DONE)), (1, "event 1 follows event 1")),
         (((1, DONE),), (1, "the episode has not started")),
         (((1, START), (2, START)), (2, "the episode starts a second time")),
         (((1, START), (2, DONE), (3, DONE)), (3, "the episode has ended already")),
