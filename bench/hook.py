@@ -42,7 +42,7 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import FlushTimeout
 from pycrorm_async.settings import Writer
 from pycrorm_async.world import BulletWorld
-from tests.crash.walking import say
+from tests.crash.step_robot import say
 from tests.databases import Server, server_in
 
 _LATE_S = 0.02

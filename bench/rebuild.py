@@ -40,7 +40,7 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import server_in
-from tests.projections.remade import TYPES, picking
+from tests.projections.rebuild_cases import TYPES, picking
 
 _NODES = 124
 """So that an episode has 253 events; those of a plan that ends well have some hundred."""

@@ -19,8 +19,8 @@ from sqlalchemy import func, select
 from pycrorm_async import Memory, Reading
 from pycrorm_async.orm import Action, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.settings import Settings
-from tests.crash.forked import Forked
-from tests.memory.notes import NoteActionPerformable
+from tests.crash.forked_processes import Forked
+from tests.memory.note_actions import NoteActionPerformable
 
 __all__ = ["Company"]
 

@@ -31,11 +31,11 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str
 
 
 _LONG = """
-test_verify test_verify_damage test_own test_cancelled test_rebuild_kill test_copy test_types_without_a_class
-test_contradictions test_thoughts
+test_verify test_verify_damage test_custom_projections test_cancelled test_rebuild_kill test_copy test_dynamic_classes
+test_contradictions test_session_views
 """.split()
 """Modules whose tests take long on a server; there they run on demand, and the others show that it answers alike."""
-_LONGER = "test_bad_server test_bad_spool test_refused_killed cli/test_own".split()
+_LONGER = "test_bad_server test_bad_spool test_dead_letters_killed cli/test_custom_projections".split()
 """Modules that walk through many processes, each started anew: all of them run on demand."""
 
 

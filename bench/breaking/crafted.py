@@ -17,8 +17,8 @@ from pycrorm_async.queue import Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from pycrorm_async.queue.maintenance.repair import repair_folder
 from tests.databases import ask
-from tests.queue.crafting import change_a_frame, change_the_header
-from tests.queue.writing import Author, ended, episode, node, started
+from tests.queue.factories import Author, ended, episode, node, started
+from tests.queue.forged_segments import change_a_frame, change_the_header
 
 __all__ = ["crafted_folders"]
 

@@ -27,8 +27,8 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask
 from tests.proxy import Proxy, proxy_before
-from tests.store.making import episode, run_of
-from tests.writer.ends import CountingFold, KeptSource
+from tests.store.factories import episode, run_of
+from tests.writer.fakes import CountingFold, KeptSource
 
 __all__ = [
     "lost_replies",

@@ -30,7 +30,7 @@ from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask
-from tests.projections.script import T0_NS, Script
+from tests.projections.event_script import T0_NS, Script
 
 __all__ = ["foreign_declarations"]
 

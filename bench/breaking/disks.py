@@ -24,8 +24,8 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.settings import Settings
-from tests.queue.test_displaced import DELETIONS
-from tests.queue.writing import drain, episode, node, started
+from tests.queue.factories import drain, episode, node, started
+from tests.queue.test_deleted_files import DELETIONS
 
 __all__ = ["FullDisksOn", "deleted_spools"]
 

@@ -23,7 +23,7 @@ from pycrorm_async.queue import RecorderQueue, open_dead
 from pycrorm_async.queue.maintenance.repair import RepairReport, repair_folder
 from tests.crash.test_queue_disk import ON_A_SMALL_DISK, SLOW, break_syncing
 from tests.crash.test_queue_power import live_through, machine_on
-from tests.queue.writing import RECORDER, SMALL, Author, drain, ended, make, node, recover, started
+from tests.queue.factories import RECORDER, SMALL, Author, drain, ended, make, node, recover, started
 
 __all__ = [
     "torn_writes",

@@ -25,9 +25,9 @@ from pycrorm_async.events.envelope import LOST
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.store.address import DatabaseAddress
-from tests.crash import recording
+from tests.crash import recorder_process
 from tests.databases import ask
-from tests.queue.writing import SMALL, episode, make, node, recover
+from tests.queue.factories import SMALL, episode, make, node, recover
 from tests.store.test_crash import PER_BATCH, append_all, batch
 
 __all__ = ["killed_recorders", "killed_appenders", "forks", "exits_with_a_full_queue", "second_openers"]
@@ -51,7 +51,7 @@ def _said_until_killed(target: Callable[..., None], arguments: tuple[object, ...
 def _record(spool: str, seed: int, threads: int, doing: str, cpu_s: float) -> None:
     kill_me_after(cpu_s)
     sys.argv = ["recording", spool, str(seed), str(threads), doing]
-    recording.main()
+    recorder_process.main()
 
 
 class _Life(NamedTuple):
@@ -187,9 +187,9 @@ def _fill_and_exit(spool: str, how: str) -> None:
         kind = "EpisodeStarted"
         while True:
             _, sequence, payload = put(queue, kind, b"f" * 200)
-            recording.say("put", sequence, payload)
+            recorder_process.say("put", sequence, payload)
             kind = "NodeStarted"
-    recording.say("full", 0, "-")
+    recorder_process.say("full", 0, "-")
     if how == "exit":
         raise SystemExit(3)
     if how == "raise":
@@ -220,11 +220,11 @@ def _drain_if_mine(folder: str, barrier: object) -> None:
     barrier.wait()  # type: ignore[attr-defined]
     recovered = open_dead(Path(folder))
     if recovered is None:
-        recording.say("not", "mine")
+        recorder_process.say("not", "mine")
         return
     records = asyncio.run(recovered.get_batch(events_max=10_000, bytes_max=2**24, age_s_max=0.0))
     for name, sequence, payload in events_of(records):
-        recording.say("drained", name, sequence, payload)
+        recorder_process.say("drained", name, sequence, payload)
     asyncio.run(recovered.acknowledge(records[-1].position))
     recovered.remove()
 

@@ -22,7 +22,7 @@ from pycrorm_async import Memory
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.destination import recover
 from pycrorm_async.settings import Writer
-from tests.crash.walking import SETTINGS, StepActionPerformable, say
+from tests.crash.step_robot import SETTINGS, StepActionPerformable, say
 from tests.databases import Server, ask
 
 __all__ = ["killed_plans", "killed_daemons", "walk", "Walked", "compare_steps"]

@@ -29,7 +29,7 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.crash.test_queue_power import Machine, machine_on
 from tests.databases import ask
-from tests.writer.ends import CountingFold, Passing
+from tests.writer.fakes import CountingFold, Passing
 
 __all__ = ["simulated"]
 

@@ -25,7 +25,7 @@ from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.crash.walking import SETTINGS, say
+from tests.crash.step_robot import SETTINGS, say
 from tests.databases import Server
 
 __all__ = ["faulty_workers"]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.notes import NOTES_PLAN
+from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, environment, one_line_of, pycrorm
 from tests.databases import ask
 

@@ -14,10 +14,10 @@ import pytest
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.copying.memories import append, assert_same
 from tests.databases import Server
-from tests.store.making import episode, record, run_of
-from tests.tables import logs_of
-from tests.test_tables import episode as hand_written
-from tests.test_tables import fill
+from tests.store.factories import episode, record, run_of
+from tests.table_comparison import logs_of
+from tests.test_table_comparison import episode as hand_written
+from tests.test_table_comparison import fill
 
 PLAN = """
 from dataclasses import dataclass

@@ -12,9 +12,9 @@ from pycrorm_async.events.envelope import Record
 from tests.commands import COMMAND, environment, one_line_of, pycrorm
 from tests.copying.memories import append
 from tests.databases import ask_to_change
-from tests.projections.script import Script
-from tests.store.making import episode, run_of
-from tests.test_tables import episode as hand_written
+from tests.projections.event_script import Script
+from tests.store.factories import episode, run_of
+from tests.test_table_comparison import episode as hand_written
 
 URL = "sqlite:///pycrorm.db"
 IDENTITY = "00000000-0000-7000-8000-000000000001"

@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from pycrorm_async.cli.main import app
-from tests.cli.notes import NOTES_PLAN
+from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, pycrorm
 
 

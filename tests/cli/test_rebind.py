@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.notes import NOTES_PLAN
+from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, one_line_of, pycrorm
 
 

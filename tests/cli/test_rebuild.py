@@ -18,8 +18,8 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask
-from tests.projections.remade import TYPES, parking, picking, store, str_of, traces
-from tests.tables import differences, tables_of
+from tests.projections.rebuild_cases import TYPES, parking, picking, store, str_of, traces
+from tests.table_comparison import differences, tables_of
 
 PLAN = '''
 from dataclasses import dataclass

@@ -11,7 +11,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.queue.sources.dead_letters import RefusedRecords
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
-from tests.queue.writing import overwrite
+from tests.queue.factories import overwrite
 
 PLAN = '''
 import itertools, os

@@ -14,8 +14,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask, ask_to_change
-from tests.projections.verifying import fold_in_batches, full, opened, shown
-from tests.store.making import declaration
+from tests.projections.verify_cases import fold_in_batches, full, opened, shown
+from tests.store.factories import declaration
 
 ID = "00000000-0000-7000-8000-00000000000{}"
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.cli.notes import NOTES_PLAN
+from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask_to_change
 

@@ -16,13 +16,13 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import Arms, Pose
 from tests.databases import ask
-from tests.memory.notes import NoteActionPerformable
+from tests.memory.note_actions import NoteActionPerformable
 from tests.plan.conftest import kitchen
-from tests.projections.script import Script
+from tests.projections.event_script import Script
 from tests.promises.test_random_plans import play
-from tests.tables import declarations_of, differences, logs_of, tables_of, united
-from tests.test_tables import episode as hand_written
-from tests.test_tables import fill
+from tests.table_comparison import declarations_of, differences, logs_of, tables_of, united
+from tests.test_table_comparison import episode as hand_written
+from tests.test_table_comparison import fill
 from tests.upstream.conftest import common_plan
 
 PATIENT = Settings(connect_timeout_s=120)

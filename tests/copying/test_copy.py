@@ -27,14 +27,14 @@ from tests.copying.memories import (
     notes,
     random_plans,
 )
-from tests.crash.forked import Forked
+from tests.crash.forked_processes import Forked
 from tests.databases import Server, ask, ask_to_change
-from tests.memory.notes import NoteActionPerformable, texts
-from tests.projections.script import Script, declarations, declared, field, name_of
-from tests.store.making import declaration, episode, record, run_of
-from tests.tables import Logs, logs_of, tables_of
-from tests.test_tables import episode as hand_written
-from tests.test_tables import fill
+from tests.memory.note_actions import NoteActionPerformable, texts
+from tests.projections.event_script import Script, declarations, declared, field, name_of
+from tests.store.factories import declaration, episode, record, run_of
+from tests.table_comparison import Logs, logs_of, tables_of
+from tests.test_table_comparison import episode as hand_written
+from tests.test_table_comparison import fill
 
 SMALL = Settings(batch_events_max=40, batch_bytes_max=8_000)
 """So that a copy is many batches, and ends of them fall into episodes."""

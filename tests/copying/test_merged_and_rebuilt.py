@@ -9,10 +9,10 @@ from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from tests.copying.memories import assert_merged, everything, lost, random_plans
 from tests.databases import ask, ask_to_change
-from tests.projections.remade import traces
-from tests.tables import declarations_of, differences, tables_of
-from tests.test_tables import episode as hand_written
-from tests.test_tables import fill
+from tests.projections.rebuild_cases import traces
+from tests.table_comparison import declarations_of, differences, tables_of
+from tests.test_table_comparison import episode as hand_written
+from tests.test_table_comparison import fill
 
 New = Callable[[], str]
 

@@ -5,35 +5,35 @@ More rounds, longer, and some on disks of their own: `python -m bench.faults`.
  1  SIGKILL at any moment
         test_queue_kill (500 rounds), test_killed_plan, test_daemon_kill, test_many_machines, store/test_crash
  2  killed at each step that touches disk or log, and once more
-        test_crash_points; queue/test_recovery (sealing, removing), queue/test_repair
+        test_crash_points; queue/test_dead_source (sealing, removing), queue/test_repair
  3  power cut: any sectors of what was not synced
         test_queue_power; a mounted image of a disk: the bench
  4  torn write at every byte
-        queue/test_recovery, queue/test_frame, queue/test_segment, queue/test_progress
+        queue/test_dead_source, queue/test_frame, queue/test_segment, queue/test_drain_status
  5  every bit flipped
-        queue/test_recovery, queue/test_frame, queue/test_segment; queue/test_repair (whatever is spoilt)
+        queue/test_dead_source, queue/test_frame, queue/test_segment; queue/test_repair (whatever is spoilt)
  6  a record that was once on the same blocks; segments are never used again
-        queue/test_recovery
+        queue/test_dead_source
  7  a sync that fails
-        test_queue_disk, queue/test_recovery (a disk that does not keep what is left)
+        test_queue_disk, queue/test_dead_source (a disk that does not keep what is left)
  8  a full disk, below the queue and below the database
         test_queue_disk, store/test_full_disk, cli/test_bad_spool
  9  a COMMIT whose reply is lost
-        store/test_postgresql_faults, writer/test_drain, writer/test_thread
+        store/test_postgresql_faults, writer/test_drain, writer/test_writer_thread
 10  a database stopped or killed under load, a network that cuts, stalls, resets, dribbles
         test_many_machines, test_daemon_kill, store/test_postgresql_faults
 11  commits out of order, gaps
         store/test_postgresql_schema (an earlier number is committed later), store/test_append
 12  a writer that stands still and wakes up again, a second opener
-        test_stopped_daemon, queue/test_locks, queue/test_living, cli/test_writer
+        test_stopped_daemon, queue/test_locks, queue/test_live_source, cli/test_writer
 13  a projection killed, several at once, an event that cannot be folded
         test_daemon_kill, test_cancelled, projections/test_projector (parks once, shown once),
-        memory/test_by_daemon
+        memory/test_delegated_writer
 14  cancelled at every await, fork, leaving with a full queue, told to leave
-        test_cancelled, store/test_crash, store/test_postgresql_faults, queue/test_fork, test_leaving,
+        test_cancelled, store/test_crash, store/test_postgresql_faults, queue/test_fork, test_exit_and_clock,
         test_stopped_daemon
 15  a plan faster than its writer, clocks set back
-        queue/test_room, memory/test_by_daemon (a full spool), test_leaving
+        queue/test_full_spool, memory/test_delegated_writer (a full spool), test_exit_and_clock
 
 Where a machine gives no right to mount a disk a simulated one is used; no test skips itself. What was acknowledged is
 noted outside the system, in a pipe that outlives the process, and random choices are made again from a printed seed.

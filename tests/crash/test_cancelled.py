@@ -27,9 +27,9 @@ from pycrorm_async.writer.background_writer import LiveWriter
 from pycrorm_async.writer.daemon import Daemon
 from pycrorm_async.writer.ports import ClaimedSource, ScanResult
 from tests.databases import ask
-from tests.projections.script import SAYING, Script, declarations, name_of
-from tests.queue.writing import make
-from tests.writer.ends import KeptSource
+from tests.projections.event_script import SAYING, Script, declarations, name_of
+from tests.queue.factories import make
+from tests.writer.fakes import KeptSource
 
 SETTINGS = Settings(batch_events_max=10, idle_ms=1, batch_age_ms=1)
 CLOSING = {"AsyncAdapt_aiosqlite_connection._terminate_graceful_close", "Connection._cancel"}

@@ -26,8 +26,8 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
 from tests.databases import ask
-from tests.queue.writing import RECORDER, SMALL, STILL, Author, ended, episode, node, started
-from tests.writer.ends import CountingFold
+from tests.queue.factories import RECORDER, SMALL, STILL, Author, ended, episode, node, started
+from tests.writer.fakes import CountingFold
 
 LIVE = replace(SMALL, sync_interval_ms=1, spool_bytes_max=64 * SMALL.segment_bytes)
 STEPS = {

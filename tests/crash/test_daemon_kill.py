@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.crash.robots import Lab
+from tests.crash.robot_processes import Lab
 from tests.databases import Server, server_in
 
 

@@ -22,9 +22,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from tests.commands import pycrorm
-from tests.crash.chores import LANES, do_chores
-from tests.crash.forked import Forked
-from tests.crash.robots import HANGS_S, Lab
+from tests.crash.chore_robot import LANES, do_chores
+from tests.crash.forked_processes import Forked
+from tests.crash.robot_processes import HANGS_S, Lab
 from tests.databases import Server, ask
 from tests.proxy import Proxy, proxy_before
 

@@ -14,7 +14,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolFull, SpoolUnavailable
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.settings import Settings
-from tests.queue.writing import RECORDER, SMALL, drain, lost, make, node, record, recover, started
+from tests.queue.factories import RECORDER, SMALL, drain, lost, make, node, record, recover, started
 
 SLOW = Settings(
     sync_interval_ms=3_600_000,

@@ -11,8 +11,8 @@ import pytest
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
-from tests.crash.forked import Forked
-from tests.crash.recording import record
+from tests.crash.forked_processes import Forked
+from tests.crash.recorder_process import record
 
 TOGETHER = 4
 """How many recorders live at the same time; each has a spool of its own."""

@@ -23,7 +23,7 @@ from pycrorm_async.queue.files.frame import EVENT
 from pycrorm_async.queue.files.segment import Segment, salt_of
 from pycrorm_async.queue.live.appender import Appender, Span
 from pycrorm_async.queue.live.sync_thread import Syncer
-from tests.queue.writing import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
+from tests.queue.factories import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
 
 SECTOR = 512
 ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.operations.rebuild import rebuild_memory
-from tests.crash.forked import Forked
-from tests.crash.remaking import read_until_told, rebuild_until, record_until_told
+from tests.crash.forked_processes import Forked
+from tests.crash.rebuild_processes import read_until_told, rebuild_until, record_until_told
 from tests.databases import ask
-from tests.projections.remade import TYPES, folded_elsewhere, picking, store, traces
-from tests.tables import differences, tables_of
+from tests.projections.rebuild_cases import TYPES, folded_elsewhere, picking, store, traces
+from tests.table_comparison import differences, tables_of
 
 EPISODES = 30
 BATCH_EVENTS = 60

@@ -14,7 +14,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from tests.commands import one_line_of, pycrorm
-from tests.crash.robots import Lab
+from tests.crash.robot_processes import Lab
 from tests.databases import Server, ask
 from tests.proxy import proxy_before
 

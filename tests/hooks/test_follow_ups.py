@@ -36,7 +36,7 @@ from pycrorm_async.plan.motions.process_modules import simulated_robot
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from tests.hooks.rig import CarryActionPerformable, ListSink, NoteActionPerformable, Rig, findings, rigged
+from tests.hooks.fakes import CarryActionPerformable, ListSink, NoteActionPerformable, Rig, findings, rigged
 
 MAX = 100
 SMALL = Settings(episode_events_max=MAX)

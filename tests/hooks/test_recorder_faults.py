@@ -20,7 +20,7 @@ from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType
-from tests.hooks.rig import NoteActionPerformable, Rig, findings, kinds, rigged
+from tests.hooks.fakes import NoteActionPerformable, Rig, findings, kinds, rigged
 
 STRICT = Settings(on_unrecordable="refuse")
 

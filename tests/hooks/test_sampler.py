@@ -27,7 +27,7 @@ from pycrorm_async.plan.current_robot import robot_here
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.hooks.rig import Rig, findings, rigged
+from tests.hooks.fakes import Rig, findings, rigged
 
 SAMPLED = Settings(sample_interval_ms=1)
 BASE = {"base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw"}

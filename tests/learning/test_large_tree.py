@@ -14,7 +14,7 @@ from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import load_policy, name_of, save_policy
 from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.world.enums import Arms
-from tests.learning.rollouts import frame_of
+from tests.learning.geometric_rollouts import frame_of
 
 LEFT = Evidence(arms=frozenset({Arms.LEFT}))
 SQUARE = Rectangle(0.0, 1.0, 0.0, 1.0)

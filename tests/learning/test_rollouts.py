@@ -31,7 +31,7 @@ from pycrorm_async.orm import BatchRolloutAction, PickUpAction, ProcessMetaData,
 from pycrorm_async.plan.task_tree import collected_tree
 from pycrorm_async.world import Grasp, ObjectType
 from pycrorm_async.world.robots.robot_description import Limits
-from tests.learning.rollouts import works
+from tests.learning.geometric_rollouts import works
 
 PATIENT = Settings(flush_timeout_s=60)
 

@@ -21,7 +21,7 @@ from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import save_policy
 from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.world.enums import Arms, Grasp
-from tests.learning.rollouts import frame_of, works
+from tests.learning.geometric_rollouts import frame_of, works
 
 LEFT = Evidence(arms=frozenset({Arms.LEFT}))
 ALIKE = {"arm": ["LEFT"] * 30, "grasp": ["FRONT"] * 30, "object_x": [0.5] * 30, "object_y": [0.1] * 30}

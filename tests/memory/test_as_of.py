@@ -36,7 +36,7 @@ from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.query.snapshot import Moment, WorldThen
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, WorldState, current_world
 from tests.promises.chronicle import joints_of_bullet, numbers
-from tests.promises.remembering import WITHIN_REACH, FailingActionPerformable, lab, url_of
+from tests.promises.lab import WITHIN_REACH, FailingActionPerformable, lab, url_of
 
 ARM = "l_gripper_tool_frame"
 

@@ -21,7 +21,7 @@ from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.errors import NoWorld, WorldClosed
 from tests.commands import pycrorm
-from tests.memory.notes import NoteActionPerformable, texts, url_of
+from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 HERE = Path(__file__).parent
 
@@ -105,7 +105,7 @@ FORGETS = """
 import asyncio
 from pycrorm_async import Memory
 from tests.commands import pycrorm
-from tests.memory.notes import NoteActionPerformable
+from tests.memory.note_actions import NoteActionPerformable
 
 async def main():
     memory = await Memory.connect("sqlite:///memory.db")

@@ -15,11 +15,11 @@ from pycrorm_async.queue import Spool
 from pycrorm_async.queue.maintenance.repair import repair_folder
 from tests.commands import pycrorm
 from tests.databases import ask
-from tests.memory.daemons import QUICK, Daemon
-from tests.memory.notes import NoteActionPerformable
-from tests.queue.crafting import change_a_frame
-from tests.queue.writing import Author, ended, episode, node, started
-from tests.writer.threads import until
+from tests.memory.daemon_in_loop import QUICK, Daemon
+from tests.memory.note_actions import NoteActionPerformable
+from tests.queue.factories import Author, ended, episode, node, started
+from tests.queue.forged_segments import change_a_frame
+from tests.writer.writer_threads import until
 
 STORED = "SELECT count(*) FROM event"
 

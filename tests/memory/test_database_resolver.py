@@ -28,7 +28,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.memory.notes import url_of
+from tests.memory.note_actions import url_of
 
 STAND = Pose([0.6, 0.9, 0.0])
 TORSO = 0.3

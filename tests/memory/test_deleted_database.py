@@ -18,8 +18,8 @@ from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask
-from tests.memory.notes import NoteActionPerformable
-from tests.store.making import episode, run_of
+from tests.memory.note_actions import NoteActionPerformable
+from tests.store.factories import episode, run_of
 
 IMPATIENT = Settings(flush_timeout_s=0.3, connect_timeout_s=60)
 RECORDER = "0190a000-0000-7000-8000-000000000001"

@@ -14,8 +14,8 @@ from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue import Spool
 from pycrorm_async.settings import Writer
 from tests.databases import ask
-from tests.memory.daemons import QUICK, Daemon
-from tests.memory.notes import NoteActionPerformable, texts
+from tests.memory.daemon_in_loop import QUICK, Daemon
+from tests.memory.note_actions import NoteActionPerformable, texts
 
 GONE = "was deleted or replaced"
 

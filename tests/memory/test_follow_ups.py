@@ -20,8 +20,8 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.commands import answer, pycrorm
-from tests.memory.notes import NoteActionPerformable
-from tests.tables import differences, tables_of
+from tests.memory.note_actions import NoteActionPerformable
+from tests.table_comparison import differences, tables_of
 
 SMALL = Settings(episode_events_max=1_000)
 NOTES = 1_000

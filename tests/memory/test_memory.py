@@ -16,7 +16,7 @@ from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure
 from pycrorm_async.plan.task_tree import TaskStatus
 from tests.commands import environment
-from tests.memory.notes import NoteActionPerformable, texts, url_of
+from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 
 async def test_a_private_memory_answers_and_leaves_nothing_behind() -> None:

@@ -12,7 +12,7 @@ from sqlalchemy import select
 from pycrorm_async import Memory
 from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
-from tests.memory.notes import NoteActionPerformable
+from tests.memory.note_actions import NoteActionPerformable
 
 
 @dataclass

@@ -26,7 +26,7 @@ from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder
 from tests.commands import answer
-from tests.memory.notes import NoteActionPerformable, texts, url_of
+from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 
 async def test_a_memory_that_is_not_open_says_how_to_open_it(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.current_robot import robot_here
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.commands import environment
-from tests.memory.notes import url_of
+from tests.memory.note_actions import url_of
 
 STEPS = 20
 SAMPLED = Settings(sample_interval_ms=2)

@@ -15,7 +15,7 @@ from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
 from pycrorm_async.plan.object_designators import BelieveObject
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from tests.commands import environment
-from tests.memory.notes import NoteActionPerformable, url_of
+from tests.memory.note_actions import NoteActionPerformable, url_of
 
 
 @dataclass

@@ -26,7 +26,7 @@ from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask
-from tests.operations.trap import TRAP, Trapped, arm
+from tests.operations.faults import TRAP, Trapped, arm
 
 PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1, fold_worker_report_s=0.1)
 IMPATIENT = replace(PATIENT, fold_worker_stopped_s=0.6)

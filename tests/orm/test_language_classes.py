@@ -13,7 +13,7 @@ from pycrorm_async.plan import Code, Monitor, Parallel, Repeat, Retry, Sequentia
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 from pycrorm_async.store.log import EventLog
-from tests.projections.asking import stored_and_folded
+from tests.projections.sql_queries import stored_and_folded
 
 EXPRESSIONS = [Sequential, TryInOrder, Parallel, TryAll, Repeat, Monitor, Code, Retry]
 COLUMNS = {

@@ -6,7 +6,7 @@ import numpy as np
 import pybullet
 
 from pycrorm_async.world import Object
-from tests.world.witness import Matrix
+from tests.world.fakes import Matrix
 
 
 def bullet_frame(thing: Object, link: str) -> Matrix:

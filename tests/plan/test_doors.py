@@ -38,7 +38,7 @@ from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
 from tests.plan.test_actions import shape
-from tests.world.witness import Matrix, Witness, Z, shifted, turned
+from tests.world.fakes import Matrix, Witness, Z, shifted, turned
 
 TOOL = {Arms.LEFT: "l_gripper_tool_frame", Arms.RIGHT: "r_gripper_tool_frame"}
 

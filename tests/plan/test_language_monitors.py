@@ -24,8 +24,8 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.failures import NotALanguageExpression
 from pycrorm_async.world import Arms, GripperState, Pose
 from tests.plan.conftest import Scene
-from tests.plan.recording import Recording
-from tests.plan.told import Around, Step, drawn, failing
+from tests.plan.fake_observer import Recording
+from tests.plan.step_actions import Around, Step, drawn, failing
 
 INTERRUPTED = Outcome(results=(None,), interrupted=True)
 

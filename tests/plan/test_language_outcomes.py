@@ -38,7 +38,7 @@ from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import Attempt
 from pycrorm_async.world import Arms, GripperState
 from tests.plan.conftest import Scene
-from tests.plan.told import Around, Step, drawn, failing
+from tests.plan.step_actions import Around, Step, drawn, failing
 
 # --- what the reference system loses ----------------------------------------------------------------------------------
 
@@ -189,7 +189,7 @@ class Odd:
         (3, "3"),
         ("a", "'a'"),
         (None, "None"),
-        (Step, "<class 'tests.plan.told.Step'>: make an instance"),
+        (Step, "<class 'tests.plan.step_actions.Step'>: make an instance"),
         (print, "<built-in function print>: wrap it in Code(…)"),
         (Odd(), "<Odd: RuntimeError: no repr>"),
     ],

@@ -27,8 +27,8 @@ from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose, WorldMode
 from pycrorm_async.world.observers import current_world
 from tests.plan.conftest import Scene
-from tests.plan.recording import Recording
-from tests.plan.told import Around, Step, drawn
+from tests.plan.fake_observer import Recording
+from tests.plan.step_actions import Around, Step, drawn
 
 LEFT, RIGHT, BASE, HEAD = Resource.LEFT_ARM, Resource.RIGHT_ARM, Resource.BASE, Resource.HEAD
 

@@ -41,7 +41,7 @@ from pycrorm_async.world.errors import UnknownLink
 from pycrorm_async.world.models.primitives import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import Scene
-from tests.plan.recording import Recording
+from tests.plan.fake_observer import Recording
 
 LEFT_TOOL = "l_gripper_tool_frame"
 OUT_OF_REACH = Pose([1.3, 1, 3])

@@ -45,7 +45,7 @@ from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
 from tests.plan.test_actions import shape
-from tests.world.witness import CRANE, Matrix, Witness, X, Y, Z, matrix, shifted, turned
+from tests.world.fakes import CRANE, Matrix, Witness, X, Y, Z, matrix, shifted, turned
 
 LEFT_TOOL, RIGHT_TOOL = "l_gripper_tool_frame", "r_gripper_tool_frame"
 

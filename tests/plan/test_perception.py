@@ -34,7 +34,7 @@ from pycrorm_async.world.models.primitives import box_urdf
 from pycrorm_async.world.robots.robot_description import PR2
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
-from tests.plan.recording import Recording
+from tests.plan.fake_observer import Recording
 from tests.plan.test_actions import shape
 from tests.plan.test_process_modules import Noting
 

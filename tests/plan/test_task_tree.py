@@ -11,7 +11,7 @@ import pytest
 from pycrorm_async.plan.designator import ActionAbstract, BaseMotion
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.plan.task_tree import TaskTreeNode, collected_tree, current_node
-from tests.plan.recording import Recording
+from tests.plan.fake_observer import Recording
 
 
 @dataclass

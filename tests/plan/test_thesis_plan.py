@@ -23,7 +23,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, WorldMode
 from tests.plan.conftest import Scene
-from tests.plan.recording import Recording
+from tests.plan.fake_observer import Recording
 
 TREE = """\
 ParkArmsActionPerformable

@@ -21,9 +21,9 @@ from pycrorm_async.world import Arms, Grasp, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.robots.robot_description import PR2
 from tests.plan.conftest import Scene
-from tests.plan.recording import Recording
+from tests.plan.fake_observer import Recording
 from tests.plan.test_actions import shape
-from tests.world.witness import matrix
+from tests.world.fakes import matrix
 
 LEFT_TOOL = "l_gripper_tool_frame"
 ISLAND = Pose([-1.35, 1.0, 0.988], yaw_quaternion(math.pi))

@@ -35,7 +35,7 @@ from pycrorm_async.projections.fold.fold import CannotFold, fold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.tables import COLUMNS
-from tests.projections.script import (
+from tests.projections.event_script import (
     NAVIGATE,
     PICK_UP,
     POSE_US,

@@ -32,9 +32,9 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server
 from tests.databases import ask as ask_past_ours
-from tests.projections.asking import ask, stored_and_folded
-from tests.projections.script import SAYING, T0_NS, Script, declarations, declared, field, name_of
-from tests.projections.verifying import rebuilt
+from tests.projections.event_script import SAYING, T0_NS, Script, declarations, declared, field, name_of
+from tests.projections.sql_queries import ask, stored_and_folded
+from tests.projections.verify_cases import rebuilt
 
 LONG = "Ä" * 35 + "_field"
 

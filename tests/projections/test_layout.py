@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.schema.layout import Contradictory, Layout, Leaf
-from tests.projections.script import PICK_UP, SAYING, declared, field
+from tests.projections.event_script import PICK_UP, SAYING, declared, field
 
 
 def layout_of(*types: DesignatorTypeDeclared) -> Layout:

@@ -24,8 +24,8 @@ from pycrorm_async.projections.run.batch_fold import Prepared
 from pycrorm_async.projections.run.pipeline import FoldPipeline, Outlook
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
-from tests.projections.asking import ask
-from tests.projections.script import SAYING, Script, declarations, declared, field, mixed, name_of, row
+from tests.projections.event_script import SAYING, Script, declarations, declared, field, mixed, name_of, row
+from tests.projections.sql_queries import ask
 
 
 class InLoop:

@@ -28,8 +28,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
 from pycrorm_async.store.log import EventLog
-from tests.projections.asking import all_rows, ask, names, stored_and_folded
-from tests.projections.script import (
+from tests.projections.event_script import (
     NAVIGATE,
     PICK_UP,
     SAYING,
@@ -43,6 +42,7 @@ from tests.projections.script import (
     row,
     time_us,
 )
+from tests.projections.sql_queries import all_rows, ask, names, stored_and_folded
 
 VIA = declared("ViaAction", "via_action", field("via", "list", 2, item="pose"))
 

@@ -30,9 +30,19 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 from tests.databases import Server, ask, ask_to_change
-from tests.projections.remade import TYPES, folded_elsewhere, lost, parking, picking, store, str_of, traces, whispering
+from tests.projections.rebuild_cases import (
+    TYPES,
+    folded_elsewhere,
+    lost,
+    parking,
+    picking,
+    store,
+    str_of,
+    traces,
+    whispering,
+)
 from tests.promises.test_random_plans import play
-from tests.tables import differences, tables_of
+from tests.table_comparison import differences, tables_of
 
 PATIENT = Settings(connect_timeout_s=120, flush_timeout_s=300)
 STOPPED = "SELECT number, folded, parked FROM episode ORDER BY number"

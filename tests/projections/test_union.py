@@ -5,7 +5,7 @@ from __future__ import annotations
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.schema.layout import Layout, unite
-from tests.projections.script import declared, field, name_of
+from tests.projections.event_script import declared, field, name_of
 
 TEXT = declared("NoteAction", "note_action", field("text", "text", 2))
 NUMBER = declared("NoteAction", "note_action", field("text", "integer", 2), field("weight", "real", 3))

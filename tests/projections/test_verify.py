@@ -21,8 +21,8 @@ from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.projections.verify.verify import verify as verifying
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
-from tests.projections.script import Script
-from tests.projections.verifying import (
+from tests.projections.event_script import Script
+from tests.projections.verify_cases import (
     TYPES,
     another,
     assert_clean,

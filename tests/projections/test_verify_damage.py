@@ -16,8 +16,8 @@ from pycrorm_async.projections.verify.verify import Verified, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
-from tests.projections.script import NAVIGATE, PICK_UP, name_of
-from tests.projections.verifying import (
+from tests.projections.event_script import NAVIGATE, PICK_UP, name_of
+from tests.projections.verify_cases import (
     assert_clean,
     fold_in_batches,
     full,

@@ -17,7 +17,7 @@ from pycrorm_async.orm import Attachment, JointChange, ObjectRemoval, TaskTreeNo
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world import BulletWorld, Object, Pose
-from tests.promises.remembering import at, every, turned
+from tests.promises.lab import at, every, turned
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

@@ -26,8 +26,8 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
-from tests.memory.notes import NoteActionPerformable
-from tests.promises.remembering import lab, nodes_of, remembered, statuses
+from tests.memory.note_actions import NoteActionPerformable
+from tests.promises.lab import lab, nodes_of, remembered, statuses
 
 well: Any = NoteActionPerformable("well")
 nothing: Any = 7

@@ -35,8 +35,8 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.robots.robot_description import PR2
-from tests.memory.notes import NoteActionPerformable
-from tests.promises.remembering import Lab, asked, lab, nodes_of, remembered, statuses, url_of, written
+from tests.memory.note_actions import NoteActionPerformable
+from tests.promises.lab import Lab, asked, lab, nodes_of, remembered, statuses, url_of, written
 
 FAR = Pose([9, 9, 1], time_ns=1)
 

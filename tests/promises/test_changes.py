@@ -33,8 +33,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.schema import Birth, make_or_migrate
 from pycrorm_async.world import Arms
 from tests.databases import ask, ask_to_change
-from tests.store.making import declaration, episode, run_of
-from tests.tables import differences, tables_of
+from tests.store.factories import declaration, episode, run_of
+from tests.table_comparison import differences, tables_of
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
 

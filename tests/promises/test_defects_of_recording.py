@@ -63,8 +63,8 @@ from pycrorm_async.plan.failures import CollisionError, PerceptionObjectNotInWor
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
-from tests.memory.notes import NoteActionPerformable
-from tests.promises.remembering import (
+from tests.memory.note_actions import NoteActionPerformable
+from tests.promises.lab import (
     MILK_AT,
     WITHIN_REACH,
     FailingActionPerformable,

@@ -41,8 +41,8 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from tests.commands import environment
-from tests.memory.notes import NoteActionPerformable
-from tests.promises.remembering import (
+from tests.memory.note_actions import NoteActionPerformable
+from tests.promises.lab import (
     MILK_AT,
     WITHIN_REACH,
     FailingActionPerformable,

@@ -36,9 +36,9 @@ from pycrorm_async.plan import NavigateAction as Navigate
 from pycrorm_async.plan.execution.observer import PlanObserver, recorder
 from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, Pose
-from tests.memory.notes import NoteActionPerformable
+from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import joints_of_bullet, numbers
-from tests.promises.remembering import (
+from tests.promises.lab import (
     WITHIN_REACH,
     FailingActionPerformable,
     asked,

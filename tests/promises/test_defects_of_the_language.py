@@ -15,8 +15,8 @@ from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import Code, Designator, NavigateAction, ParkArmsAction, PlanFailure, Repeat
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.world import Arms, Pose
-from tests.memory.notes import NoteActionPerformable
-from tests.promises.remembering import FailingActionPerformable, asked, lab, nodes_of, remembered, statuses
+from tests.memory.note_actions import NoteActionPerformable
+from tests.promises.lab import FailingActionPerformable, asked, lab, nodes_of, remembered, statuses
 
 DEFECTS = {
     "a": "test_a_failure_deep_inside_an_expression_fails_all_of_it",

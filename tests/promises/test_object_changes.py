@@ -30,9 +30,9 @@ from pycrorm_async.plan.object_designators import designator_of
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.memory.notes import NoteActionPerformable
+from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import Chronicle, assert_same, told_by_memory
-from tests.promises.remembering import WITHIN_REACH, Lab, at, every, lab, remembered, url_of
+from tests.promises.lab import WITHIN_REACH, Lab, at, every, lab, remembered, url_of
 
 ARM = "l_gripper_tool_frame"
 

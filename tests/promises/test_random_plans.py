@@ -14,7 +14,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
-from tests.promises.generated import AT_ONCE, Entry, Generator, Journal, Thing, built
+from tests.promises.random_plans import AT_ONCE, Entry, Generator, Journal, Thing, built
 
 PLANS = 1_000
 PARTS = 4

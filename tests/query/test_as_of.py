@@ -42,8 +42,8 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import AttachmentThen, Moment, NodeThen, RobotThen
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.pose import Pose
-from tests.projections.asking import stored_and_folded
-from tests.projections.script import MOVE, NAVIGATE, PICK_UP, T0_NS, Script, declarations, name_of, pose, row
+from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, T0_NS, Script, declarations, name_of, pose, row
+from tests.projections.sql_queries import stored_and_folded
 
 TYPES = (NAVIGATE, PICK_UP, MOVE)
 ID = "00000000-0000-7000-8000-000000000001"

@@ -13,8 +13,8 @@ from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.orm import Action, Designator, Motion, TaskTreeNode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
-from tests.projections.asking import stored_and_folded
-from tests.projections.script import SAYING, Script, declarations, declared, field, name_of
+from tests.projections.event_script import SAYING, Script, declarations, declared, field, name_of
+from tests.projections.sql_queries import stored_and_folded
 
 WAVE = declared("Wave", "wave", field("times", "integer", 2))
 WAVE_MOTION = declared("Wave", "wave", field("times", "integer", 2), kind="motion")

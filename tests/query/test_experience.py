@@ -28,8 +28,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 from tests.databases import Server
-from tests.projections.asking import stored_and_folded
-from tests.projections.script import PICK_UP, T0_NS, Script, declarations, name_of
+from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, name_of
+from tests.projections.sql_queries import stored_and_folded
 
 
 def tried(

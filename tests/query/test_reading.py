@@ -30,8 +30,8 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms
-from tests.projections.asking import stored_and_folded
-from tests.projections.script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
+from tests.projections.sql_queries import stored_and_folded
 
 
 def moment(sequence: int) -> datetime:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.queue import RecorderQueue
-from tests.queue.writing import make
+from tests.queue.factories import make
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.queue.sources.dead_letters import RefusedRecords
 from pycrorm_async.settings import FileAccess
-from tests.memory.notes import NoteActionPerformable
+from tests.memory.note_actions import NoteActionPerformable
 
 EPISODE = parse_episode_id("0190a000-0000-7000-8000-000000000002")
 

@@ -11,8 +11,8 @@ from pycrorm_async import Memory
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.queue.files import file_system
 from pycrorm_async.queue.files.file_system import check_file_system, file_system_type
-from tests.memory.notes import NoteActionPerformable, texts
-from tests.queue.writing import make
+from tests.memory.note_actions import NoteActionPerformable, texts
+from tests.queue.factories import make
 
 BTRFS = 0x9123683E
 

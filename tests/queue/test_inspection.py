@@ -12,7 +12,7 @@ from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.maintenance.inspection import OpenEpisode, inspect_spool
 from pycrorm_async.queue.maintenance.repair import repair_folder
 from pycrorm_async.settings import Settings
-from tests.queue.writing import DECLARED, RECORDER, WALL_NS, Author, ended, episode, node, overwrite, started
+from tests.queue.factories import DECLARED, RECORDER, WALL_NS, Author, ended, episode, node, overwrite, started
 
 
 def everything_in(folder: Path) -> dict[str, bytes | None]:

@@ -19,7 +19,7 @@ from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.scan import scan
 from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
-from tests.queue.writing import (
+from tests.queue.factories import (
     DECLARED,
     RECORDER,
     SMALL,

@@ -10,7 +10,7 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.recorder_folder import make_folder
-from tests.queue.writing import RECORDER, episode, make, started
+from tests.queue.factories import RECORDER, episode, make, started
 
 
 def test_a_spool_that_is_not_there_has_no_recorders_and_is_not_made(spool: Path) -> None:

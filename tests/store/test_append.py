@@ -12,7 +12,7 @@ from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
-from tests.store.making import declaration, episode, record, run_of
+from tests.store.factories import declaration, episode, record, run_of
 
 HEADS = "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode ORDER BY number"
 

@@ -8,7 +8,7 @@ from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask
-from tests.store.making import episode, record, run_of
+from tests.store.factories import episode, record, run_of
 
 EVENTS = "SELECT sequence, type, payload FROM event ORDER BY sequence"
 HEADS = "SELECT head, ended_wall_ns, refused FROM episode"

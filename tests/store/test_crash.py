@@ -16,9 +16,9 @@ import pytest
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.crash.recording import say
+from tests.crash.recorder_process import say
 from tests.databases import ask
-from tests.store.making import episode, run_of
+from tests.store.factories import episode, run_of
 
 PER_BATCH = 300
 

@@ -19,8 +19,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import ask
-from tests.store.making import episode, record
-from tests.writer.ends import CountingFold, KeptSource
+from tests.store.factories import episode, record
+from tests.writer.fakes import CountingFold, KeptSource
 
 
 class SmallDisk:

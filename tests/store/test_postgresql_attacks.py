@@ -24,7 +24,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
-from tests.crash.walking import SETTINGS, StepActionPerformable
+from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask
 
 PAYLOAD = """

@@ -27,8 +27,8 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask, server_in
 from tests.proxy import Proxy, proxy_before
-from tests.store.making import declaration, episode, run_of
-from tests.writer.ends import CountingFold, KeptSource
+from tests.store.factories import declaration, episode, run_of
+from tests.writer.fakes import CountingFold, KeptSource
 
 SETTINGS = Settings(batch_events_max=250)
 QUICKLY = Backoff(first_s=0.005, longest_s=0.05)

@@ -16,7 +16,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.databases import Server, ask, server_in
-from tests.store.making import episode, run_of
+from tests.store.factories import episode, run_of
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import dialect
 from tests.databases import Server, ask
-from tests.store.making import episode, run_of
+from tests.store.factories import episode, run_of
 
 SECRET = "s3cr et/@#?&:%"
 WRITTEN = "s3cr%20et%2F%40%23%3F%26%3A%25"

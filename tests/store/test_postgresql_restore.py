@@ -19,10 +19,10 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
-from tests.crash.walking import SETTINGS, StepActionPerformable
+from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask
-from tests.store.making import declaration, episode, run_of
-from tests.writer.ends import CountingFold, KeptSource
+from tests.store.factories import declaration, episode, run_of
+from tests.writer.fakes import CountingFold, KeptSource
 
 QUICKLY = Backoff(first_s=0.005, longest_s=0.02)
 DROP = "DROP SCHEMA IF EXISTS pycrorm, memory_tables, memory CASCADE"

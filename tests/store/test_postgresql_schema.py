@@ -22,7 +22,7 @@ from pycrorm_async.store.postgresql.roles import GRANTS
 from pycrorm_async.store.postgresql.tables import MIGRATIONS
 from pycrorm_async.store.schema import Birth, make_or_migrate
 from tests.databases import Server, ask
-from tests.store.making import declaration, episode, record, run_of
+from tests.store.factories import declaration, episode, record, run_of
 
 TABLES = (
     "SELECT relname FROM pg_class WHERE relnamespace = 'pycrorm'::regnamespace AND relkind IN ('r', 'S') ORDER BY 1"

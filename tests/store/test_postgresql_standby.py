@@ -13,7 +13,7 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask
-from tests.store.making import declaration, episode, run_of
+from tests.store.factories import declaration, episode, run_of
 
 _WAITING = "SELECT pid FROM pg_stat_activity WHERE wait_event = 'SyncRep' AND datname = current_database()"
 _PROBE = "SELECT pg_logical_emit_message(true, 'test', '')"

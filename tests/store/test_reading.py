@@ -12,7 +12,7 @@ from pycrorm_async.store.sqlite import statements
 from pycrorm_async.store.sqlite.engine import Connection
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 from tests.databases import ask
-from tests.store.making import episode, record, run_of
+from tests.store.factories import episode, record, run_of
 
 
 async def test_events_come_in_order_in_pages(log: EventLog) -> None:

@@ -15,7 +15,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.schema import Birth, make_or_migrate, recognise
 from pycrorm_async.store.sqlite.tables import MIGRATIONS
 from tests.databases import ask
-from tests.store.making import declaration, episode, run_of
+from tests.store.factories import declaration, episode, run_of
 
 ALL_OF_IT = "SELECT type, name, sql FROM sqlite_master ORDER BY type, name"
 

@@ -13,7 +13,7 @@ from pycrorm_async import Memory
 from pycrorm_async.plan import MoveTorsoAction, NavigateAction, ObjectDesignatorDescription, PickUpAction, PlaceAction
 from pycrorm_async.world import Arms, Grasp, Pose
 from tests.plan.conftest import Scene, kitchen
-from tests.promises.remembering import asked, url_of
+from tests.promises.lab import asked, url_of
 
 DESCRIPTION = "the common plan"
 

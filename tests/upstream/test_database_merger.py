@@ -16,8 +16,8 @@ from pycrorm_async.operations.copy import copy_episodes
 from tests.commands import pycrorm
 from tests.databases import Server, ask
 from tests.plan.conftest import kitchen
-from tests.promises.remembering import url_of
-from tests.tables import Tables, differences, logs_of, tables_of, united
+from tests.promises.lab import url_of
+from tests.table_comparison import Tables, differences, logs_of, tables_of, united
 from tests.upstream.conftest import common_plan
 
 RUNS = 3

@@ -13,7 +13,7 @@ from pycrorm_async.plan import IKError, ParkArmsAction, PickUpAction, PlanFailur
 from pycrorm_async.plan.failures import GripperClosedCompletely
 from pycrorm_async.world import Arms, Grasp, Pose
 from tests.plan.conftest import Scene, kitchen
-from tests.promises.remembering import statuses, url_of
+from tests.promises.lab import statuses, url_of
 from tests.upstream.conftest import Remembered
 
 

@@ -57,7 +57,7 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import kitchen
-from tests.promises.remembering import at, url_of
+from tests.promises.lab import at, url_of
 from tests.upstream.conftest import DESCRIPTION, Remembered, common_plan
 
 

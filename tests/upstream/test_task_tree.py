@@ -14,7 +14,7 @@ from pycrorm_async.plan import ActionAbstract, PlanFailure, SimulatedTaskTree, T
 from pycrorm_async.plan.task_tree import CollectedTree
 from pycrorm_async.world import Pose
 from tests.plan.conftest import Scene, kitchen
-from tests.promises.remembering import url_of
+from tests.promises.lab import url_of
 from tests.upstream.conftest import Remembered, common_plan
 
 

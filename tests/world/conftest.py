@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from pycrorm_async.world import BulletWorld
-from tests.world.witness import Witness
+from tests.world.fakes import Witness
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from pycrorm_async.world.errors import (
     WorldUnavailable,
 )
 from pycrorm_async.world.state import WorldState
-from tests.world.witness import CRANE, Witness
+from tests.world.fakes import CRANE, Witness
 
 # --- entering and leaving -------------------------------------------------------------------------------------
 

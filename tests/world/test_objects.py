@@ -20,7 +20,7 @@ from pycrorm_async.world.errors import (
     UnknownJoint,
     UnknownLink,
 )
-from tests.world.witness import CRANE, Witness, crane_links, matrix
+from tests.world.fakes import CRANE, Witness, crane_links, matrix
 
 LEANING = Pose([0.3, -1.2, 0.7], [0.2, -0.4, 0.1, 0.8])
 

@@ -8,7 +8,7 @@ import pytest
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.errors import AttachmentRefused, ObjectNotInWorld, UnknownLink
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.world.witness import CRANE, Witness, crane_links, matrix
+from tests.world.fakes import CRANE, Witness, crane_links, matrix
 
 BASE = Pose([0.5, 1.0, 0.2], [0.1, 0.2, -0.3, 0.9])
 CUP_AT = Pose([1.1, 0.6, 0.9], [0.5, 0.1, 0.0, 0.8])

@@ -11,7 +11,7 @@ import pytest
 
 from pycrorm_async.world import BoundingBox, BulletWorld, Object, ObjectType, Pose, Vector
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.world.witness import CRANE, X, Z, crane_links, matrix, shifted, turned
+from tests.world.fakes import CRANE, X, Z, crane_links, matrix, shifted, turned
 
 ONE_LINK = '<robot name="a"><link name="l"><collision>{origin}<geometry>{shape}</geometry></collision></link></robot>'
 

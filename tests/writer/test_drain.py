@@ -18,8 +18,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain, run_to_completion
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import ask
-from tests.store.making import episode, record, run_of
-from tests.writer.ends import CountingFold, KeptSource, LosesReplies, Passing
+from tests.store.factories import episode, record, run_of
+from tests.writer.fakes import CountingFold, KeptSource, LosesReplies, Passing
 
 TENS = Settings(batch_events_max=10)
 STORED = "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY episode"

@@ -1,0 +1,154 @@
+"""Plans and daemons in processes of their own, started and killed at will, and the proof that nothing is lost by it.
+
+What the plans said before they died is kept here, outside the system; the memory is asked by connections that know
+nothing of it.
+"""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import time
+from collections import defaultdict
+from pathlib import Path
+
+from tests.commands import COMMAND, environment, pycrorm
+from tests.crash.forked_processes import Forked
+from tests.crash.step_robot import take_a_walk
+from tests.databases import ask
+
+__all__ = ["Robot", "Lab"]
+
+HANGS_S = 300.0
+"""After this long a process hangs, however busy the machine is."""
+
+
+class Robot:
+    """One plan's process, and all it said."""
+
+    def __init__(self, url: str, spool: Path, name: str, seed: int) -> None:
+        self.name = name
+        self.forked = Forked(take_a_walk, url, str(spool), name, seed)
+
+    def wait_until_it_walks(self) -> None:
+        deadline = time.monotonic() + HANGS_S
+        while len(self.said) < 5:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+    def kill(self) -> None:
+        self.forked.kill()
+
+    def stop(self) -> None:
+        """It ends its episode and closes its memory."""
+        self.forked.tell_to_stop()
+        assert self.forked.wait() == 0
+
+    @property
+    def said(self) -> list[list[str]]:
+        """The words of each line that is whole."""
+        return [line.split() for line in self.forked.said]
+
+
+class Lab:
+    """One database, one spool, robots that come and go, and a daemon now and then."""
+
+    def __init__(self, folder: Path, url: str, seed: int) -> None:
+        print(f"seed {seed}")
+        self.folder = folder
+        self.url = url
+        self.spool = folder / "spool"
+        self.rng = random.Random(seed)
+        self.robots: list[Robot] = []
+        self.gone: list[Robot] = []
+        self.daemon: subprocess.Popen[bytes] | None = None
+        self.log = folder / "daemon.log"
+
+    def start_robot(self, name: str | None = None) -> Robot:
+        name = name or f"robot{len(self.robots) + len(self.gone)}"
+        robot = Robot(self.url, self.spool, name, self.rng.randrange(2**31))
+        self.robots.append(robot)
+        return robot
+
+    def kill_robot(self) -> None:
+        robot = self.robots.pop(self.rng.randrange(len(self.robots)))
+        robot.kill()
+        self.gone.append(robot)
+
+    def stop_robots(self) -> None:
+        for robot in self.robots:
+            robot.stop()
+        self.gone += self.robots
+        self.robots = []
+
+    def start_daemon(self) -> None:
+        with self.log.open("ab") as log:
+            self.daemon = subprocess.Popen(
+                [*COMMAND, "writer", "--url", self.url, "--spool", str(self.spool)],
+                stderr=log,
+                stdout=log,
+                cwd=self.folder,
+                env=environment(),
+            )
+
+    def kill_daemon(self) -> None:
+        assert self.daemon is not None
+        self.daemon.kill()
+        self.daemon.wait()
+
+    def stop_daemon(self) -> int:
+        assert self.daemon is not None
+        self.daemon.terminate()
+        return self.daemon.wait(timeout=HANGS_S)
+
+    def wait_for_log(self, words: str) -> None:
+        deadline = time.monotonic() + HANGS_S
+        while not self.log.exists() or words not in self.log.read_text():
+            assert time.monotonic() < deadline, self.log.read_text()
+            time.sleep(0.05)
+
+    def clear(self) -> None:
+        """Nothing of ours runs afterwards."""
+        for robot in self.robots:
+            robot.kill()
+        if self.daemon is not None and self.daemon.poll() is None:
+            self.kill_daemon()
+
+    def prove_that_everything_is_there_once_and_in_order(self) -> None:
+        """After one `pycrorm writer --once`, when nobody else is at work."""
+        assert not self.robots
+        done = pycrorm("writer", "--once", "--url", self.url, "--spool", self.spool, cwd=self.folder)
+        assert done.returncode == 0, done.stderr
+        assert "Traceback" not in self.log.read_text()
+        assert [path.name for path in self.spool.iterdir() if path.is_dir() and path.name != "stored"] == []
+        said = [line for robot in self.gone for line in robot.said]
+        did = {
+            (place, int(step)) for what, place, step, *_ in (line for line in said if len(line) == 3) if what == "did"
+        }
+        ended = {line[1] for line in said if line[0] == "ended"}
+        assert len(did) > 100, "too little was done to prove anything"
+
+        rows = ask(
+            self.url,
+            "SELECT place, step, status FROM step_action JOIN task_tree_node ON step_action.id = task_tree_node.id"
+            " ORDER BY step_action.id",
+        )
+        steps: defaultdict[str, list[int]] = defaultdict(list)
+        for place, step, status in rows:
+            steps[place].append(step)
+            assert status in ("SUCCEEDED", "LOST")
+            assert status == "SUCCEEDED" or (place, step) not in did
+        assert all(found == list(range(len(found))) for found in steps.values())
+        there = {(place, step) for place, found in steps.items() for step in found}
+        assert did <= there
+        assert len(there) <= len(did) + len(self.gone)  # one that was done and not said, before each death
+
+        episodes = ask(self.url, "SELECT description, status FROM process_metadata")
+        statuses = dict(episodes)
+        assert len(statuses) == len(episodes)
+        assert {place: statuses[place] for place in ended} == dict.fromkeys(ended, "SUCCEEDED")
+        assert set(steps) <= set(statuses)
+        heads = ask(self.url, "SELECT number, head, folded, refused, parked FROM episode ORDER BY number")
+        assert all(head == folded and refused is None and parked is None for _, head, folded, refused, parked in heads)
+        counted = ask(self.url, "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode")
+        assert sorted(counted) == [(number, head, 1, head) for number, head, *_ in heads]

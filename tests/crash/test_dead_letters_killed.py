@@ -1,0 +1,115 @@
+"""An episode that the log refuses, its recorder killed at each step that touches disk or log: nothing of it is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import DatabaseError
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.queue import RecorderQueue, Spool, open_dead
+from pycrorm_async.settings import Settings
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.drain import Drain
+from tests.crash.test_crash_points import LIVE, _made, drained, in_a_child, stored
+from tests.queue.factories import RECORDER, STILL, drain, ended, episode, node, started
+from tests.writer.fakes import CountingFold
+
+NO_TEXT = b'"\xff"'  # no database holds it
+LOST = '{"status":"LOST"}'
+
+
+def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
+    queue = RecorderQueue.create(spool, settings=LIVE, clock=STILL, recorder=RECORDER)
+
+    async def both() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+        task = asyncio.create_task(Drain(queue, CountingFold(log), settings=Settings(batch_events_max=4)).run())
+        for number in (1, 2):
+            say("put", number, queue.put_nowait(started(number), b"{}"))
+        for index in range(6):
+            payload = NO_TEXT if index == 2 else b'"%d %s"' % (index, b"y" * 900)
+            say("put", 1 + index % 2, queue.put_nowait(node(1 + index % 2), payload))
+            await queue.synced_to()
+        for number in (1, 2):
+            say("put", number, queue.put_nowait(ended(number), b"{}"))
+        queue.close()
+        with contextlib.suppress(DatabaseError):
+            await task
+        await log.close()
+
+    asyncio.run(both())
+    queue.release()
+
+
+def recover(url: str, spool: Path, _say: object) -> None:
+    """What the next process does with what it finds."""
+    for folder in Spool(spool).recorders():
+        recovered = open_dead(folder.path)
+        if recovered is not None:
+            asyncio.run(drained(url, recovered))
+            if recovered.all_stored:
+                recovered.remove()
+            else:
+                recovered.release()
+
+
+def dead_letter(spool: Path) -> list[Record]:
+    """What is kept of the first episode, which must be all that is in the spool."""
+    folders = Spool(spool).recorders()
+    if not folders:
+        return []
+    [folder] = folders
+    recovered = open_dead(folder.path)
+    assert recovered is not None
+    records = asyncio.run(drain(recovered))
+    recovered.release()
+    assert {each.episode for each in records} == {episode(1)}
+    return records
+
+
+@pytest.mark.parametrize("after", [False, True])
+def test_killed_at_any_step_and_once_more_no_event_of_a_refused_episode_is_lost_or_kept_twice(
+    tmp_path: Path, after: bool
+) -> None:
+    done, step = False, 0
+    while not done:
+        step += 1
+        place = tmp_path / str(step)
+        place.mkdir()
+        url, spool = f"sqlite:///{place}/memory.db", place / "spool"
+        asyncio.run(_made(url))
+        done, said = in_a_child(partial(record_and_drain, url, spool), step, after=after)
+        in_a_child(partial(recover, url, spool), 1 + step * 7 % 30, after=not after)
+        for _ in range(2):  # the second time, what is refused again stays as it is
+            recover(url, spool, None)
+        texts = {
+            number: [
+                b"{}",
+                *(NO_TEXT if each == 2 else b'"%d %s"' % (each, b"y" * 900) for each in range(number - 1, 6, 2)),
+                b"{}",
+            ]
+            for number in (1, 2)
+        }
+        found = {number: {row[0]: row[2].encode() for row in stored(url, number)} for number in (1, 2)}
+        aside = dead_letter(spool)
+        sequences = [each.sequence for each in aside]
+        assert sequences == list(range(sequences[0], sequences[0] + len(aside)) if aside else ()), (step, after)
+        assert set(sequences) & set(found[1]) <= {1, 2}
+        found[1] |= {each.sequence: each.payload for each in aside}
+        for number in (1, 2):
+            put = [int(line[2]) for line in said if line[:2] == ["put", str(number)]]
+            rows = [found[number][sequence] for sequence in sorted(found[number])]
+            assert sorted(found[number]) == list(range(1, len(rows) + 1)), (step, after)
+            rows = rows[:-1] if rows and rows[-1] == LOST.encode() else rows
+            assert rows == texts[number][: len(rows)]
+            assert len(put) <= len(rows) <= len(put) + 1, (step, after)
+        if done:
+            assert sequences[-1] == 5
+    assert step > 50

@@ -1,0 +1,353 @@
+"""A plan that runs without a memory runs with one: what cannot be recorded is missing, counted, warned about once."""
+
+from __future__ import annotations
+
+import asyncio
+import decimal
+import enum
+import logging
+import math
+from collections.abc import Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, Happening, NodeEnded, NodeStarted, ObjectAdded
+from pycrorm_async.hooks.values import missing_values
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.object_designators import ObjectDesignator
+from pycrorm_async.settings import Settings
+from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world.models.primitives import built_in_urdf
+from tests.hooks.fakes import NoteActionPerformable, findings, rigged
+
+
+@dataclass
+class Inner:
+    depth: Any = 1.0
+    """Of no type that a column has."""
+    width: float = 2.0
+
+
+@dataclass
+class AnythingActionPerformable(ActionAbstract):
+    """Every field gets the same value, whatever its type."""
+
+    integer: int
+    real: float
+    text: str
+    flag: bool
+    arm: Arms
+    pose: Pose
+    thing: ObjectDesignator
+    texts: list[str]
+    reals: dict[str, float]
+    odd: set[bytes]
+    inner: Inner
+    note: str = "kept"
+    _raised: BaseException | None = None
+
+    async def perform(self) -> Any:
+        if self._raised is not None:
+            raise self._raised
+        return self.odd
+
+
+nasty: ContextVar[bool] = ContextVar("nasty", default=False)
+"""Other tests look at every object of the process, and these must let them."""
+
+
+class Raising(str):
+    """Raises wherever it can."""
+
+    __slots__ = ()
+
+    def __raise(self, *_: object) -> Any:
+        if nasty.get():
+            raise SystemExit("read me not")
+        return "raising"
+
+    __repr__ = __str__ = __float__ = __len__ = __iter__ = encode = replace = __raise  # type: ignore[assignment]
+
+
+class RaisingAny:
+    def __getattribute__(self, name: str) -> Any:
+        if nasty.get():
+            raise LookupError(f"\x00\ud800{name}")
+        return super().__getattribute__(name)
+
+    def __repr__(self) -> str:
+        if nasty.get():
+            raise GeneratorExit
+        return "raising"
+
+
+class Endless(Sequence[int]):
+    """Its length is a lie."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, index: Any) -> Any:
+        return index
+
+
+class Foreign(enum.Enum):
+    """Not the enum that was declared; its names are no texts that can be recorded."""
+
+    ODD = math.nan
+
+
+def circle() -> list[Any]:
+    """Ten times itself, at every depth."""
+    round_: list[Any] = []
+    round_.extend([round_] * 10)
+    return round_
+
+
+class RaisingFailure(Exception):
+    @property
+    def args(self) -> Any:
+        raise ZeroDivisionError
+
+    @args.setter
+    def args(self, _: object) -> None: ...
+
+    def __str__(self) -> str:
+        raise ZeroDivisionError
+
+
+LONG_NAMED = type("Long" * 30_000, (Exception,), {"__module__": "\ud800"})
+SCALARS = [
+    math.nan, math.inf, "\x00", "\ud800", "x" * 5_000, b"\xff", 2**70, decimal.Decimal("NaN"), object(), Raising("x"),
+    RaisingAny(), Foreign.ODD, ObjectType.MILK, Pose([math.nan, 0, 0]), Pose(frame="\ud800"), np.float64("nan"),
+    np.zeros((40, 40)), np.array(None), np.datetime64("NaT"), lambda: None, int, asyncio, LookupError("\ud800"),
+    range(10**12), {1: 2}, {"a": {"b": [math.nan]}}, memoryview(b"x"), circle(), Inner(math.nan, -1), 10**5_000,
+]  # fmt: skip
+
+
+class Nasty(NamedTuple):
+    """Stands for one of `SCALARS`, of which some cannot even be shown."""
+
+    number: int
+
+
+NASTY = st.builds(Nasty, st.integers(0, len(SCALARS) - 1))
+VALUES = st.recursive(
+    NASTY | st.floats() | st.text() | st.binary() | st.integers() | st.none() | st.booleans(),
+    lambda each: st.lists(each, max_size=4) | st.dictionaries(st.text(), each, max_size=4),
+    max_leaves=6,
+)
+FAILURES = st.tuples(st.sampled_from([ValueError, RaisingFailure, LONG_NAMED, ExceptionGroup]), NASTY)
+
+
+def meant(value: Any) -> Any:
+    if isinstance(value, Nasty):
+        return SCALARS[value.number]
+    if isinstance(value, list):
+        return [meant(each) for each in value]
+    return {key: meant(each) for key, each in value.items()} if isinstance(value, dict) else value
+
+
+def failure_of(kind: Any, value: Any) -> BaseException:
+    return ExceptionGroup("many", [OSError(value)]) if kind is ExceptionGroup else kind(value)
+
+
+def outcome_of(action: ActionAbstract) -> list[Any]:
+    """Its result, or what it raised; no task holds it, for asyncio shows the results of its tasks."""
+    outcome: list[Any] = []
+
+    async def plan() -> None:
+        try:
+            outcome.append(await action.perform())
+        except BaseException as raised:  # noqa: BLE001  it is what is compared
+            outcome.append(raised)
+
+    asyncio.run(plan())
+    return outcome
+
+
+def started(events: list[tuple[int, Happening]]) -> NodeStarted:
+    return next(event for _, event in events if isinstance(event, NodeStarted) and event.kind == "action")
+
+
+@pytest.mark.parametrize("bytes_max", [2**20, 3_000])
+@given(described=VALUES, fails=st.none() | FAILURES)
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+def test_with_a_memory_a_plan_does_what_it_does_without_one(
+    bytes_max: int, described: Any, fails: tuple[type, Any] | None
+) -> None:
+    value = meant(described)
+    failure = failure_of(fails[0], meant(fails[1])) if fails is not None else None
+    action = AnythingActionPerformable(
+        value, value, value, value, value, value, value, value, value, value, Inner(value, 3.0), _raised=failure
+    )
+    (outcome,) = outcome_of(action)
+    logging.disable()
+    token = nasty.set(True)
+    try:
+        with rigged(Settings(record_bytes_max=bytes_max)) as rig, rig.episode() as episode:
+            (recorded_outcome,) = outcome_of(action)
+            is_same = recorded_outcome is outcome
+            assert is_same
+        assert rig.emitter.faults.total == 0, rig.emitter.faults.last
+        events = rig.sink.of(episode)
+        assert findings(events) == []
+        start = started(events)
+        assert start.parameters["note"] == "kept"
+        assert start.parameters["inner_width"] == 3.0
+        end = next(event for _, event in events if isinstance(event, NodeEnded))
+        assert end.status == ("SUCCEEDED" if failure is None else "ERROR")
+    finally:
+        nasty.reset(token)
+        logging.disable(logging.NOTSET)
+
+
+async def test_what_cannot_be_recorded_is_counted_and_warned_about_once_for_each_type_and_field(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with rigged() as rig, rig.episode() as episode:
+        for _ in range(3):
+            assert await NoteActionPerformable("a\x00", weight=math.nan).perform() == "a\x00"
+    parameters = started(rig.sink.of(episode)).parameters
+    assert parameters["text"] == {"missing": "the text holds U+0000", "repr": "'a\\x00'"}
+    assert parameters["weight"] == {"missing": "nan is not a finite number", "repr": "nan"}
+    assert rig.emitter.missing.count == (9, "NoteAction.result: the text holds U+0000")
+    assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
+        "NoteAction.text is recorded as missing",
+        "NoteAction.weight is recorded as missing",
+        "NoteAction.result is recorded as missing",
+    ]
+
+
+async def test_a_long_text_is_cut_and_marked_and_every_other_field_is_recorded() -> None:
+    with rigged() as rig, rig.episode() as episode:
+        await NoteActionPerformable("x" * 2**21, weight=2.5).perform()
+    start = started(rig.sink.of(episode))
+    assert start.parameters["weight"] == 2.5
+    assert (
+        start.parameters["text"]["missing"] == "takes 2,097,154 bytes, 1,048,576 are allowed for all (record_bytes_max)"
+    )
+    assert start.parameters["text"]["repr"].startswith("'xxxx")
+    assert start.parameters["text"]["repr"].endswith("xxx'… (2,097,152 characters)")
+    assert len(start.parameters["text"]["repr"]) < 250
+
+
+@dataclass
+class OddActionPerformable(ActionAbstract):
+    """One field of no type that a column has, one whose type is nowhere, one with a reserved name."""
+
+    odd: set[str]
+    nowhere: Nowhere  # type: ignore[name-defined]  # noqa: F821  the fault here
+    robot_state: str
+    inner: Inner = field(default_factory=Inner)
+    weight: float = 1.5
+
+    async def perform(self) -> None:
+        """Nothing."""
+
+
+async def test_fields_that_cannot_be_declared_are_missing_and_the_others_recorded() -> None:
+    with rigged() as rig, rig.episode() as episode:
+        await OddActionPerformable({"a"}, 3, "upright").perform()
+    parameters = started(rig.sink.of(episode)).parameters
+    assert {name: value for name, value in parameters.items() if not isinstance(value, dict)} == {
+        "inner_width": 2.0,
+        "weight": 1.5,
+    }
+    reasons = {name: value["missing"] for name, value in parameters.items() if isinstance(value, dict)}
+    assert reasons.keys() == {"odd", "nowhere", "robot_state", "inner_depth"}
+    assert reasons["odd"].startswith("has the type set[str], which has no column")
+    assert reasons["nowhere"] == "has a type that cannot be read: name 'Nowhere' is not defined"
+    assert reasons["robot_state"] == "field 'robot_state' has a reserved name (robot_state)"
+    assert parameters["odd"]["repr"] == "{'a'}"
+    assert rig.emitter.missing.count.total == 4
+    (declared,) = [event for owner, _, event in rig.sink.records if owner is None]
+    assert [each.name for each in declared.fields] == ["inner_width", "weight"]  # type: ignore[attr-defined]
+    assert [each.slot for each in declared.fields] == [2, 3]  # type: ignore[attr-defined]
+
+
+async def test_nodes_of_a_class_that_cannot_be_declared_are_recorded_without_a_type() -> None:
+    @dataclass
+    class PoseActionPerformable(ActionAbstract):
+        dtype = "Pose"
+        text: str
+
+        async def perform(self) -> str:
+            return self.text
+
+    with rigged() as rig, rig.episode() as episode:
+        assert await PoseActionPerformable("a").perform() == "a"
+    start = started(rig.sink.of(episode))
+    assert (start.designator, start.parameters) == (None, {"text": "a"})
+    assert findings(rig.sink.of(episode)) == []
+    assert rig.emitter.missing.count.total == 1
+    assert "'pose', which the memory itself uses" in str(rig.emitter.missing.count.last)
+
+
+def test_warnings_are_bounded_by_a_number_of_fields(caplog: pytest.LogCaptureFixture) -> None:
+    values = missing_values.MissingValues()
+    for number in range(missing_values.WARNED_MAX + 50):
+        values.note("AnAction", f"field_{number}", "it is odd")
+    assert values.count.total == missing_values.WARNED_MAX + 50
+    assert len(caplog.records) == missing_values.WARNED_MAX + 1
+    assert caplog.records[-1].getMessage() == "values of more than 1000 fields are missing; the others are only counted"
+    assert len(values._warned) == missing_values.WARNED_MAX + 1
+
+
+async def test_texts_of_an_episode_that_are_too_long_are_cut_and_marked() -> None:
+    with rigged(Settings(record_bytes_max=4_000)) as rig:
+        episode = rig.recorder.open_episode(description="d" * 3_000_000, plan="\x00p" * 6_000)
+        rig.recorder.close_episode(episode, None)
+    start = rig.sink.of(episode)[0][1]
+    assert isinstance(start, EpisodeStarted)
+    assert start.description == "d" * 1_000 + "… (3,000,000 characters)"
+    assert start.plan == ("\\x00p" * 200) + "… (30,000 characters)"
+    assert rig.emitter.missing.count.total == 2
+
+
+async def test_names_in_the_world_that_cannot_be_recorded_are_cleaned_and_cut() -> None:
+    with rigged(Settings(record_bytes_max=8_000)) as rig, rig.episode() as episode, BulletWorld():
+        carton = built_in_urdf("milk", ObjectType.MILK)
+        Object("milk\x00" * 3_000, ObjectType.MILK, carton)
+        cup = Object("cup\ud800", ObjectType.MILK, carton)
+        cup.set_pose(Pose([1, 0, 0]))
+    names = [event.name for _, event in rig.sink.of(episode) if isinstance(event, ObjectAdded)]
+    assert names == ["milk\\x00" * 125 + "… (24,000 characters)", "cup\\ud800"]
+    assert findings(rig.sink.of(episode)) == []
+    assert rig.emitter.faults.total == 0
+
+
+async def test_of_two_worlds_in_one_episode_the_first_is_recorded_and_nothing_is_mixed_up(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with rigged() as rig, rig.episode() as episode, BulletWorld():
+        Object("pr2", ObjectType.ROBOT, pose=Pose([1, 0, 0]))
+        with BulletWorld() as second:
+            other = Object("pr2", ObjectType.ROBOT, pose=Pose([2, 0, 0]))
+            other.set_pose(Pose([3, 0, 0]))
+            await NoteActionPerformable("in the second").perform()
+            assert len(second.objects) == 1
+        await NoteActionPerformable("in the first").perform()
+    events = rig.sink.of(episode)
+    assert [event.pose.position[0] for _, event in events if isinstance(event, ObjectAdded)] == [1.0]
+    robots = {
+        event.parameters["text"]: event.robot and event.robot.pose.position[0]
+        for _, event in events
+        if isinstance(event, NodeStarted) and event.kind == "action"
+    }
+    assert robots == {"in the second": None, "in the first": 1.0}
+    assert findings(events) == []
+    assert isinstance(events[-1][1], EpisodeEnded)
+    assert events[-1][1].status == "SUCCEEDED"
+    assert rig.emitter.faults.total == 0
+    assert rig.emitter.missing.count.total == 2
+    assert [record.getMessage().partition(" is ")[0] for record in caplog.records] == [
+        "Episode.second world",
+        "Episode.robot of a second world",
+    ]

@@ -1,0 +1,106 @@
+"""A dead recorder's folder that is damaged further on: whoever drains it says so, and stores what was safe before."""
+
+import logging
+import uuid
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory, recover
+from pycrorm_async.errors import SpoolDamaged
+from pycrorm_async.events.codec import encode
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.types import EpisodeStarted, ObjectAdded, PoseValue
+from pycrorm_async.operations.daemon import _Folders
+from pycrorm_async.queue import Spool
+from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.store.address import DatabaseAddress
+from tests.databases import ask
+from tests.memory.daemon_in_loop import QUICK, Daemon
+from tests.memory.note_actions import NoteActionPerformable
+from tests.queue.factories import WALL_NS, Author, episode, overwrite, started
+from tests.writer.writer_threads import until
+
+STORED = "SELECT max(sequence), count(*) FROM event"
+MISSING = "position 13 is missing"
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Path:
+    return tmp_path / "spool"
+
+
+@pytest.fixture
+def damaged(spool: Path) -> Author:
+    """Of twenty events, each safe and two in a file, the thirteenth is not what it was."""
+    author = Author(spool)
+    author.put(started(), encode(EpisodeStarted("damaged further on", "me", "host", "1.0", "3.11")))
+    added, here = Heading(episode(1), "ObjectAdded", 1), PoseValue((0, 0, 0), (0, 0, 0, 1), "map", WALL_NS)
+    for number in range(2, 21):
+        author.put(added, encode(ObjectAdded(f"{number} {'x' * 600}", "MILK", here)))
+        author.sync()
+    path, offset, _ = author.places[12]
+    overwrite(path, offset + 68, b"#")
+    return author
+
+
+async def test_the_daemon_tells_it_once_and_stores_what_a_repair_keeps_of_the_rest(
+    database_url: str, spool: Path, damaged: Author
+) -> None:
+    running = Daemon(database_url, spool)
+    await running.says("is dead: recovering")
+    await running.says(f"{MISSING}, and .* tried again now and then$")
+    await running.leaves()
+    assert ask(database_url, STORED) == [(12, 12)]
+    assert len([line for line in running.said if MISSING in line]) == 1
+    assert len(damaged.segments) > len(list(damaged.folder.glob("*.segment"))) > 1
+    assert repair_folder(damaged.folder) is not None
+    running = Daemon(database_url, spool)
+    await running.says(r"is recovered \(1 episode LOST\)")
+    await running.leaves()
+    assert ask(database_url, STORED) == [(13, 13)]
+    assert Spool(spool).recorders() == []
+
+
+async def test_one_round_reports_it_and_stores_what_a_repair_keeps_of_the_rest(
+    database_url: str, spool: Path, damaged: Author
+) -> None:
+    for _ in range(2):
+        report = await recover(database_url, spool=spool)
+        [(name, fault)] = report.failed.items()
+        assert (name, isinstance(fault, SpoolDamaged), MISSING in str(fault)) == (damaged.folder.name, True, True)
+        assert (report.lost, report.drained.stopped) == ((), {})
+        assert ask(database_url, STORED) == [(12, 12)]
+    assert repair_folder(damaged.folder) is not None
+    report = await recover(database_url, spool=spool)
+    assert (report.failed, len(report.lost)) == ({}, 1)
+    assert ask(database_url, STORED) == [(13, 13)]
+    assert Spool(spool).recorders() == []
+
+
+async def test_a_plan_that_starts_beside_it_tells_it_once_and_goes_on(
+    database_url: str, spool: Path, damaged: Author, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Memory.open(database_url, spool=spool, settings=QUICK) as memory:
+        await NoteActionPerformable("beside").perform()
+        await until(lambda: bool(memory.status.unadopted))
+        assert memory.status.unadopted.keys() == {damaged.folder.name}
+        await memory.flush()
+        assert memory.status.drained
+    [line] = [each.getMessage() for each in caplog.records if each.levelno >= logging.WARNING]
+    assert MISSING in line
+    assert ask(database_url, f"{STORED} WHERE wall_ns = {WALL_NS}") == [(12, 12)]
+    assert [each.name for each in Spool(spool).recorders()] == [damaged.folder.name]
+
+
+def test_where_damage_was_met_all_is_looked_at_before_any_of_it_is_given_again(
+    tmp_path: Path, spool: Path, damaged: Author
+) -> None:
+    look = _Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))
+    first = look(())
+    assert (len(first.held), first.failed) == (1, {})
+    assert not first.held[0].release_folder().whole
+    for _ in range(2):
+        again = look(())
+        assert again.held == []
+        assert MISSING in str(again.failed[damaged.folder.name])

@@ -1,0 +1,395 @@
+"""A memory whose events a daemon writes: the same promises, no connection for writing, plain words when it is away."""
+
+import asyncio
+import logging
+import shutil
+import sqlite3
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading, Settings, UserView, recover
+from pycrorm_async.errors import (
+    CallerError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    EpisodeParked,
+    FlushTimeout,
+    SpoolForeign,
+    SpoolUnavailable,
+)
+from pycrorm_async.operations.daemon import _take, serve
+from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.queue import Spool
+from pycrorm_async.queue.files.spool import RecorderFolder
+from pycrorm_async.queue.retention.stored_segments import StoredSegments
+from pycrorm_async.queue.sources.live_source import LiveQueue
+from pycrorm_async.writer.ports import ClaimedSource
+from tests.databases import ask, ask_to_change
+from tests.memory.daemon_in_loop import QUICK, Daemon
+from tests.memory.note_actions import NoteActionPerformable, texts
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Path:
+    return tmp_path / "spool"
+
+
+Start = Callable[..., AbstractAsyncContextManager[Daemon]]
+
+
+@pytest.fixture
+def daemon(database_url: str, spool: Path) -> Start:
+    @asynccontextmanager
+    async def running(settings: Settings = QUICK) -> AsyncIterator[Daemon]:
+        started = Daemon(database_url, spool, settings)
+        yield started
+        started.leave.set()
+        await started.task
+
+    return running
+
+
+def memory_at(url: str, spool: Path, settings: Settings = QUICK) -> Memory:
+    return Memory.open(url, spool=spool, writer="daemon", settings=settings)
+
+
+async def test_what_is_flushed_is_in_the_tables_and_closing_leaves_nothing_behind(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    async with memory_at(database_url, spool) as memory:
+        async with memory.episode(description="before the daemon"):
+            await NoteActionPerformable("a").perform()
+        async with daemon() as started:
+            await memory.flush()
+            assert await texts(memory) == ["a"]
+            async with memory.episode(description="beside the daemon"):
+                await NoteActionPerformable("b").perform()
+                await memory.flush()
+                assert await texts(memory) == ["a", "b"]
+            await memory.flush()
+            status = memory.status
+            assert status.written == status.synced == status.stored == status.folded
+            assert (status.drained, status.writer, status.faults.total) == (True, None, 0)
+            assert [each.status for each in await memory.reading.episodes()] == ["SUCCEEDED", "SUCCEEDED"]
+            await NoteActionPerformable("c").perform()
+            await memory.__aexit__(None, None, None)
+            async with Reading.open(database_url) as reading:
+                assert await texts(reading) == ["a", "b", "c"]
+            assert Spool(spool).recorders() == []
+            await started.says("has ended")
+    assert [line.split("; ")[-1] for line in started.said if "has ended" in line] == [
+        f"{status.written + 6} events stored"
+    ]
+
+
+async def test_the_database_need_not_be_there_before_the_daemon(tmp_path: Path, spool: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    async with memory_at(url, spool) as memory:
+        await NoteActionPerformable("early").perform()
+        await memory.synced()
+        assert not (tmp_path / "memory.db").exists()
+        with pytest.raises(DatabaseUnavailable, match="does not exist"):
+            await texts(memory)
+        with pytest.raises(CallerError, match="open a session first"):
+            memory.mapped(NoteActionPerformable)
+        started = Daemon(url, spool)
+        await memory.flush()
+        assert await texts(memory) == ["early"]
+        async with memory.session() as session:
+            assert (await session.scalars(select(ProcessMetaData.status))).all() == ["SUCCEEDED"]
+    started.leave.set()
+    await started.task
+
+
+async def test_without_a_daemon_flush_says_so_and_closing_leaves_the_events_to_whoever_comes(
+    database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
+        await NoteActionPerformable("a").perform()
+        with pytest.raises(FlushTimeout, match="nobody drains this spool: start `pycrorm writer`"):
+            await memory.flush()
+        assert not memory.status.drained
+    [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+    assert line.startswith(f"7 events are safe in {spool} and not in the database yet (nobody drains this spool")
+    report = await recover(database_url, spool=spool)
+    assert (report.lost, report.failed) == ((), {})
+    async with Reading.open(database_url) as reading:
+        assert await texts(reading) == ["a"]
+
+
+async def test_closing_says_so_when_all_is_stored_and_the_tables_are_behind(
+    database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.synced()
+        [folder] = Spool(spool).recorders()
+        drainer = LiveQueue.take(folder.path)
+        assert drainer is not None
+        batch = await drainer.get_batch(events_max=100, bytes_max=2**20, age_s_max=0.0)
+        await drainer.acknowledge(batch[-1].position)
+    drainer.release()
+    [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+    assert line.startswith("all events are stored, and the last 7 do not show in the tables yet (")
+
+
+async def test_one_round_stores_what_a_living_process_has_synced_and_its_flush_returns(
+    database_url: str, spool: Path
+) -> None:
+    async with memory_at(database_url, spool) as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.synced()
+        report = await recover(database_url, spool=spool)
+        assert (report.living, len(report.drained.drained), report.failed) == (1, 1, {})
+        await memory.flush()
+        assert await texts(memory) == ["a"]
+        await NoteActionPerformable("b").perform()
+        await memory.synced()
+        assert (await recover(database_url, spool=spool)).drained.drained[0].records == 6
+        await memory.flush()
+        assert await texts(memory) == ["a", "b"]
+
+
+async def test_a_full_spool_is_emptied_by_the_daemon_and_the_plan_goes_on(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    tiny = replace(QUICK, segment_bytes=2**14, record_bytes_max=2**12, spool_bytes_max=2**17, spool_reserve_bytes=2**15)
+    async with memory_at(database_url, spool, tiny) as memory, memory.episode(description="e"):
+
+        async def many() -> None:
+            for index in range(1000):
+                await NoteActionPerformable(f"{index:04}").perform()
+
+        task = asyncio.create_task(many())
+        await asyncio.sleep(0.5)
+        assert not task.done()
+        async with daemon():
+            await asyncio.wait_for(task, 60)
+            await memory.flush()
+            assert await texts(memory) == [f"{index:04}" for index in range(1000)]
+            assert memory.status.faults.total == 0
+
+
+async def test_an_episode_that_is_parked_is_told_by_flush_once_and_the_others_go_on(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    async with memory_at(database_url, spool) as memory, daemon():
+        async with memory.episode(description="parked") as parked:
+            await NoteActionPerformable("a").perform()
+            await memory.flush()
+            ask_to_change(database_url, "UPDATE episode SET parked = 'by hand' WHERE number = 1")
+            await NoteActionPerformable("b").perform()
+            with pytest.raises(EpisodeParked, match=f"{parked}: by hand"):
+                await memory.flush()
+        async with memory.episode(description="other"):
+            await NoteActionPerformable("c").perform()
+        await memory.flush()
+        assert await texts(memory) == ["a", "c"]
+
+
+async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later_daemon_when_it_can_be(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    settings = replace(QUICK, keep_stored_s=0)  # a daemon that keeps nothing heals nothing
+    async with memory_at(database_url, spool, settings) as memory:
+        async with memory.episode(description="refused") as refused:
+            async with daemon(settings):
+                await NoteActionPerformable("a").perform()
+                await memory.flush()
+                [[head]] = ask(database_url, "SELECT head FROM episode")
+                ask_to_change(database_url, "UPDATE episode SET folded = 1, head = 1")  # as after an older backup
+                await NoteActionPerformable("b").perform()
+                with pytest.raises(EpisodeParked, match=f"{refused}: events 2 to .* did not arrive before"):
+                    await memory.flush()
+            async with daemon(settings) as started:  # which goes on where the one before was
+                await NoteActionPerformable("c").perform()
+                await memory.flush()
+                await started.says(f"episode {refused} was refused: events 2 to .*; its events are kept in the spool")
+        async with daemon(settings) as started:
+            async with memory.episode(description="other"):
+                await NoteActionPerformable("d").perform()
+            await memory.flush()
+            status = memory.status
+            assert status.written == status.stored == status.folded
+            await memory.__aexit__(None, None, None)
+            [kept] = Spool(spool).recorders()
+            assert kept.refused == str(refused)
+            await started.says(f"recorder {kept.name}: episode {refused} .*; tried again by the next writer")
+            segments = {path: path.read_bytes() for path in kept.path.glob("*.segment")}
+    assert (len(segments), kept.alive) == (3, False)
+    report = await recover(database_url, spool=spool)
+    assert list(report.drained.stopped) == [str(refused)]
+    assert {path: path.read_bytes() for path in kept.path.glob("*.segment")} == segments
+    ask_to_change(database_url, f"UPDATE episode SET folded = {head}, head = {head} WHERE number = 1")
+    async with daemon(settings) as started:
+        await started.says(f"recorder {kept.name} is recovered; ")
+    assert Spool(spool).recorders() == []
+    async with Reading.open(database_url) as reading:
+        assert sorted(await texts(reading)) == ["a", "b", "c", "d"]
+
+
+async def test_one_round_tells_a_living_recorder_which_of_its_own_episodes_are_refused_or_parked(
+    database_url: str, spool: Path
+) -> None:
+    settings = replace(QUICK, connect_timeout_s=60)
+    async with Memory.open(database_url, spool=spool, settings=settings) as memory:
+        async with memory.episode(description="of another"):
+            await NoteActionPerformable("a").perform()
+        await memory.flush()
+    ask_to_change(database_url, "UPDATE episode SET parked = 'long ago'")
+    async with memory_at(database_url, spool) as memory, memory.episode(description="parked") as parked:
+        await NoteActionPerformable("b").perform()
+        await memory.synced()
+        await recover(database_url, spool=spool)
+        await memory.flush()
+        ask_to_change(database_url, "UPDATE episode SET parked = 'by hand' WHERE number = 2")
+        await NoteActionPerformable("c").perform()
+        await memory.synced()
+        await recover(database_url, spool=spool)
+        with pytest.raises(EpisodeParked) as told:
+            await memory.flush()
+        assert told.value.reasons == {str(parked): "by hand"}
+
+
+async def test_a_daemon_whose_file_is_replaced_by_another_ends_and_one_whose_file_is_only_gone_waits(
+    tmp_path: Path, spool: Path
+) -> None:
+    file = tmp_path / "memory.db"
+    url = f"sqlite:///{file}"
+    started = Daemon(url, spool)
+    async with memory_at(url, spool, replace(QUICK, flush_timeout_s=0.5)):
+        await NoteActionPerformable("a").perform()
+        await started.says("appeared")
+        file.rename(tmp_path / "away.db")
+        await NoteActionPerformable("b").perform()
+        await started.says("the database is away: .*removed or replaced")
+        (tmp_path / "away.db").rename(file)
+        await started.says("the database is back")
+        shutil.copy(file, tmp_path / "copy.db")
+        (tmp_path / "copy.db").replace(file)
+        await NoteActionPerformable("c").perform()
+        async with asyncio.timeout(60):
+            with pytest.raises(DatabaseForeign, match=r"memory\.db was replaced while it was open: start"):
+                await started.task
+    assert not any("Traceback" in line for line in started.said)
+    report = await recover(url, spool=spool)
+    assert report.failed == {}
+
+
+async def test_a_second_daemon_on_the_same_spool_is_refused_in_one_line(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    async with daemon() as started:
+        await started.says("draining")
+        with pytest.raises(SpoolUnavailable, match="another `pycrorm writer` drains it already") as refused:
+            await serve(database_url, spool=spool, leave=asyncio.Event(), say=print)
+        assert "\n" not in str(refused.value)
+    async with daemon() as started:
+        await started.says("draining")
+
+
+async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folders_to_the_next(
+    database_url: str, spool: Path, daemon: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looking, cancelled = threading.Event(), threading.Event()
+
+    def take(folder: RecorderFolder, stored: StoredSegments, *, again: bool) -> ClaimedSource | None:
+        looking.set()
+        assert cancelled.wait(60)
+        return _take(folder, stored, again=again)
+
+    async with memory_at(database_url, spool) as memory:
+        await NoteActionPerformable("a").perform()
+        with monkeypatch.context() as patch:
+            patch.setattr("pycrorm_async.operations.daemon._take", take)
+            first = Daemon(database_url, spool)
+            assert await asyncio.to_thread(looking.wait, 60)
+            first.task.cancel()
+            cancelled.set()
+            with pytest.raises(asyncio.CancelledError):
+                await first.task
+        assert not memory.status.drained
+        async with daemon():
+            await memory.flush()
+            assert await texts(memory) == ["a"]
+
+
+async def test_a_spool_of_another_database_is_refused_and_nothing_of_it_is_moved(
+    database_url: str, spool: Path, tmp_path: Path
+) -> None:
+    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.1)):
+        await NoteActionPerformable("a").perform()
+        await recover(database_url, spool=spool)
+        await NoteActionPerformable("b").perform()
+        async with Memory.open(f"sqlite:///{tmp_path}/other.db"):
+            pass
+        with pytest.raises(SpoolForeign, match="belongs to log"):
+            await serve(f"sqlite:///{tmp_path}/other.db", spool=spool, leave=asyncio.Event(), say=print)
+        await recover(database_url, spool=spool)
+    assert ask(f"sqlite:///{tmp_path}/other.db", "SELECT count(*) FROM event") == [(0,)]
+
+
+async def test_a_damaged_folder_is_told_and_the_others_are_drained(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    for text in ("damaged", "whole"):
+        async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.1)) as memory:
+            await NoteActionPerformable(text).perform()
+    first, second = Spool(spool).recorders()
+    segment = first.path / "00000001.segment"
+    content = bytearray(segment.read_bytes())
+    content[content.index(b"damaged")] ^= 1
+    segment.write_bytes(content)
+    async with daemon() as started:
+        await started.says(f"{first.name}: .*00000001.segment is damaged at byte .*; tried again")
+        await started.says(f"{second.name} is recovered")
+    async with Reading.open(database_url) as reading:
+        assert await texts(reading) == ["whole"]
+    assert [each.name for each in Spool(spool).recorders()] == [first.name]
+    assert memory.is_open is False
+
+
+@pytest.mark.parametrize(
+    ("open_it", "words"),
+    [
+        (lambda: Memory.open("sqlite://", writer="daemon"), "sqlite:// is private to this process"),
+        (
+            lambda: Memory.open("sqlite:///x.db", writer="daemon", views=[UserView("v", select(ProcessMetaData.id))]),
+            "knows no views of this process",
+        ),
+        (lambda: Memory.open("sqlite:///x.db", settings=Settings(writer="cron")), "use 'thread' or 'daemon'"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_no_daemon_can_do_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
+    with pytest.raises(CallerError, match=words):
+        open_it()
+
+
+async def test_a_locked_database_is_away_for_the_daemon_and_closing_does_not_wait_for_it(
+    tmp_path: Path, spool: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    started = Daemon(url, spool)
+    async with memory_at(url, spool) as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.flush()
+        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        await NoteActionPerformable("b").perform()
+        await started.says("the database is away: .*locked; trying again")
+    [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+    assert "the daemon says that the database is away" in line
+    other.execute("COMMIT")
+    other.close()
+    await started.says("the database is back after")
+    await started.says("is recovered")
+    started.leave.set()
+    await started.task
+    async with Reading.open(url) as reading:
+        assert await texts(reading) == ["a", "b"]

@@ -1,0 +1,103 @@
+"""A memory that has used up its episode numbers keeps what comes then in its spool; before, it warns."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import EpisodeParked
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.destination import recover
+from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.commands import answer, pycrorm
+from tests.databases import ask, ask_to_change
+from tests.memory.note_actions import NoteActionPerformable, texts
+from tests.store.factories import episode, run_of
+
+
+def take_numbers_up_to(url: str, last: int) -> None:
+    """The database has given this episode number."""
+    ask_to_change(url, f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({last}, 'x', 0, 0)")
+    if url.startswith("postgresql"):  # there, numbers come from a sequence
+        ask_to_change(url, f"SELECT setval('pycrorm.episode_number', {last})")
+
+
+async def made(url: str) -> None:
+    await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
+
+
+async def test_the_last_number_serves_and_what_comes_after_it_is_kept_in_the_spool_and_offered_again(
+    database_url: str, tmp_path: Path
+) -> None:
+    await made(database_url)
+    take_numbers_up_to(database_url, EPISODE_NUMBER_MAX - 1)
+    spool = tmp_path / "spool"
+    async with Memory.open(database_url, spool=spool) as memory:
+        await NoteActionPerformable("the last").perform()
+        await NoteActionPerformable("one too many").perform()
+        with pytest.raises(EpisodeParked, match="all 4,194,303 episode numbers"):
+            await memory.flush()
+        assert await texts(memory) == ["the last"]
+        assert memory.status.writer is not None
+        last, beyond = memory.recent_episodes
+    assert ask(database_url, f"SELECT id, head FROM episode WHERE number = {EPISODE_NUMBER_MAX}") == [(last, 6)]
+    assert ask(database_url, "SELECT max(id) < 9007199254740992 FROM task_tree_node") in ([(1,)], [(True,)])
+    async with Reading.open(database_url) as reading:
+        assert [(each.id, each.nodes) for each in await reading.episodes()] == [(last, 2)]
+    (kept,) = [each for each in Spool(spool).recorders() if each.refused is not None]
+    assert kept.refused == beyond
+
+    offered = await recover(database_url, spool=spool)  # as the next start does
+    assert offered.dead_letters.keys() == {beyond}
+    assert "all 4,194,303 episode numbers" in offered.drained.stopped[beyond]
+    assert [each.refused for each in Spool(spool).recorders() if each.refused is not None] == [beyond]
+    other = f"sqlite:///{tmp_path}/other.db"
+    await copy_episodes(database_url, other)
+    assert ask(other, f"SELECT number, head FROM episode WHERE id = '{last}'") == [(1, 6)]  # a new memory numbers anew
+    done = pycrorm("spool", "rebind", "--url", other, "--spool", spool, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert ask(other, f"SELECT number, head, refused FROM episode WHERE id = '{beyond}'") == [(2, 6, None)]
+    assert [each for each in Spool(spool).recorders() if each.refused is not None] == []
+
+
+async def test_from_nine_tenths_of_the_numbers_on_status_warns_and_the_log_has_one_line(
+    database_url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    await made(database_url)
+    take_numbers_up_to(database_url, 3_774_871)
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    with caplog.at_level(logging.WARNING, logger="pycrorm_async"):
+        await log.append(run_of(episode(1), 1, 2))
+        assert (await log.limits_near(), caplog.messages) == ([], [])
+        for number in (2, 3):
+            await log.append(run_of(episode(number), 1, 2))
+    warning = "{} of 4,194,303 episode numbers are used (90 %): record into a new database before none is left"
+    assert await log.limits_near() == [warning.format("3,774,874")]
+    assert [each[-len(warning) - 7 :].strip() for each in caplog.messages] == [warning.format("3,774,873")]
+    await log.close()
+    asked = ("--url", database_url, "--spool", tmp_path / "spool")
+    assert answer("status", *asked, cwd=tmp_path)["warnings"] == [warning.format("3,774,874")]
+    assert f"warning: {warning.format('3,774,874')}" in pycrorm("status", *asked, cwd=tmp_path).stderr
+
+
+async def test_from_nine_tenths_of_an_episodes_sequences_on_status_warns_and_the_log_has_one_line(
+    database_url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    await log.append(run_of(episode(1), 1, 2))
+    first = 60_397_977
+    ask_to_change(database_url, f"UPDATE episode SET head = {first - 2}")
+    with caplog.at_level(logging.WARNING, logger="pycrorm_async"):
+        for sequence in range(first - 1, first + 2):
+            await log.append(run_of(episode(1), sequence, sequence))
+    assert len(caplog.messages) == 1
+    (warning,) = await log.limits_near()
+    assert warning.startswith("episode 1 (")
+    assert "has 60,397,978 of 67,108,863 events (90 %): it goes on in a follow-up episode" in warning
+    await log.close()

@@ -1,0 +1,235 @@
+"""A memory beside others: other memories, tasks, processes, and plans that nobody holds any more."""
+
+import asyncio
+import contextvars
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import (
+    UnknownEpisode,
+)
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.world.observers import watcher
+from tests.commands import environment
+from tests.memory.note_actions import NoteActionPerformable, texts, url_of
+
+
+async def test_a_memory_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
+    for text in ("one", "two", "three"):
+        async with Memory.open(url_of(tmp_path)):
+            await NoteActionPerformable(text).perform()
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["one", "two", "three"]
+        assert [each.number for each in await reading.episodes()] == [1, 2, 3]
+
+
+async def test_recording_ends_with_the_memory(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)):
+        await NoteActionPerformable("inside").perform()
+    assert recorder.get() is None
+    assert watcher.get() is None
+    await NoteActionPerformable("outside").perform()
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["inside"]
+
+
+async def test_what_is_performed_goes_to_the_memory_whose_episode_is_open(tmp_path: Path) -> None:
+    first, second = f"sqlite:///{tmp_path}/1.db", f"sqlite:///{tmp_path}/2.db"
+    async with Memory.open(first) as one, Memory.open(second) as two:
+        await NoteActionPerformable("to the last opened").perform()
+        async with one.episode(description="e"):
+            await NoteActionPerformable("to the one with the episode").perform()
+        await NoteActionPerformable("to the last opened again").perform()
+        await one.flush()
+        await two.flush()
+        assert await texts(one) == ["to the one with the episode"]
+        assert await texts(two) == ["to the last opened", "to the last opened again"]
+
+
+async def test_a_memory_closed_inside_an_episode_ends_it_as_interrupted(tmp_path: Path) -> None:
+    memory = Memory.open(url_of(tmp_path))
+    await memory.__aenter__()
+    opened = memory.episode(description="e")
+    await opened.__aenter__()
+    await NoteActionPerformable("a").perform()
+    await memory.__aexit__(None, None, None)
+    await opened.__aexit__(None, None, None)
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert [each.status for each in await reading.episodes()] == ["INTERRUPTED"]
+
+
+async def test_the_next_memory_adopts_what_a_killed_process_left(tmp_path: Path) -> None:
+    script = (
+        "import asyncio, os, signal, sys\n"
+        "from tests.memory.note_actions import Memory, NoteActionPerformable\n"
+        "async def main():\n"
+        "    async with Memory.open(sys.argv[1]) as memory, memory.episode(description='killed'):\n"
+        "        for index in range(50):\n"
+        "            await NoteActionPerformable(str(index)).perform()\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+        "asyncio.run(main())\n"
+    )
+    done = await asyncio.to_thread(
+        subprocess.run, [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), check=False
+    )
+    assert done.returncode == -9
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await NoteActionPerformable("after").perform()
+        for _ in range(200):
+            await memory.flush()
+            found = await texts(memory)
+            if len(found) == 51:
+                break
+            await asyncio.sleep(0.05)
+        assert sorted(found) == sorted([*map(str, range(50)), "after"])
+        lost = [each for each in await memory.reading.episodes() if each.description == "killed"]
+        assert [each.status for each in lost] == ["LOST"]
+    assert [path for path in (tmp_path / "memory.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
+
+
+async def test_concurrent_episodes_in_tasks_of_their_own_are_all_whole(tmp_path: Path) -> None:
+    async def run(name: str) -> None:
+        async with memory.episode(description=name):
+            for index in range(20):
+                await NoteActionPerformable(f"{name}{index}").perform()
+                await asyncio.sleep(0)
+
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await asyncio.gather(*(run(name) for name in "abcde"))
+        await memory.flush()
+        found = await memory.reading.episodes()
+        assert sorted(each.description for each in found) == list("abcde")
+        for each in found:
+            nodes = await memory.reading.tree(each.number)
+            assert [node.parameters.get("text") for node in nodes] == [None] + [
+                f"{each.description}{index}" for index in range(20)
+            ]
+        with pytest.raises(UnknownEpisode):
+            await memory.reading.episode("nothing")
+
+
+async def test_a_memory_opened_inside_an_episode_of_another_leaves_that_episode_whole(tmp_path: Path) -> None:
+    outer, inner = f"sqlite:///{tmp_path}/1.db", f"sqlite:///{tmp_path}/2.db"
+    async with Memory.open(outer) as one:
+        async with one.episode(description="outer"):
+            await NoteActionPerformable("1").perform()
+            async with Memory.open(inner) as two:
+                await NoteActionPerformable("2").perform()
+                await two.flush()
+                assert await texts(two) == ["2"]
+            await NoteActionPerformable("3").perform()
+        await one.flush()
+        assert [each.description for each in await one.reading.episodes()] == ["outer"]
+        assert await texts(one) == ["1", "3"]
+
+
+async def test_a_forked_child_leaves_the_memory_of_its_parent_alone(tmp_path: Path) -> None:
+    script = (
+        "import asyncio, os, sys\n"
+        "from tests.memory.note_actions import Memory, NoteActionPerformable\n"
+        "async def main():\n"
+        "    async with Memory.open(sys.argv[1]) as memory, memory.episode(description='parent'):\n"
+        "        await NoteActionPerformable('before').perform()\n"
+        "        child = os.fork()\n"
+        "        if child == 0:\n"
+        "            await NoteActionPerformable('in the child').perform()\n"
+        "            os._exit(7)\n"  # the way every worker of multiprocessing leaves
+        "        _, status = os.waitpid(child, 0)\n"
+        "        assert os.waitstatus_to_exitcode(status) == 7\n"
+        "        await NoteActionPerformable('after').perform()\n"
+        "asyncio.run(main())\n"
+    )
+    done = await asyncio.to_thread(
+        subprocess.run,
+        [sys.executable, "-c", script, url_of(tmp_path)],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["before", "after"]
+        assert [each.status for each in await reading.episodes()] == ["SUCCEEDED"]
+
+
+async def test_what_outlives_the_memory_runs_on_and_is_not_recorded(tmp_path: Path) -> None:
+    leave = asyncio.Event()
+
+    async def late() -> str:
+        await NoteActionPerformable("early").perform()
+        await leave.wait()
+        await NoteActionPerformable("late").perform()
+        return "ran"
+
+    async with Memory.open(url_of(tmp_path)) as memory:
+        task = asyncio.create_task(late())
+        await asyncio.sleep(0.1)
+        assert memory.status.faults.total == 0
+    leave.set()
+    assert await task == "ran"
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await texts(reading) == ["early"]
+
+
+async def test_memories_closed_in_another_order_than_opened_record_what_is_theirs(tmp_path: Path) -> None:
+    one, two = Memory.open(f"sqlite:///{tmp_path}/1.db"), Memory.open(f"sqlite:///{tmp_path}/2.db")
+    await one.__aenter__()
+    await two.__aenter__()
+    await one.__aexit__(None, None, None)
+    await NoteActionPerformable("to the second").perform()
+    await two.flush()
+    assert await texts(two) == ["to the second"]
+    await two.__aexit__(None, None, None)
+    assert recorder.get() is None
+    assert watcher.get() is None
+
+
+async def test_an_opening_that_fails_or_is_cancelled_leaves_no_thread(tmp_path: Path) -> None:
+    def ours() -> set[str]:
+        return {each.name for each in threading.enumerate() if each.name.startswith("pycrorm ")}
+
+    before = ours()
+    for turns in range(12):
+        task = asyncio.create_task(Memory.open(url_of(tmp_path)).__aenter__())
+        for _ in range(turns):
+            await asyncio.sleep(0.01)
+        if task.done():
+            await (await task).__aexit__(None, None, None)
+            continue
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+    for _ in range(500):
+        if ours() <= before:
+            break
+        await asyncio.sleep(0.02)
+    assert ours() <= before
+
+
+async def test_a_dropped_plan_that_is_closed_elsewhere_leaves_the_episode_there_alone(tmp_path: Path) -> None:
+    @dataclass
+    class HangActionPerformable(ActionAbstract):
+        async def perform(self) -> None:
+            await asyncio.sleep(60)
+
+    async with Memory.open(url_of(tmp_path)) as memory:
+        dropped = HangActionPerformable().perform()
+        context = contextvars.copy_context()
+        context.run(dropped.send, None)
+        while recorder.get() is not None and not memory.recent_episodes:
+            context.run(dropped.send, None)
+        async with memory.episode(description="mine"):
+            dropped.close()
+            await NoteActionPerformable("here").perform()
+        await memory.flush()
+        found = {each.description: each.nodes for each in await memory.reading.episodes()}
+        assert found == {"HangAction": 2, "mine": 2}

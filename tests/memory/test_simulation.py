@@ -1,0 +1,219 @@
+"""A memory keeps what was thought through apart from what happened."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sqlite3
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.operations.destination import recover
+from pycrorm_async.orm import (
+    Action,
+    Attachment,
+    MoveAndPickUpAction,
+    Object,
+    PickUpAction,
+    PickUpWithContextView,
+    ProcessMetaData,
+    TaskTreeNode,
+)
+from pycrorm_async.plan import (
+    ActionAbstract,
+    MoveAndPickUpPerformable,
+    MoveTorsoActionPerformable,
+    ObjectDesignator,
+    PlanFailure,
+    SimulatedTaskTree,
+    simulated_robot,
+)
+from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
+from pycrorm_async.world import Object as WorldObject
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.commands import answer, environment, pycrorm
+from tests.memory.note_actions import NoteActionPerformable, texts, url_of
+
+TOO_FAR = Pose([-2, 0, 0])
+NEAR = Pose([0.6, 0.9, 0], yaw_quaternion(-0.27))
+
+
+@dataclass
+class FetchFromAnywhereActionPerformable(ActionAbstract):
+    """Thinks through from where the thing can be picked up, and does it from the first place that works."""
+
+    thing: ObjectDesignator
+
+    async def perform(self) -> None:
+        for stand in (TOO_FAR, NEAR):
+            fetching = MoveAndPickUpPerformable(stand, self.thing, Arms.RIGHT, Grasp.FRONT)
+            try:
+                with SimulatedTaskTree(f"from x = {stand.position.x:g}"):
+                    await fetching.perform()
+            except PlanFailure:
+                continue
+            await fetching.perform()
+            return
+
+
+async def fetched(url: str) -> None:
+    """One real episode, in which one thought failed and one went well."""
+    async with Memory.open(url) as memory, memory.episode(description="fetch the cereal"):
+        with BulletWorld(), simulated_robot:
+            WorldObject("pr2", ObjectType.ROBOT)
+            WorldObject("kitchen", ObjectType.ENVIRONMENT)
+            cereal = WorldObject("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
+            await MoveTorsoActionPerformable(0.3).perform()
+            await FetchFromAnywhereActionPerformable(designator_of(cereal)).perform()
+
+
+async def test_the_plan_found_in_thought_is_what_happened_and_the_thoughts_are_left_out(tmp_path: Path) -> None:
+    await fetched(url_of(tmp_path))
+    async with Reading.open(url_of(tmp_path)) as reading:
+        async with reading.session() as session:
+            assert [each.dtype for each in await session.scalars(select(Action).order_by(Action.id))] == [
+                "MoveTorsoAction", "FetchFromAnywhereAction", "MoveAndPickUpAction", "NavigateAction", "FaceAtAction",
+                "NavigateAction", "LookAtAction", "PickUpAction",
+            ]  # fmt: skip
+            done = (await session.scalars(select(MoveAndPickUpAction))).one()
+            assert (done.standing_position.x, done.object.name) == (0.6, "cereal")
+            assert [each.description for each in await session.scalars(select(ProcessMetaData))] == ["fetch the cereal"]
+            positions = {(each.pose.x, each.pose.y) for each in await session.scalars(select(Object)) if each.pose}
+            assert (-2.0, 0.0) not in positions
+            assert len((await session.scalars(select(Attachment))).all()) == 1
+            assert set(await session.scalars(select(TaskTreeNode.simulated))) == {False}
+        frame = await reading.dataframe(select(PickUpWithContextView))
+        assert list(frame.status) == ["SUCCEEDED"]
+
+
+async def test_who_asks_for_thoughts_sees_what_came_of_them(tmp_path: Path) -> None:
+    await fetched(url_of(tmp_path))
+    async with Reading.open(url_of(tmp_path)) as reading:
+        frame = await reading.dataframe(select(PickUpWithContextView), simulated=True)
+        assert sorted(frame.status) == ["FAILED", "SUCCEEDED", "SUCCEEDED"]
+        async with reading.session(simulated=True) as session:
+            episodes = (await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id))).all()
+            assert [(each.description, each.simulated, each.status) for each in episodes] == [
+                ("fetch the cereal", False, "SUCCEEDED"),
+                ("from x = -2", True, "FAILED"),
+                ("from x = 0.6", True, "SUCCEEDED"),
+            ]
+            thinker = await session.scalar(select(TaskTreeNode).where(TaskTreeNode.dtype == "FetchFromAnywhereAction"))
+            assert thinker is not None
+            assert {(each.thought_by, each.thought_by_node) for each in episodes[1:]} == {
+                (episodes[0].uuid, thinker.id >> 5 & 2**26 - 1)
+            }
+            picked = (await session.scalars(select(PickUpAction).order_by(PickUpAction.id))).all()
+            # each episode has a cereal of its own, there as it was when it was picked up
+            assert len({each.object.id for each in picked}) == 3
+            poses = [each.object.pose for each in picked]
+            assert {(each.x, each.y, each.z) for each in poses if each is not None} == {(1.3, 0.7, 0.95)}
+            held = (await session.scalars(select(Attachment).order_by(Attachment.id))).all()
+            assert [each.process_metadata_id for each in held] == [1, 3]
+
+
+async def test_thoughts_without_an_episode_are_remembered_all_the_same(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with SimulatedTaskTree(description="what if"):
+            await NoteActionPerformable("thought").perform()
+        await NoteActionPerformable("real").perform()
+        await memory.flush()
+        assert await texts(memory) == ["real"]
+        assert [each.description for each in await memory.reading.episodes()] == ["NoteAction"]
+        both = await memory.reading.episodes(simulated=True)
+        assert [(each.description, each.simulated, each.thought_by) for each in both] == [
+            ("what if", True, None),
+            ("NoteAction", False, None),
+        ]
+        async with memory.session(simulated=True) as session:
+            assert len((await session.scalars(select(Action))).all()) == 2
+        assert len(await memory.dataframe(select(TaskTreeNode), simulated=True)) == 4
+        assert len(await memory.dataframe(select(TaskTreeNode))) == 2
+
+
+async def test_a_memory_opened_in_a_thought_remembers_thoughts(tmp_path: Path) -> None:
+    with SimulatedTaskTree():
+        async with Memory.open(url_of(tmp_path)) as memory:
+            await NoteActionPerformable("a").perform()
+            async with memory.episode(description="in a thought"):
+                await NoteActionPerformable("b").perform()
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert await reading.episodes() == []
+        assert {each.simulated for each in await reading.episodes(simulated=True)} == {True}
+
+
+async def test_a_memory_closed_in_a_thought_ends_it(tmp_path: Path) -> None:
+    with SimulatedTaskTree():
+        async with Memory.open(url_of(tmp_path)):
+            with SimulatedTaskTree():
+                await NoteActionPerformable("a").perform()
+                memory = Memory.open(f"sqlite:///{tmp_path}/other.db")
+                await memory.__aenter__()
+                with SimulatedTaskTree():
+                    await memory.__aexit__(None, None, None)
+    async with Reading.open(f"sqlite:///{tmp_path}/other.db") as reading:
+        assert [each.status for each in await reading.episodes(simulated=True)] == ["INTERRUPTED"]
+
+
+async def test_a_thought_whose_process_is_killed_is_lost_with_the_episode_around_it(tmp_path: Path) -> None:
+    script = (
+        "import asyncio, os, signal, sys\n"
+        "from pycrorm_async.plan import SimulatedTaskTree\n"
+        "from tests.memory.note_actions import Memory, NoteActionPerformable\n"
+        "async def main():\n"
+        "    async with Memory.open(sys.argv[1]) as memory, memory.episode(description='killed'):\n"
+        "        await NoteActionPerformable('real').perform()\n"
+        "        with SimulatedTaskTree():\n"
+        "            await NoteActionPerformable('thought').perform()\n"
+        "            os.kill(os.getpid(), signal.SIGKILL)\n"
+        "asyncio.run(main())\n"
+    )
+    done = await asyncio.to_thread(
+        subprocess.run, [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), check=False
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert (await recover(url_of(tmp_path))).failed == {}
+    async with Reading.open(url_of(tmp_path)) as reading:
+        found = await reading.episodes(simulated=True)
+        assert [(each.description, each.status, each.simulated) for each in found] == [
+            ("killed", "LOST", False),
+            ("thinking", "LOST", True),
+        ]
+        assert await texts(reading) == ["real"]
+
+
+async def test_who_asks_with_nothing_but_sqlite3_is_told_what_happened(tmp_path: Path) -> None:
+    await fetched(url_of(tmp_path))
+    connection = sqlite3.connect(tmp_path / "memory.db")
+    count = "SELECT (SELECT count(*) FROM pick_up_action), (SELECT count(*) FROM process_metadata)"
+    assert connection.execute(count).fetchall() == [(1, 1)]
+    connection.close()
+
+
+async def test_the_command_leaves_thoughts_out_and_tells_of_them_when_asked(tmp_path: Path) -> None:
+    await fetched(url_of(tmp_path))
+    url = ("--url", url_of(tmp_path))
+    assert [each["number"] for each in answer("episodes", *url, cwd=tmp_path)] == [1]
+    listed = answer("episodes", "--simulated", *url, cwd=tmp_path)
+    assert [(each["number"], each["simulated"]) for each in listed] == [(1, False), (2, True), (3, True)]
+    assert [listed[2]["thought_by"][name] for name in ("episode", "dtype")] == [1, "FetchFromAnywhereAction"]
+    assert answer("show", "last", *url, cwd=tmp_path)["episode"]["number"] == 1
+    thought = answer("show", "2", *url, cwd=tmp_path)
+    assert thought["episode"]["simulated"] is True
+    assert {each["simulated"] for each in thought["tree"]} == {True}
+    assert [each["dtype"] for each in thought["tree"]][:3] == [None, "MoveAndPickUpAction", "NavigateAction"]
+
+    table = pycrorm("episodes", "--simulated", *url, cwd=tmp_path).stdout
+    assert table.count("by FetchFromAnywhereAction of episode 1") == 2
+    assert "thought" not in pycrorm("episodes", *url, cwd=tmp_path).stdout
+    shown = pycrorm("show", "3", *url, cwd=tmp_path).stdout
+    assert "thought through by FetchFromAnywhereAction of episode 1; nothing of it happened" in shown
+    real = pycrorm("show", "1", *url, cwd=tmp_path).stdout
+    thinker = next(line for line in real.splitlines() if "FetchFromAnywhereAction" in line)
+    assert thinker.endswith("thought through in episodes 2, 3")

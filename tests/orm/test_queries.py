@@ -1,0 +1,304 @@
+"""The thesis' queries, and what an object names being there without another question."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+from sqlalchemy.ext.asyncio import AsyncSession
+from sqlalchemy.orm import selectinload, undefer
+
+import pycrorm_async.orm
+from pycrorm_async.events.types import (
+    CandidateValue,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    ObjectValue,
+    RobotValue,
+)
+from pycrorm_async.orm import (
+    Action,
+    Attachment,
+    Base,
+    BelieveObject,
+    Designator,
+    JointChange,
+    LocationResolution,
+    Motion,
+    MoveJointsMotion,
+    MoveMotion,
+    NavigateAction,
+    Object,
+    ObjectPart,
+    ObjectRemoval,
+    OpenAction,
+    PickUpAction,
+    Pose,
+    Position,
+    ProcessMetaData,
+    Quaternion,
+    RobotState,
+    TaskTreeNode,
+)
+from pycrorm_async.orm.types import Moment
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from tests.projections.event_script import (
+    MOVE,
+    NAVIGATE,
+    PICK_UP,
+    T0_NS,
+    Script,
+    declarations,
+    declared,
+    field,
+    name_of,
+    pose,
+    row,
+)
+from tests.projections.sql_queries import stored_and_folded
+
+OPEN = declared("OpenAction", "open_action", field("object_designator", "object", 2), field("arm", "enum", 3))
+MOVE_JOINTS = declared(
+    "MoveJointsMotion",
+    "move_joints_motion",
+    field("names", "list", 2, item="text"),
+    field("positions", "list", 3, item="real"),
+    kind="motion",
+)
+CLASSES = sorted(
+    (each for each in vars(pycrorm_async.orm).values() if isinstance(each, type) and issubclass(each, Base)),
+    key=lambda each: each.__name__,
+)
+
+
+def moment(sequence: int) -> datetime:
+    return datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC) + timedelta(seconds=sequence)
+
+
+@pytest.fixture
+async def script(log: EventLog) -> Script:
+    """A robot drives (with a motion inside), picks up the milk, opens the fridge, all in one episode."""
+    script = Script()
+    put = script.put
+    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))  # 1
+    root = put(NodeStarted("root"))  # 2
+    robot = put(ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))  # 3
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 4
+    fridge = put(ObjectAdded("fridge", "ENVIRONMENT", pose()))  # 5
+    state = RobotValue(pose(0.5, 0, 0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot, robot))
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))  # 6
+    put(LocationResolved("CostmapLocation", (CandidateValue(pose(7, 8), ("LEFT",)),), 0, 9, drive))  # 7
+    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))  # 8
+    put(NodeEnded(move, "SUCCEEDED"))  # 9
+    put(NodeEnded(drive, "SUCCEEDED"))  # 10
+    seen = ObjectReference(milk, milk)
+    grasp = {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", root, name_of(PICK_UP), grasp, state))  # 11
+    put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))  # 12
+    put(ObjectAttached(ObjectReference(robot, robot), seen, "l_gripper_tool_frame", pick))  # 13
+    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far", ["LEFT"])))  # 14
+    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1), ObjectReference(fridge, fridge))
+    put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "RIGHT"}, None))  # 15
+    joints = {"names": ["a", "b"], "positions": [0.5, -1.0]}
+    put(NodeStarted("motion", root, name_of(MOVE_JOINTS), joints, state))  # 16
+    put(JointsMoved(ObjectReference(robot, robot), {"a": 0.5}, root))  # 17
+    put(ObjectRemoved(seen))  # 18
+    put(EpisodeEnded("LOST"))  # 19
+    await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, MOVE, OPEN, MOVE_JOINTS), *script.records])
+    return script
+
+
+async def every(log: EventLog, question: Any) -> list[Any]:
+    async with AsyncSession(log.engine, expire_on_commit=False) as session:
+        return list((await session.scalars(question)).unique().all())
+
+
+async def test_a_fresh_memory_answers_every_class_with_nothing(log: EventLog) -> None:
+    await Projector(log).open()
+    mapped = [each for each in CLASSES if each is not Base]
+    assert len(mapped) > 50
+    assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
+
+
+async def test_the_episode_says_who_did_what_and_how_it_ended(log: EventLog, script: Script) -> None:
+    (metadata,) = await every(log, select(ProcessMetaData))
+    assert repr(metadata) == (
+        "ProcessMetaData(id=1, uuid='00000000-0000-7000-8000-000000000001',"
+        f" created_at={moment(1)!r}, created_by='me', description='Tutorial', version='1.0', host='host',"
+        f" python='3.11', plan='breakfast', status='LOST', ended_at={moment(19)!r},"
+        " simulated=False)"
+    )
+
+
+async def test_a_navigation_knows_where_from_and_where_to(log: EventLog, script: Script) -> None:
+    (drive,) = await every(log, select(NavigateAction))
+    assert (drive.id, drive.dtype, drive.kind) == (row(6), "NavigateAction", "action")
+    state = drive.robot_state
+    assert (state.torso_height, state.type, state.pose_id) == (0.25, ObjectType.ROBOT, row(6, 1))
+    assert (state.pose.position.x, state.pose.orientation.z, state.pose.orientation.w) == (0.5, 0.6, 0.8)
+    assert drive.pose is drive.target_location
+    assert drive.pose_id == drive.target_location_id == row(6, 2)
+    assert (drive.pose.position.x, drive.pose.position.y, drive.pose.frame) == (7.0, 8.0, "map")
+    assert drive.pose.time == datetime(2023, 11, 14, 22, 13, 19, 998_999, tzinfo=UTC)
+    assert drive.process_metadata.description == "Tutorial"
+    assert state.pose.process_metadata is drive.process_metadata
+
+
+async def test_an_action_shows_what_it_is_and_the_robot_it_was_done_with(log: EventLog, script: Script) -> None:
+    (pick,) = await every(log, select(PickUpAction))
+    assert repr(pick) == (
+        f"PickUpAction(id={row(11)}, process_metadata_id=1, dtype='PickUpAction', kind='action',"
+        f" robot_state_id={row(11)}, object_id={row(4)}, arm=<Arms.LEFT: 1>, grasp=<Grasp.TOP: 3>,"
+        f" robot_state=RobotState(id={row(11)}, process_metadata_id=1, torso_height=0.25,"
+        f" type=<ObjectType.ROBOT: 8>, pose_id={row(11, 1)}))"
+    )
+
+
+async def test_every_action_comes_as_its_own_class(log: EventLog, script: Script) -> None:
+    actions = await every(log, select(Action).order_by(Action.id))
+    assert [type(each) for each in actions] == [NavigateAction, PickUpAction, OpenAction]
+    assert actions[1].arm is Arms.LEFT
+    assert actions[1].grasp is Grasp.TOP
+    assert actions[1].object.pose.position.z == 3.0
+    assert actions[2].robot_state is None
+    motions = await every(log, select(Motion).order_by(Motion.id))
+    assert [type(each) for each in motions] == [MoveMotion, MoveJointsMotion]
+    assert motions[0].robot_state.pose.position.x == 0.5
+    assert (motions[1].names, motions[1].positions) == (["a", "b"], [0.5, -1.0])
+    designators = await every(log, select(Designator).order_by(Designator.id))
+    assert [type(each).__name__ for each in designators] == [
+        "NavigateAction", "MoveMotion", "PickUpAction", "OpenAction", "MoveJointsMotion",
+    ]  # fmt: skip
+    assert designators[0].target_location.position.x == 7.0
+
+
+async def test_the_pose_of_what_was_picked_up_is_the_one_at_execution(log: EventLog, script: Script) -> None:
+    for picked in (PickUpAction.object, PickUpAction.object_designator):
+        poses = await every(log, select(Pose).join(picked).join(Object.pose))
+        assert [(each.position.x, each.position.y, each.position.z) for each in poses] == [(1.0, 2.0, 3.0)]
+
+
+async def test_nodes_carry_their_action_parent_status_and_reason(log: EventLog, script: Script) -> None:
+    nodes = {each.id: each for each in await every(log, select(TaskTreeNode))}
+    assert sorted(nodes) == [row(2), row(6), row(8), row(11), row(15), row(16)]
+    pick = nodes[row(11)]
+    assert (pick.status, pick.reason, pick.failure_message) == (TaskStatus.FAILED, "IKError", "too far")
+    assert (pick.failure_arguments, pick.duration_s) == (["LEFT"], 3.0)
+    assert (pick.start_time, pick.end_time) == (moment(11), moment(14))
+    assert pick.action.object.pose.position.x == 1.0
+    assert pick.parent is nodes[row(2)]
+    assert nodes[row(2)].action is None
+    assert nodes[row(8)].parent.action.target_location.position.x == 7.0
+    assert (nodes[row(15)].status, nodes[row(15)].end_time) == (TaskStatus.LOST, None)
+    lost = select(TaskTreeNode.id).where(TaskTreeNode.status == TaskStatus.LOST).order_by(TaskTreeNode.id)
+    assert await every(log, lost) == [row(2), row(15), row(16)]
+
+
+async def test_one_node_alone_has_its_parent_loaded(log: EventLog, script: Script) -> None:
+    (node,) = await every(log, select(TaskTreeNode).where(TaskTreeNode.id == row(8)))
+    assert node.parent.id == row(6)
+    assert node.parent.action.robot_state.pose.position.x == 0.5
+
+
+async def test_nodes_join_their_designators(log: EventLog, script: Script) -> None:
+    question = (
+        select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == Arms.LEFT)
+    )
+    async with AsyncSession(log.engine) as session:
+        assert (await session.execute(question)).all() == [(Arms.LEFT, TaskStatus.FAILED)]
+        other = select(TaskTreeNode).join(TaskTreeNode.action.of_type(PickUpAction)).where(PickUpAction.arm == "LEFT")
+        assert [each.id for each in await session.scalars(other)] == [row(11)]
+
+
+async def test_the_parts_of_a_pose_can_be_joined(log: EventLog, script: Script) -> None:
+    question = (
+        select(Position.x, Quaternion.z)
+        .select_from(NavigateAction)
+        .join(NavigateAction.robot_state)
+        .join(RobotState.pose)
+        .join(Pose.position)
+        .join(Pose.orientation)
+    )
+    async with AsyncSession(log.engine) as session:
+        assert (await session.execute(question)).all() == [(0.5, 0.6)]
+
+
+async def test_objects_are_rows_of_moments_and_parts_know_what_they_belong_to(log: EventLog, script: Script) -> None:
+    milk = await every(log, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
+    assert [(each.id, each.pose.position.x, each.node_id) for each in milk] == [
+        (row(4), 1.0, None),
+        (row(12), 9.0, row(11)),
+    ]
+    (handle,) = await every(log, select(ObjectPart))
+    assert (handle.name, handle.part_of.name, handle.pose.position.x) == ("handle", "fridge", 1.0)
+    assert await every(log, select(BelieveObject)) == []
+    (robot,) = await every(log, select(Object).where(Object.obj_type == ObjectType.ROBOT))
+    assert robot.joints == {"torso": 0.25}
+
+
+async def test_what_happened_to_objects_can_be_asked(log: EventLog, script: Script) -> None:
+    (held,) = await every(log, select(Attachment))
+    assert (held.kind, held.parent.name, held.child.name, held.link) == (
+        "attached", "pr2", "milk", "l_gripper_tool_frame",
+    )  # fmt: skip
+    (turned,) = await every(log, select(JointChange))
+    assert (turned.joint, turned.position, turned.object.name, turned.time) == ("a", 0.5, "pr2", moment(17))
+    (gone,) = await every(log, select(ObjectRemoval))
+    assert (gone.object.name, gone.identity_id, gone.node_id) == ("milk", row(4), None)
+
+
+async def test_a_resolved_location_has_its_candidates(log: EventLog, script: Script) -> None:
+    (resolved,) = await every(log, select(LocationResolution))
+    assert (resolved.location, resolved.considered, resolved.offered, resolved.taken) == ("CostmapLocation", 9, 1, 0)
+    assert (resolved.pose.position.x, resolved.node.action.dtype) == (7.0, "NavigateAction")
+    assert [(each.x, each.reachable_arms, each.taken) for each in resolved.candidates] == [(7.0, [Arms.LEFT], True)]
+
+
+async def test_the_parameters_as_they_were_recorded_are_there_when_asked_for(log: EventLog, script: Script) -> None:
+    async with AsyncSession(log.engine) as session:
+        pick = (await session.scalars(select(PickUpAction))).one()
+        asked = await pick.awaitable_attrs.parameters
+        assert asked == {"object_designator": {"object": 4, "row": 4}, "arm": "LEFT", "grasp": "TOP"}
+    (joints,) = await every(log, select(MoveJointsMotion).options(undefer(MoveJointsMotion.parameters)))
+    assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
+
+
+async def test_an_action_leads_to_its_node_when_asked(log: EventLog, script: Script) -> None:
+    async with AsyncSession(log.engine) as session:
+        pick = (await session.scalars(select(PickUpAction))).one()
+        assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
+    (pick,) = await every(log, select(PickUpAction).options(selectinload(PickUpAction.node)))
+    assert (pick.node.status, pick.node.reason) == (TaskStatus.FAILED, "IKError")
+
+
+async def test_an_enum_member_this_process_does_not_know_is_its_name(log: EventLog) -> None:
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "OAT_MILK", pose()))
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "THIRD", "grasp": "TOP"}
+    script.put(NodeStarted("action", None, name_of(PICK_UP), parameters))
+    await stored_and_folded(log, [*declarations(PICK_UP), *script.records])
+    (pick,) = await every(log, select(PickUpAction))
+    assert (pick.arm, pick.grasp, pick.object.obj_type) == ("THIRD", Grasp.TOP, "OAT_MILK")
+
+
+async def test_moments_can_be_compared_and_a_naive_one_is_refused(log: EventLog, script: Script) -> None:
+    later = select(TaskTreeNode.id).where(TaskTreeNode.start_time > moment(11)).order_by(TaskTreeNode.id)
+    assert await every(log, later) == [row(15), row(16)]
+    with pytest.raises(ValueError, match="has no time zone"):
+        Moment().process_bind_param(datetime(2026, 1, 1), None)  # type: ignore[arg-type]  # noqa: DTZ001  the point
+    assert int(moment(0).timestamp()) * 10**9 == T0_NS

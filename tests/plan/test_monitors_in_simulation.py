@@ -1,0 +1,135 @@
+"""A monitor's condition is asked about what really happens, also while the plan it watches only thinks."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from contextlib import suppress
+from dataclasses import dataclass
+
+import pytest
+
+from pycrorm_async.plan import (
+    ActionAbstract,
+    Monitor,
+    NavigateActionPerformable,
+    Outcome,
+    SimulatedTaskTree,
+    TaskStatus,
+    collected_tree,
+)
+from pycrorm_async.plan.execution.observer import thinking
+from pycrorm_async.plan.failures import NotALanguageExpression
+from pycrorm_async.world import Pose, current_world
+from tests.plan.conftest import Scene
+from tests.plan.step_actions import Step
+
+THERE = Pose([0.6, 0.4, 0])
+DONE = Outcome(results=(None,), succeeded=(0,), interrupted=False)
+
+
+@dataclass
+class ThinkOfDrivingActionPerformable(ActionAbstract):
+    """Thinks that it drives there and looks around, for a while."""
+
+    target: Pose
+
+    async def perform(self) -> None:
+        with SimulatedTaskTree():
+            await NavigateActionPerformable(self.target).perform()
+            await Step("look", turns=5).perform()
+
+
+@pytest.mark.parametrize("asks_later", [True, False])
+async def test_what_is_only_thought_interrupts_nobody(scene: Scene, asks_later: bool) -> None:
+    def has_left() -> bool:
+        world = current_world.get()
+        assert world is not None
+        assert world.robot is not None
+        return world.robot.pose.position.x > 0.3
+
+    async def has_left_later() -> bool:
+        await asyncio.sleep(0)
+        return has_left()
+
+    condition = has_left_later if asks_later else has_left
+    plan = ThinkOfDrivingActionPerformable(THERE) + NavigateActionPerformable(THERE) + Step("never")
+    with collected_tree() as tree:
+        outcome = await (plan >> Monitor(condition, interval_s=60)).perform()
+    assert outcome == Outcome(results=(None,), interrupted=True)
+    assert [type(each.designator).__name__ for each in tree if each.status is TaskStatus.SUCCEEDED] == [
+        "ThinkOfDrivingActionPerformable",
+        "NavigateActionPerformable",
+        "MoveMotion",
+    ]
+
+
+@pytest.mark.parametrize("asks_later", [True, False])
+async def test_what_a_condition_performs_is_really_performed_while_the_plan_thinks(
+    scene: Scene, asks_later: bool
+) -> None:
+    thought: list[bool] = []
+
+    class Looking(ActionAbstract):
+        async def perform(self) -> None:
+            thought.append(thinking.get() is not None)
+
+    async def looks() -> bool:
+        await Looking().perform()
+        return False
+
+    condition = looks if asks_later else functools.partial(looks)
+    with collected_tree() as tree:
+        await (ThinkOfDrivingActionPerformable(THERE) >> Monitor(condition, interval_s=60)).perform()
+    # Asked once by the clock, and before each node: the thinking itself, the drive, its motion, and the look.
+    assert thought == [False] * 5
+    below = [type(node.designator).__name__ for node in tree.children(tree.roots[0])]
+    assert sorted(below) == ["Looking"] * 5 + ["ThinkOfDrivingActionPerformable"]
+
+
+async def test_a_condition_that_swallows_its_cancellation_does_not_outlive_the_plan() -> None:
+    begun, asked = asyncio.Event(), asyncio.Event()
+
+    class Waiting(ActionAbstract):
+        async def perform(self) -> None:
+            begun.set()
+            await asked.wait()
+
+    async def stubborn() -> bool:
+        if begun.is_set():
+            asked.set()
+            with suppress(asyncio.CancelledError):
+                await asyncio.Event().wait()
+        return False
+
+    async with asyncio.timeout(10):
+        assert await (Waiting() >> Monitor(stubborn, interval_s=0.001)).perform() == DONE
+
+
+@pytest.mark.parametrize("asks_later", [True, False])
+async def test_a_condition_that_is_cancelled_interrupts_as_whatever_it_raises(asks_later: bool) -> None:
+    asked = 0
+
+    def broken() -> bool:
+        nonlocal asked
+        asked += 1
+        if asked > 2:
+            raise asyncio.CancelledError("the camera is gone")
+        return False
+
+    async def broken_later() -> bool:
+        return broken()
+
+    class Waiting(ActionAbstract):
+        async def perform(self) -> None:
+            await asyncio.Event().wait()
+
+    plan = Waiting() >> Monitor(broken_later if asks_later else broken, interval_s=0.001)
+    with pytest.raises(asyncio.CancelledError):
+        async with asyncio.timeout(10):
+            await plan.perform()
+
+
+def test_the_wait_of_an_event_is_refused_and_the_event_asked_for() -> None:
+    with pytest.raises(NotALanguageExpression, match="give it the Event itself, not its wait"):
+        Monitor(asyncio.Event().wait)

@@ -1,0 +1,367 @@
+"""What is told of a perform, in which order, and how it ends in every case."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+import tracemalloc
+from collections.abc import Awaitable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import CoroutineType
+from typing import Any
+
+import pytest
+
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
+from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collected_tree, current_node
+from tests.plan.fake_observer import Recording
+
+
+class Abort(BaseException):
+    """Not an Exception."""
+
+
+@dataclass
+class Raising(ActionAbstract):
+    what: Any
+
+    async def perform(self) -> None:
+        if self.what is not None:
+            raise self.what
+
+
+@dataclass
+class Inside(ActionAbstract):
+    """Performs one action after another."""
+
+    parts: list[ActionAbstract]
+
+    async def perform(self) -> int:
+        for part in self.parts:
+            await part.perform()
+        return len(self.parts)
+
+
+@dataclass
+class Waiting(ActionAbstract):
+    for_what: asyncio.Event
+
+    async def perform(self) -> None:
+        await self.for_what.wait()
+
+
+@dataclass
+class Empty(ActionAbstract):
+    async def perform(self) -> None: ...
+
+
+OUTCOMES = [
+    (None, TaskStatus.SUCCEEDED),
+    (PlanFailure("no", 1), TaskStatus.FAILED),
+    (ObjectUnreachable("milk"), TaskStatus.FAILED),
+    (ValueError("bug"), TaskStatus.ERROR),
+    (asyncio.CancelledError(), TaskStatus.CANCELLED),
+    (Abort(), TaskStatus.ERROR),
+    (ExceptionGroup("failures", [PlanFailure("a"), ObjectUnreachable("b")]), TaskStatus.FAILED),
+    (ExceptionGroup("nested", [ExceptionGroup("inner", [PlanFailure("a")]), PlanFailure("b")]), TaskStatus.FAILED),
+    (ExceptionGroup("mixed", [PlanFailure("a"), ValueError("bug")]), TaskStatus.ERROR),
+    (ExceptionGroup("nested", [ExceptionGroup("inner", [PlanFailure("a"), ValueError("bug")])]), TaskStatus.ERROR),
+    (BaseExceptionGroup("cancelled", [PlanFailure("a"), asyncio.CancelledError()]), TaskStatus.ERROR),
+]
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize(("raised", "status"), OUTCOMES, ids=lambda each: getattr(each, "name", type(each).__name__))
+async def test_every_outcome_has_its_status_and_passes_through(
+    raised: BaseException | None, status: TaskStatus, recorded: bool
+) -> None:
+    with maybe(Recording() if recorded else None), collected_tree() as tree:
+        if raised is None:
+            assert await Inside([Raising(None)]).perform() == 1
+        else:
+            with pytest.raises(type(raised)) as caught:
+                await Inside([Raising(raised)]).perform()
+            assert caught.value is raised
+        assert current_node.get() is None
+    assert [(node.status, node.failure) for node in tree] == [(status, raised), (status, raised)]
+    assert [node.result for node in tree] == ([1, None] if raised is None else [None, None])
+    assert all(node.ended_ns is not None and node.ended_ns >= node.started_ns for node in tree)
+
+
+@pytest.mark.parametrize("raised", [KeyboardInterrupt, SystemExit])
+def test_what_ends_the_process_is_an_error_of_its_nodes_and_ends_it(raised: type[BaseException]) -> None:
+    recording = Recording()
+
+    async def plan() -> None:
+        with recording.listening():
+            await Inside([Raising(raised())]).perform()
+
+    with pytest.raises(raised):
+        asyncio.run(plan())
+    assert recording.told == ["start Inside", "start Raising", "end Raising ERROR", "end Inside ERROR"]
+
+
+async def test_a_recorder_is_told_each_start_and_end_once_in_legal_order() -> None:
+    with Recording().listening() as recording:
+        await Inside([Empty(), Inside([Empty()])]).perform()
+        with pytest.raises(PlanFailure):
+            await Inside([Raising(PlanFailure()), Empty()]).perform()
+    assert recording.told == [
+        "start Inside",
+        "start Empty",
+        "end Empty SUCCEEDED",
+        "start Inside",
+        "start Empty",
+        "end Empty SUCCEEDED",
+        "end Inside SUCCEEDED",
+        "end Inside SUCCEEDED",
+        "start Inside",
+        "start Raising",
+        "end Raising FAILED",
+        "end Inside FAILED",
+    ]
+    assert recording.open == []
+
+
+async def test_a_recorder_that_refuses_a_start_keeps_perform_from_running() -> None:
+    class Refusing(Recording):
+        def node_started(self, node: TaskTreeNode) -> None:
+            if isinstance(node.designator, Raising):
+                raise ZeroDivisionError
+            super().node_started(node)
+
+    with Refusing().listening() as recording, collected_tree() as tree:
+        with pytest.raises(ZeroDivisionError):
+            await Inside([Raising(AssertionError("perform ran"))]).perform()
+        assert current_node.get() is None
+    assert recording.told == ["start Inside", "end Inside ERROR"]
+    assert len(tree) == 1
+
+
+async def test_a_node_starts_only_when_the_recorder_has_room() -> None:
+    class Full(Recording):
+        def __init__(self) -> None:
+            super().__init__()
+            self.room = asyncio.Event()
+
+        def admit(self) -> Awaitable[None] | None:
+            return None if self.room.is_set() else self._room()
+
+        async def _room(self) -> None:
+            self.told.append("waits")
+            await self.room.wait()
+
+    with Full().listening() as recording:
+        assert isinstance(recording, Full)
+        plan = asyncio.create_task(Empty().perform())
+        await recording.heard(1)
+        assert recording.told == ["waits"]
+        recording.room.set()
+        await plan
+        await Empty().perform()
+    assert recording.told[1:] == ["start Empty", "end Empty SUCCEEDED"] * 2
+
+
+async def test_the_recorder_of_the_start_is_told_of_the_end() -> None:
+    first, second = Recording(), Recording()
+
+    class Switching(ActionAbstract):
+        async def perform(self) -> None:
+            recorder.set(second)
+
+    with first.listening():
+        await Switching().perform()
+    assert (first.told, second.told) == (["start Switching", "end Switching SUCCEEDED"], [])
+
+
+async def test_a_plan_is_cancelled_in_the_middle_and_every_open_node_says_so() -> None:
+    with Recording().listening() as recording:
+        plan = asyncio.create_task(Inside([Empty(), Waiting(asyncio.Event()), Empty()]).perform())
+        await recording.heard(4)
+        plan.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await plan
+    assert recording.told[3:] == ["start Waiting", "end Waiting CANCELLED", "end Inside CANCELLED"]
+
+
+async def test_a_plan_that_never_suspends_can_be_cancelled() -> None:
+    class Endless(ActionAbstract):
+        async def perform(self) -> None:
+            while True:
+                await Empty().perform()
+
+    with collected_tree() as tree:
+        plan = asyncio.create_task(Endless().perform())
+        await asyncio.sleep(0)
+        asyncio.get_running_loop().call_later(0.05, plan.cancel)
+        with pytest.raises(asyncio.CancelledError):
+            await plan
+    endless, *done = tree
+    assert endless.status is TaskStatus.CANCELLED
+    assert len(done) > 100
+    assert {node.status for node in done} == {TaskStatus.SUCCEEDED}
+
+
+def test_a_plan_that_never_suspends_hears_ctrl_c() -> None:
+    recording = Recording()
+
+    class Endless(ActionAbstract):
+        async def perform(self) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            while True:
+                await Empty().perform()
+
+    async def plan() -> None:
+        with recording.listening():
+            await Endless().perform()
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(plan())
+    assert recording.told[-1] == "end Endless CANCELLED"
+
+
+async def test_plans_in_different_tasks_never_share_a_parent() -> None:
+    @dataclass
+    class Step(ActionAbstract):
+        owner: str
+
+        async def perform(self) -> None:
+            await asyncio.sleep(0)
+
+    @dataclass
+    class Plan(ActionAbstract):
+        owner: str
+
+        async def perform(self) -> None:
+            await all_started.wait()
+            for _ in range(20):
+                await Step(self.owner).perform()
+                await asyncio.sleep(0)
+
+    all_started = asyncio.Barrier(3)
+    with Recording().listening() as recording:
+        await asyncio.gather(*(Plan(owner).perform() for owner in "abc"))
+    steps = [node for node in recording.ended if isinstance(node.designator, Step)]
+    assert len(steps) == 60
+    assert recording.told[:5] == ["start Plan", "start Plan", "start Plan", "start Step", "start Step"]
+    for step in steps:
+        assert isinstance(step.designator, Step)
+        assert step.parent is not None
+        assert isinstance(step.parent.designator, Plan)
+        assert step.parent.designator.owner == step.designator.owner
+        assert step.parent.parent is None
+
+
+async def test_a_task_started_inside_an_action_belongs_to_it() -> None:
+    class Both(ActionAbstract):
+        async def perform(self) -> None:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(Empty().perform())
+                group.create_task(Raising(None).perform())
+
+    with collected_tree() as tree:
+        await Both().perform()
+    assert [(type(node.designator).__name__, tree.depth(node)) for node in tree] == [
+        ("Both", 0),
+        ("Empty", 1),
+        ("Raising", 1),
+    ]
+
+
+async def test_a_plan_whose_parts_failed_at_the_same_time_failed() -> None:
+    failures = [ObjectUnreachable("milk"), PlanFailure("cereal")]
+
+    class AtOnce(ActionAbstract):
+        async def perform(self) -> None:
+            async with asyncio.TaskGroup() as group:
+                for failure in failures:
+                    group.create_task(Raising(failure).perform())
+                group.create_task(Waiting(asyncio.Event()).perform())
+
+    with collected_tree() as tree, pytest.raises(ExceptionGroup) as caught:
+        await AtOnce().perform()
+    assert list(caught.value.exceptions) == failures
+    assert [(type(node.designator).__name__, node.status, node.failure) for node in list(tree)[:3]] == [
+        ("AtOnce", TaskStatus.FAILED, caught.value),
+        ("Raising", TaskStatus.FAILED, failures[0]),
+        ("Raising", TaskStatus.FAILED, failures[1]),
+    ]
+    assert [node.status for node in list(tree)[3:]] == [TaskStatus.CANCELLED]
+
+
+async def test_a_suspended_plan_that_is_dropped_leaves_the_current_node_of_others_alone() -> None:
+    with Recording().listening() as recording:
+
+        async def suspended() -> CoroutineType[Any, Any, Any]:
+            coroutine = Inside([Waiting(asyncio.Event())]).perform()
+            while len(recording.told) < 2:
+                coroutine.send(None)
+            assert isinstance(coroutine, CoroutineType)
+            return coroutine
+
+        dropped = await asyncio.create_task(suspended())
+        here = TaskTreeNode(None, "root", None, 0)
+        current_node.set(here)
+        dropped.close()
+        assert current_node.get() is here
+    assert recording.told[2:] == ["end Waiting ERROR", "end Inside ERROR"]
+
+
+async def test_a_failed_perform_leaves_nothing_for_the_garbage_collector() -> None:
+    class Failing(ActionAbstract):
+        async def perform(self) -> None:
+            raise PlanFailure("x")
+
+    async def plan() -> None:
+        for _ in range(10):
+            try:
+                await Inside([Failing()]).perform()
+            except PlanFailure:
+                continue
+
+    def nodes() -> list[TaskTreeNode]:
+        return [each for each in gc.get_objects() if isinstance(each, TaskTreeNode)]
+
+    await plan()
+    gc.collect()
+    before = nodes()
+    gc.disable()
+    try:
+        await plan()
+        assert len(nodes()) == len(before)
+        assert not any(isinstance(each, Failing) for each in gc.get_objects())
+    finally:
+        gc.enable()
+
+
+async def test_a_plan_of_a_hundred_thousand_performs_keeps_memory_flat() -> None:
+    class Many(ActionAbstract):
+        async def perform(self) -> None:
+            for _ in range(2_000):
+                await Inside([Empty()]).perform()
+
+    await Many().perform()
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        for _ in range(25):
+            await Many().perform()
+        after, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert after - before < 50_000
+    assert peak - before < 500_000
+
+
+@contextmanager
+def maybe(recording: Recording | None) -> Iterator[None]:
+    if recording is None:
+        yield
+    else:
+        with recording.listening():
+            yield

@@ -1,0 +1,162 @@
+"""Where to stand to open and close: every place that is offered really does, and what cannot be is said."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import pytest
+
+from pycrorm_async.plan import (
+    AccessingLocation,
+    CloseActionPerformable,
+    Location,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    NoRobotHere,
+    ObjectPart,
+    OpenActionPerformable,
+    ParkArmsActionPerformable,
+)
+from pycrorm_async.plan.execution.observer import Candidate
+from pycrorm_async.plan.failures import (
+    EnvironmentManipulationImpossible,
+    EnvironmentUnreachable,
+    PerceptionObjectNotInWorld,
+)
+from pycrorm_async.world import Arms, Pose
+from pycrorm_async.world.errors import UnknownLink
+from tests.plan.conftest import Scene
+from tests.plan.fake_observer import Recording
+
+DRAWERS = [
+    "kitchen_counter_upper_drawer",
+    "kitchen_counter_lower_drawer",
+    "sink_area_drawer",
+    "kitchen_island_upper_drawer",
+    "kitchen_island_lower_drawer",
+]
+TRAVEL = dict.fromkeys(DRAWERS, 0.35) | {"fridge_door": 1.9}
+"""How far each of them goes, as the kitchen's own description says: m, rad."""
+ABOUT = 12
+"""So many of the places are tried, from all over the order."""
+
+
+def some(places: list[Location]) -> list[Location]:
+    return places[:: max(1, len(places) // ABOUT)]
+
+
+@pytest.mark.parametrize(
+    ("name", "torso"), [*((name, 0.3 if "lower" in name else 0.0) for name in TRAVEL), ("fridge_door", 0.3)]
+)
+async def test_from_every_place_that_is_offered_it_can_be_opened_and_closed(
+    scene: Scene, name: str, torso: float
+) -> None:
+    await MoveTorsoActionPerformable(torso).perform()
+    handle, joint = ObjectPart(f"{name}_handle", scene.kitchen), f"{name}_joint"
+    before = scene.world.save_state()
+    places = list(AccessingLocation(handle, scene.robot))
+    assert len(places) >= 90
+    for place in some(places):
+        for arm in place.reachable_arms:
+            await NavigateActionPerformable(place.pose).perform()
+            await OpenActionPerformable(handle, arm).perform()
+            assert scene.kitchen.joint_position(joint) == pytest.approx(TRAVEL[name] - 0.05)
+            tool = scene.robot.link_pose(f"{'l' if arm is Arms.LEFT else 'r'}_gripper_tool_frame")
+            assert tool.distance(scene.kitchen.link_pose(f"{name}_handle")) < 1e-5
+            await ParkArmsActionPerformable(Arms.BOTH).perform()
+            await CloseActionPerformable(handle, arm).perform()
+            assert scene.kitchen.joint_position(joint) == 0
+            scene.world.restore_state(before)
+
+
+@pytest.mark.parametrize(("name", "now"), [("sink_area_drawer", 0.13), ("fridge_door", 0.77)])
+async def test_what_stands_half_open_can_be_opened_or_closed_from_every_place_that_is_offered(
+    scene: Scene, name: str, now: float
+) -> None:
+    handle, joint = ObjectPart(f"{name}_handle", scene.kitchen), f"{name}_joint"
+    scene.kitchen.set_joint_position(joint, now)
+    before = scene.world.save_state()
+    for place in some(list(AccessingLocation(handle, scene.robot))):
+        arm = place.reachable_arms[0]
+        for action, there in ((OpenActionPerformable, TRAVEL[name] - 0.05), (CloseActionPerformable, 0.0)):
+            await NavigateActionPerformable(place.pose).perform()
+            await action(handle, arm).perform()
+            assert scene.kitchen.joint_position(joint) == pytest.approx(there)
+            scene.world.restore_state(before)
+
+
+def test_places_are_on_the_floor_clear_of_furniture_and_those_that_the_drawer_sweeps_come_last(scene: Scene) -> None:
+    def gap(pose: Pose, low: tuple[float, float], high: tuple[float, float]) -> float:
+        x, y, _ = pose.position
+        return max(low[0] - x, x - high[0], low[1] - y, y - high[1])
+
+    places = list(AccessingLocation(ObjectPart("kitchen_counter_lower_drawer_handle", scene.kitchen), scene.robot))
+    boxes = [box for link in scene.kitchen.links if (box := scene.kitchen.bounding_box(link)).size != (0, 0, 0)]
+    for place in places:
+        assert place.pose.position.z == 0
+        for box in boxes:
+            assert gap(place.pose, box.min[:2], box.max[:2]) >= 0.4 - 1e-9
+    # Pulled out by 0.3 m: the panel, 0.6 m wide, to 1.05 - 0.02 - 0.3, the handle to 1.05 - 0.05 - 0.008 - 0.3.
+    panel, bar = ((0.73, 0.05), (1.05, 0.65)), ((0.692, 0.28), (1.05, 0.42))
+    swept = [min(gap(place.pose, *panel), gap(place.pose, *bar)) < 0.4 for place in places]
+    assert swept == sorted(swept)
+    assert True in swept
+    assert False in swept
+    facing = [place for place in places if abs(_aside(place.pose, (1.0, 0.35))) < 1e-9]
+    assert 0 < len(facing) < len(places)
+    assert places[0] in facing
+
+
+def _aside(pose: Pose, goal: tuple[float, float]) -> float:
+    """How far, rad, the pose looks past the point."""
+    towards = math.atan2(goal[1] - pose.position.y, goal[0] - pose.position.x)
+    return math.remainder(pose.yaw - towards, math.tau)
+
+
+def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+
+    def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
+        return {each.reachable_arms for each in AccessingLocation(handle, scene.robot, arm)}
+
+    assert reaching(Arms.RIGHT) == {(Arms.RIGHT,)}
+    assert reaching(Arms.BOTH) == {(Arms.LEFT, Arms.RIGHT)}
+    assert reaching(None) == {(Arms.LEFT,), (Arms.RIGHT,), (Arms.LEFT, Arms.RIGHT)}
+
+
+def test_looking_for_a_place_moves_nothing_and_is_told_once(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    before = scene.world.save_state()
+    with Recording().listening() as recording:
+        first, second = itertools.islice(AccessingLocation(handle, scene.robot), 2)
+    assert scene.world.save_state() == before
+    ((name, offered, taken, considered, node),) = recording.places
+    assert (name, taken, node) == ("AccessingLocation", 1, None)
+    assert offered == tuple(Candidate(each.pose, each.reachable_arms) for each in (first, second))
+    assert considered >= 2
+
+
+def test_a_handle_that_cannot_be_reached_from_anywhere_is_a_failure_and_is_recorded(scene: Scene) -> None:
+    scene.kitchen.set_pose(Pose([0, 0, 1.5]))
+    with Recording().listening() as recording, pytest.raises(EnvironmentUnreachable, match="no place") as caught:
+        AccessingLocation(ObjectPart("sink_area_drawer_handle", scene.kitchen), scene.robot).resolve()
+    assert caught.value.data == ("sink_area_drawer_handle",)
+    ((name, offered, taken, considered, _),) = recording.places
+    assert (name, offered, taken) == ("AccessingLocation", (), None)
+    assert considered > 600
+
+
+def test_what_cannot_be_opened_is_said(scene: Scene) -> None:
+    def asked(part: ObjectPart) -> None:
+        AccessingLocation(part, scene.robot).resolve()
+
+    with pytest.raises(EnvironmentManipulationImpossible, match="no joint of kitchen moves sink_area_surface"):
+        asked(ObjectPart("sink_area_surface", scene.kitchen))
+    with pytest.raises(UnknownLink, match="attic_handle"):
+        asked(ObjectPart("attic_handle", scene.kitchen))
+    with pytest.raises(NoRobotHere, match="'milk' is not a robot"):
+        AccessingLocation(ObjectPart("sink_area_drawer_handle", scene.kitchen), scene.milk).resolve()
+    scene.world.remove(scene.kitchen)
+    with pytest.raises(PerceptionObjectNotInWorld, match="kitchen"):
+        asked(ObjectPart("sink_area_drawer_handle", scene.kitchen))

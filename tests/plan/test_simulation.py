@@ -1,0 +1,411 @@
+"""A plan that is thought through shows what would come of it, and nothing of it happens."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.plan import (
+    ActionAbstract,
+    CostmapLocation,
+    IKError,
+    LocatedObjectDescription,
+    MoveAndPickUpPerformable,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    ObjectDesignator,
+    ObjectDesignatorDescription,
+    ObjectPart,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    SimulatedTaskTree,
+    TransportActionPerformable,
+    collected_tree,
+    simulated_robot,
+)
+from pycrorm_async.plan.execution.observer import thinking
+from pycrorm_async.plan.failures import PerceptionObjectNotInWorld
+from pycrorm_async.plan.object_designators import designator_of, in_world
+from pycrorm_async.plan.task_tree import TaskStatus, current_node
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, current_world
+from pycrorm_async.world.errors import WorldClosed
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.plan.conftest import Scene
+from tests.plan.fake_observer import Recording
+from tests.world.fakes import Witness
+
+THERE = Pose([0.6, 0.4, 0])
+AT_THE_CEREAL = Pose([0.6, 0.9, 0], yaw_quaternion(-0.27))
+
+
+@dataclass
+class ThinkActionPerformable(ActionAbstract):
+    """Thinks that it drives there, and says what it saw come of it."""
+
+    target: Pose
+
+    async def perform(self) -> Any:
+        with SimulatedTaskTree() as tree:
+            await NavigateActionPerformable(self.target).perform()
+            robot = current_world.get().robot  # type: ignore[union-attr]
+            assert robot is not None
+            return robot.pose, [str(node) for node in tree]
+
+
+async def test_what_is_thought_through_happens_in_a_copy_and_nowhere_else(scene: Scene) -> None:
+    witness = Witness()
+    scene.world.observe(witness)
+    before = scene.world.save_state()
+    with SimulatedTaskTree() as tree:
+        copy = current_world.get()
+        assert copy is not None
+        assert copy is not scene.world
+        await MoveTorsoActionPerformable(0.3).perform()
+        await NavigateActionPerformable(THERE).perform()
+        assert copy.object("pr2").pose == THERE
+        assert copy.object("pr2").joint_position("torso_lift_joint") == 0.3
+    assert scene.world.save_state() == before
+    assert witness.told == []
+    assert current_world.get() is scene.world
+    assert not copy.entered
+    assert [(type(node.designator).__name__, node.status, tree.depth(node)) for node in tree] == [
+        ("MoveTorsoActionPerformable", TaskStatus.SUCCEEDED, 0),
+        ("MoveJointsMotion", TaskStatus.SUCCEEDED, 1),
+        ("NavigateActionPerformable", TaskStatus.SUCCEEDED, 0),
+        ("MoveMotion", TaskStatus.SUCCEEDED, 1),
+    ]
+
+
+async def test_what_was_found_in_a_thought_comes_true_to_the_last_bit(scene: Scene) -> None:
+    """The same plan, thought through and then done: both worlds end in the same state."""
+    target = Pose([1.3, 1.0, 0.95])
+
+    async def plan() -> None:
+        await TransportActionPerformable(cereal, Arms.LEFT, target).perform()
+
+    scene.milk.remove()
+    cereal = ObjectDesignatorDescription(names=["cereal"]).resolve()
+    await MoveTorsoActionPerformable(0.3).perform()
+    with SimulatedTaskTree() as tree:
+        await plan()
+        thought = current_world.get().save_state()  # type: ignore[union-attr]
+    assert scene.cereal.pose == Pose([1.3, 0.7, 0.95])
+    with collected_tree() as real:
+        await plan()
+    assert scene.world.save_state() == thought
+    assert [str(node) for node in tree] == [str(node) for node in real]
+    assert scene.cereal.pose.distance(target) < 0.01
+
+
+async def test_designators_mean_the_copy_inside_and_the_real_object_outside(scene: Scene) -> None:
+    milk = ObjectDesignatorDescription(names=["milk"]).resolve()
+    part = ObjectPart("torso_lift_link", scene.robot)
+    real_part = part.pose
+    with SimulatedTaskTree():
+        copy = current_world.get()
+        assert copy is not None
+        there = copy.object("milk")
+        assert in_world(milk) is in_world(scene.milk) is there
+        there.set_pose(Pose([5, 5, 5]))
+        assert milk.pose == designator_of(scene.milk).pose == Pose([5, 5, 5])
+        assert milk.frozen_copy().pose == Pose([5, 5, 5])
+        copy.object("pr2").set_pose(Pose([7, 0, 0]))
+        assert part.pose.position.x == pytest.approx(real_part.position.x + 7, abs=1e-6)
+        inside = ObjectDesignatorDescription(names=["milk"]).resolve()
+        assert inside.world_object is there
+    assert milk.pose == Pose([1.3, 1, 0.9])
+    assert part.pose == real_part
+    assert inside.pose == Pose([1.3, 1, 0.9])
+    assert in_world(inside) is in_world(there) is scene.milk
+
+
+async def test_an_object_given_itself_is_that_of_the_copy_too(scene: Scene) -> None:
+    """MoveAndPickUp faces it, picks it up and holds it: all in the copy, though the plan names the real object."""
+    with SimulatedTaskTree() as tree:
+        copy = current_world.get()
+        assert copy is not None
+        copy.object("cereal").set_pose(Pose([1.3, 0.75, 0.95]))
+        await MoveTorsoActionPerformable(0.3).perform()
+        await MoveAndPickUpPerformable(AT_THE_CEREAL, scene.cereal, Arms.RIGHT, Grasp.FRONT).perform()
+        assert copy.object("cereal").attached_to is copy.object("pr2")
+        faced = next(node.designator for node in tree if type(node.designator).__name__ == "FaceAtPerformable")
+        assert faced.pose == Pose([1.3, 0.75, 0.95])  # type: ignore[union-attr]
+    assert scene.cereal.attached_to is None
+    assert scene.robot.pose == Pose()
+
+
+async def test_what_is_held_is_held_in_the_copy(scene: Scene) -> None:
+    await MoveTorsoActionPerformable(0.3).perform()
+    await NavigateActionPerformable(AT_THE_CEREAL).perform()
+    await PickUpActionPerformable(scene.cereal, Arms.RIGHT, Grasp.FRONT).perform()
+    held_at = scene.cereal.pose
+    with SimulatedTaskTree():
+        await NavigateActionPerformable(AT_THE_CEREAL).perform()
+        target = Pose([1.3, 0.6, 0.95])
+        await PlaceActionPerformable(scene.cereal, Arms.RIGHT, target).perform()
+        assert designator_of(scene.cereal).pose.distance(target) < 0.01
+        assert in_world(scene.cereal).attached_to is None
+    assert scene.cereal.attached_to is scene.robot
+    assert scene.cereal.pose == held_at
+
+
+async def test_places_are_looked_for_in_the_copy_and_are_plain_poses(scene: Scene) -> None:
+    """With the milk moved in thought, the place to stand is beside where it would be."""
+    with SimulatedTaskTree():
+        in_world(scene.milk).set_pose(Pose([1.3, -0.5, 0.9]))
+        await MoveTorsoActionPerformable(0.3).perform()
+        stand = CostmapLocation(scene.milk, reachable_for=scene.robot).resolve()
+    assert stand.pose.distance(Pose([1.3, -0.5, 0])) < 1.0
+    await NavigateActionPerformable(stand.pose).perform()
+    assert scene.robot.pose == stand.pose
+
+
+async def test_an_object_is_not_located_relative_to_itself_in_a_copy_either(scene: Scene) -> None:
+    located = LocatedObjectDescription([scene.milk], types=[ObjectType.MILK, ObjectType.BREAKFAST_CEREAL])
+    with SimulatedTaskTree():
+        assert [each.name for each in located] == ["cereal"]
+
+
+async def test_what_is_only_in_the_copy_is_not_in_the_world_outside(scene: Scene) -> None:
+    with SimulatedTaskTree():
+        spoon = designator_of(Object("spoon", ObjectType.SPOON, pose=Pose([1, 1, 1])))
+        assert in_world(spoon).pose == spoon.pose == Pose([1, 1, 1])
+        in_world(scene.milk).remove()
+        with pytest.raises(PerceptionObjectNotInWorld, match="milk is not an object of the world"):
+            in_world(scene.milk)
+    with pytest.raises(PerceptionObjectNotInWorld, match="spoon is not an object of the world"):
+        in_world(spoon)
+    with pytest.raises(PerceptionObjectNotInWorld):
+        await PickUpActionPerformable(spoon, Arms.LEFT, Grasp.FRONT).perform()
+    assert spoon.pose == Pose([1, 1, 1])  # what was last known
+    assert in_world(scene.milk) is scene.milk
+
+
+async def test_what_was_removed_before_or_meanwhile_is_not_in_the_world(scene: Scene) -> None:
+    milk, cereal = designator_of(scene.milk), designator_of(scene.cereal)
+    scene.milk.remove()
+    with SimulatedTaskTree():
+        with pytest.raises(PerceptionObjectNotInWorld):
+            in_world(milk)
+        inside = ObjectDesignatorDescription(names=["cereal"]).resolve()
+        scene.cereal.remove()
+        assert in_world(cereal) is inside.world_object
+    with pytest.raises(PerceptionObjectNotInWorld):
+        in_world(inside)
+
+
+async def test_an_object_of_another_world_is_left_alone(scene: Scene) -> None:
+    with BulletWorld():
+        spoon = Object("milk", ObjectType.MILK, pose=Pose([9, 9, 9]))
+        assert in_world(scene.milk) is scene.milk
+    with SimulatedTaskTree():
+        assert designator_of(spoon).pose == Pose([9, 9, 9])
+
+
+async def test_a_thought_without_a_world_is_only_a_tree_of_its_own() -> None:
+    @dataclass
+    class NothingActionPerformable(ActionAbstract):
+        async def perform(self) -> None:
+            assert current_world.get() is None
+
+    with collected_tree() as around, SimulatedTaskTree() as tree:
+        await NothingActionPerformable().perform()
+    assert (len(around), len(tree)) == (0, 1)
+
+
+async def test_a_thought_has_its_own_root_and_the_tree_around_goes_on_without_it(scene: Scene) -> None:
+    with collected_tree() as around:
+        pose, inner = await ThinkActionPerformable(THERE).perform()
+        await NavigateActionPerformable(Pose([0.1, 0, 0])).perform()
+    assert pose == THERE
+    assert inner == ["<NavigateActionPerformable SUCCEEDED>", "<MoveMotion SUCCEEDED>"]
+    names = [(type(node.designator).__name__, around.depth(node)) for node in around]
+    assert names == [("ThinkActionPerformable", 0), ("NavigateActionPerformable", 0), ("MoveMotion", 1)]
+    assert scene.robot.pose == Pose([0.1, 0, 0])
+
+
+@pytest.mark.parametrize("raised", [IKError(Pose(), Arms.LEFT, "tool", "no"), ValueError("sour"), KeyboardInterrupt()])
+async def test_whatever_leaves_a_thought_goes_through_and_the_world_is_as_before(
+    scene: Scene, raised: BaseException
+) -> None:
+    before = scene.world.save_state()
+    with pytest.raises(type(raised)) as caught, SimulatedTaskTree() as tree:
+        await NavigateActionPerformable(THERE).perform()
+        raise raised
+    assert caught.value is raised
+    assert scene.world.save_state() == before
+    assert (current_world.get(), current_node.get(), thinking.get()) == (scene.world, None, None)
+    assert len(tree) == 2
+
+
+async def test_a_thought_that_is_cancelled_leaves_the_world_as_before(scene: Scene) -> None:
+    began = asyncio.Event()
+
+    async def dreaming() -> None:
+        with SimulatedTaskTree():
+            await NavigateActionPerformable(THERE).perform()
+            began.set()
+            await asyncio.sleep(60)
+
+    task = asyncio.create_task(dreaming())
+    await began.wait()
+    assert scene.robot.pose == Pose()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert scene.robot.pose == Pose()
+
+
+class Suspended:
+    """An await that nobody ends."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
+
+
+async def test_a_thought_that_nobody_awaits_any_more_is_closed_without_touching_its_surroundings(scene: Scene) -> None:
+    copies: list[BulletWorld | None] = []
+
+    async def dreaming() -> None:
+        with SimulatedTaskTree():
+            copies.append(current_world.get())
+            await Suspended()
+
+    listening = Recording()
+    with listening.listening():
+        dream = dreaming()
+        contextvars.copy_context().run(dream.send, None)
+        (copy,) = copies
+        assert copy is not None
+        assert copy.entered
+        dream.close()
+    assert not copy.entered
+    assert (current_world.get(), current_node.get(), thinking.get()) == (scene.world, None, None)
+    assert listening.told == ["think None", "thought GeneratorExit"]
+
+
+async def test_thoughts_nest(scene: Scene) -> None:
+    with SimulatedTaskTree() as outer:
+        await NavigateActionPerformable(THERE).perform()
+        with SimulatedTaskTree() as inner:
+            assert in_world(scene.robot).pose == THERE
+            await NavigateActionPerformable(Pose([2, 2, 0])).perform()
+            assert in_world(scene.robot).pose == Pose([2, 2, 0])
+            found = designator_of(in_world(scene.milk))
+        assert in_world(scene.robot).pose == THERE
+        assert in_world(found).world is current_world.get()
+    assert (len(outer), len(inner)) == (2, 2)
+    assert in_world(found) is scene.milk
+    assert scene.robot.pose == Pose()
+
+
+async def test_what_was_resolved_in_one_thought_is_meant_in_the_next(scene: Scene) -> None:
+    with SimulatedTaskTree():
+        found = ObjectDesignatorDescription(names=["milk"]).resolve()
+        in_world(found).set_pose(Pose([9, 9, 9]))
+    with SimulatedTaskTree():
+        assert found.pose == Pose([1.3, 1, 0.9])
+        assert in_world(found).world is current_world.get()
+
+
+async def test_two_tasks_think_at_once_and_a_third_acts(scene: Scene) -> None:
+    ready = asyncio.Barrier(3)
+
+    async def dreaming(x: float) -> tuple[Pose, int]:
+        with SimulatedTaskTree() as tree:
+            await ready.wait()
+            await NavigateActionPerformable(Pose([x, 0, 0])).perform()
+            await asyncio.sleep(0.01)
+            return in_world(scene.robot).pose, len(tree)
+
+    async def acting() -> None:
+        await ready.wait()
+        await NavigateActionPerformable(THERE).perform()
+
+    first, second, _ = await asyncio.gather(dreaming(1), dreaming(2), acting())
+    assert (first, second) == ((Pose([1, 0, 0]), 2), (Pose([2, 0, 0]), 2))
+    assert scene.robot.pose == THERE
+
+
+async def test_a_task_begun_in_a_thought_thinks_too_and_finds_the_copy_closed_afterwards(scene: Scene) -> None:
+    closing = asyncio.Event()
+
+    async def late() -> None:
+        await closing.wait()
+        await NavigateActionPerformable(THERE).perform()
+
+    with SimulatedTaskTree():
+        task = asyncio.create_task(late())
+        await asyncio.create_task(NavigateActionPerformable(THERE).perform())
+        assert in_world(scene.robot).pose == THERE
+    closing.set()
+    with pytest.raises(WorldClosed):
+        await task
+    assert scene.robot.pose == Pose()
+
+
+async def test_the_recorder_is_told_when_a_thought_begins_and_ends(scene: Scene) -> None:
+    listening = Recording()
+    with listening.listening():
+        with SimulatedTaskTree(description="what if"):
+            await NavigateActionPerformable(THERE).perform()
+        with pytest.raises(ValueError, match="sour"), SimulatedTaskTree():
+            raise ValueError("sour")
+    assert listening.told == [
+        "think what if",
+        "start NavigateActionPerformable",
+        "start MoveMotion",
+        "end MoveMotion SUCCEEDED",
+        "end NavigateActionPerformable SUCCEEDED",
+        "thought through",
+        "think None",
+        "thought ValueError",
+    ]
+
+
+async def test_a_robot_chosen_inside_a_thought_is_not_chosen_outside() -> None:
+    with BulletWorld() as world:
+        robot = Object("pr2", ObjectType.ROBOT)
+        with SimulatedTaskTree(), simulated_robot:
+            await NavigateActionPerformable(THERE).perform()
+        with pytest.raises(CallerError, match="robot"):
+            await NavigateActionPerformable(THERE).perform()
+        assert (robot.pose, world.robot) == (Pose(), robot)
+
+
+def test_a_thought_is_entered_once_and_described_in_words() -> None:
+    thought = SimulatedTaskTree()
+    with thought:
+        pass
+    with pytest.raises(CallerError, match="entered once; make a new SimulatedTaskTree"), thought:
+        pass
+    with pytest.raises(CallerError, match="a str, not 3"):
+        SimulatedTaskTree(description=3)  # type: ignore[arg-type]
+
+
+def test_a_thought_in_a_world_that_was_left_is_refused_and_changes_nothing() -> None:
+    with BulletWorld() as world:
+        pass
+    token = current_world.set(world)
+    try:
+        with pytest.raises(WorldClosed), SimulatedTaskTree():
+            pass
+        assert (current_world.get(), thinking.get()) == (world, None)
+    finally:
+        current_world.reset(token)
+
+
+def test_a_frozen_copy_taken_in_a_thought_keeps_the_pose_of_the_thought() -> None:
+    with BulletWorld():
+        milk: ObjectDesignator = designator_of(Object("milk", ObjectType.MILK))
+        with SimulatedTaskTree():
+            in_world(milk).set_pose(Pose([4, 0, 0]))
+            frozen = milk.frozen_copy()
+        assert frozen.pose == Pose([4, 0, 0])
+        assert milk.pose == Pose()

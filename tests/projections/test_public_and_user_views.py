@@ -1,0 +1,234 @@
+"""Views that join what learning asks for, and those that users register."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from sqlalchemy import func, select
+from sqlalchemy.dialects import sqlite
+from sqlalchemy.ext.asyncio import AsyncSession
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
+    FailureValue,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextView, TaskTreeNode
+from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.schema.generations import current_generation
+from pycrorm_async.projections.schema.layout import Contradictory
+from pycrorm_async.projections.schema.user_views import UserView, view_texts
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
+from tests.projections.sql_queries import ask, names, stored_and_folded
+
+
+def two_pick_ups() -> Script:
+    """The milk stands at (1, 2) and is picked up from (0.25, 2.5); then it is moved to (5, 5)."""
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 0.9)))
+    robot = RobotValue(pose(0.25, 2.5, 0, turned=0.6), "ROBOT", 0.3)
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+    node = script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, robot))
+    script.put(NodeEnded(node, "FAILED", FailureValue("a.IKError", "far")))
+    moved = script.put(ObjectMoved(milk, "milk", "MILK", pose(5, 5, 0.9)))
+    robot = RobotValue(pose(4, 4), "ROBOT", None)
+    parameters = {"object_designator": ObjectReference(milk, moved), "arm": "RIGHT", "grasp": "FRONT"}
+    node = script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, robot))
+    script.put(NodeEnded(node, "SUCCEEDED"))
+    return script
+
+
+async def test_the_view_of_pick_ups_has_the_columns_of_the_thesis_and_the_pose_at_execution(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    async with log.engine.connect() as connection:
+        answer = await connection.exec_driver_sql('SELECT * FROM "PickUpWithContextView" ORDER BY id')
+        assert list(answer.keys()) == [
+            "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
+            "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
+            "object_x", "object_y", "object_z", "object_qx", "object_qy", "object_qz", "object_qw",
+            "height_over_torso",
+        ]  # fmt: skip
+        assert [tuple(each)[:14] for each in answer] == [
+            (row(2), "LEFT", "TOP", 0.3, -0.75, 0.5, 0.0, 0.0, 0.6, 0.8, "MILK", "FAILED", 1, row(2)),
+            (row(5), "RIGHT", "FRONT", None, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0, "MILK", "SUCCEEDED", 1, row(5)),
+        ]
+
+
+CAREFUL = declared(
+    "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5), bases=("PickUpAction",)
+)
+WARY = declared(
+    "WaryPickUpAction", "wary_pick_up_action", *PICK_UP.fields, bases=("CarefulPickUpAction", "PickUpAction")
+)
+GRAB = msgspec.structs.replace(declared("GrabAction", "grab_action", *PICK_UP.fields), aliases=("PickUpAction",))
+LIFT = msgspec.structs.replace(declared("LiftAction", "lift_action", *CAREFUL.fields), aliases=("CarefulPickUpAction",))
+
+
+@pytest.mark.parametrize(
+    "types",
+    [
+        (PICK_UP, CAREFUL, WARY),
+        (WARY, CAREFUL, PICK_UP),
+        (PICK_UP, CAREFUL, GRAB),
+        (GRAB, PICK_UP),
+        (CAREFUL, PICK_UP, WARY, GRAB),
+        (PICK_UP, CAREFUL, msgspec.structs.replace(LIFT, bases=("PickUpAction",)), WARY),
+    ],
+)
+@pytest.mark.parametrize("at_once", [True, False])
+async def test_it_has_those_of_descendants_and_of_former_names_whatever_came_first(
+    log: EventLog, types: tuple[DesignatorTypeDeclared, ...], at_once: bool
+) -> None:
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 0.9)))
+    rows = []
+    projector = Projector(log)
+    await projector.open()
+    for each in types:
+        parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+        robot = RobotValue(pose(0.25, 2.5), "ROBOT", 0.3)
+        rows.append(row(script.put(NodeStarted("action", None, name_of(each), parameters, robot))))
+        if not at_once:
+            await log.append([*declarations(each), *script.records])
+            await projector.catch_up()
+    await log.append([*declarations(*types), *script.records])
+    await projector.catch_up()
+    assert await ask(log, 'SELECT id FROM "PickUpWithContextView" ORDER BY id') == [(each,) for each in rows]
+
+
+def turn(axis: tuple[float, float, float], angle: float) -> NDArray[np.float64]:
+    """The rotation matrix, by Rodrigues' formula."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix: NDArray[np.float64] = np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return matrix
+
+
+def turned(axis: tuple[float, float, float], angle: float) -> tuple[float, float, float, float]:
+    """The same rotation as a quaternion."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis) * math.sin(angle / 2)
+    return float(x), float(y), float(z), math.cos(angle / 2)
+
+
+@pytest.mark.parametrize(
+    ("axis", "angle"), [((0, 0, 1), 0.0), ((0, 0, 1), math.pi / 2), ((0, 0, 1), -2.5), ((1, -2, 0.5), 2.0)]
+)
+async def test_the_view_says_where_the_robot_stood_as_seen_from_the_object(
+    log: EventLog, axis: tuple[float, float, float], angle: float
+) -> None:
+    script = Script()
+    there = np.array([1.3, 1.0, 0.9])
+    milk = script.put(ObjectAdded("milk", "MILK", PoseValue((1.3, 1.0, 0.9), turned(axis, angle), "map", T0_NS)))
+    stand, heading = np.array([0.6, 0.4, 0.0]), 0.7
+    robot = RobotValue(PoseValue((0.6, 0.4, 0.0), turned((0, 0, 1), heading), "map", T0_NS), "ROBOT", 0.3)
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
+    script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, robot))
+    await stored_and_folded(log, [*declarations(PICK_UP), *script.records])
+    view = PickUpWithContextView
+    async with AsyncSession(log.engine) as session:
+        (seen,) = await session.execute(
+            select(
+                view.object_x, view.object_y, view.object_z,
+                view.object_qx, view.object_qy, view.object_qz, view.object_qw,
+            )
+        )  # fmt: skip
+    of_thing = turn(axis, angle)
+    np.testing.assert_allclose(seen[:3], of_thing.T @ (stand - there), atol=1e-12)
+    # The robot's heading, as a direction: turned by the quaternion it is what the object sees.
+    x, y, z, w = seen[3:]
+    ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+    upwards = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
+    np.testing.assert_allclose(ahead, of_thing.T @ [math.cos(heading), math.sin(heading), 0], atol=1e-12)
+    np.testing.assert_allclose(upwards, of_thing.T @ [0, 0, 1], atol=1e-12)
+
+
+async def test_the_view_says_how_much_higher_than_the_lifted_torso_the_object_is(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    view = PickUpWithContextView
+    async with AsyncSession(log.engine) as session:
+        heights = (await session.scalars(select(view.height_over_torso).order_by(view.id))).all()
+    assert heights == [pytest.approx(0.9 - 0.3), None]
+
+
+async def test_the_mapped_view_gives_and_takes_members(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    async with AsyncSession(log.engine) as session:
+        view = PickUpWithContextView
+        won = (await session.scalars(select(view).where(view.status == TaskStatus.SUCCEEDED))).all()
+        assert [(each.arm, each.grasp, each.obj_type) for each in won] == [(Arms.RIGHT, Grasp.FRONT, ObjectType.MILK)]
+
+
+async def test_a_careful_pick_up_is_in_the_view_too(log: EventLog) -> None:
+    careful = declared(
+        "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5),
+        bases=("PickUpAction",),
+    )  # fmt: skip
+    script = Script()
+    milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2)))
+    parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP", "speed": 0.5}
+    script.put(NodeStarted("action", None, name_of(careful), parameters, RobotValue(pose(), "ROBOT", 0.0)))
+    await stored_and_folded(log, [*declarations(careful), *script.records])
+    assert await ask(log, 'SELECT id, relative_x, relative_y FROM "PickUpWithContextView"') == [(row(2), -1.0, -2.0)]
+
+
+async def test_a_view_of_a_user_is_made_beside_the_tables_and_changed_with_its_meaning(log: EventLog) -> None:
+    node = TaskTreeNode
+    reasons = UserView(
+        "reasons",
+        select(node.reason, func.count().label("times")).where(node.status == TaskStatus.FAILED).group_by(node.reason),
+    )
+    await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
+    await Projector(log, views=[reasons]).open()
+    assert await ask(log, "SELECT * FROM reasons") == [("IKError", 1)]
+    async with AsyncSession(log.engine) as session:
+        asked = await session.execute(select(reasons.table.c.times).where(reasons.table.c.reason == "IKError"))
+        assert asked.scalars().all() == [1]
+    await Projector(log, views=[UserView("reasons", select(node.reason).where(node.reason.is_not(None)))]).open()
+    assert await ask(log, "SELECT * FROM reasons") == [("IKError",)]
+
+
+async def test_a_view_of_a_user_stays_when_another_process_opens_the_memory_without_it(log: EventLog) -> None:
+    await Projector(log, views=[UserView("arms", select(PickUpAction.arm))]).open()
+    await Projector(log).open()
+    assert await ask(log, "SELECT * FROM arms") == []
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["pose", "Action", "event", "pycrorm_x", "pg_x", "pose__1", "x__12", "park_arms_action", "pickupWithContextView"],
+)
+async def test_a_view_cannot_take_a_name_that_is_taken(log: EventLog, name: str) -> None:
+    with pytest.raises(CallerError, match=f"a view cannot be called '{name}'"):
+        await Projector(log, views=[UserView(name, select(ParkArmsAction.arm))]).open()
+
+
+async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_views(log: EventLog) -> None:
+    await Projector(log).open()
+    there = set(await names(log, "table", "view"))
+    assert len(there) > 60
+    assert {"event", "pycrorm_generation", "designator", "pose", "pose__1", "PickUpWithContextView"} <= there
+    async with log.engine.connect() as connection:
+        generation = await current_generation(connection)
+    assert generation is not None
+    layout = generation.layout
+    # The table of an author's class waits for the designator that will name it.
+    waiting = layout.leaves.keys() - {table for each in layout.types.values() for table in each.tables}
+    for name in there - waiting:
+        with pytest.raises(Contradictory):
+            layout.with_declaration(declared("NobodysAction", name))
+        with pytest.raises(CallerError):
+            view_texts([UserView(name, select(ParkArmsAction.arm))], layout, sqlite.dialect())

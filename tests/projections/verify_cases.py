@@ -1,0 +1,304 @@
+"""Memories to verify, what is changed in them by plain SQL, and a look at them in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, NamedTuple
+
+import pytest
+
+from pycrorm_async.events.envelope import LOST
+from pycrorm_async.events.types import (
+    CandidateValue,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeReference,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectDetected,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    ObjectValue,
+    RobotValue,
+    SeenValue,
+    StateSampled,
+)
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.verify.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import verify as verifying
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.databases import ask, ask_to_change
+from tests.projections.event_script import NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
+
+EVERY = declared(
+    "EveryAction",
+    "every_action",
+    field("count", "integer", 2),
+    field("share", "real", 3),
+    field("sure", "boolean", 4),
+    field("when", "datetime", 5),
+    field("words", "list", 6, item="text"),
+    field("places", "dict", 7, item="pose"),
+    field("things", "list", 8, item="object"),
+    field("part", "object", 9),
+    field("counts", "list", 10, item="integer"),
+)
+TYPES = declarations(NAVIGATE, PICK_UP, EVERY)
+
+
+def full(number: int, *, simulated: bool = False, rounds: int = 1) -> Script:
+    """Everything that can happen, so that every core table has rows; it ends well."""
+    script = Script(number)
+    put = script.put
+    thought_by = NodeReference("00000000-0000-7000-8000-000000000001", 2) if simulated else None
+    put(EpisodeStarted(f"e{number}", "me", "h", "1.0", "3.11", "plan", "a world", 7, simulated, thought_by))
+    root = put(NodeStarted("root", simulated=simulated))
+    robot = put(ObjectAdded("pr2", "ROBOT", pose(), {"torso": 0.1}))
+    for _ in range(rounds):
+        _round(script, root, robot, simulated=simulated)
+    put(NodeEnded(root, "FAILED", FailureValue("a.PlanFailure", "no more", ["x"])))
+    put(EpisodeEnded("FAILED", FailureValue("a.PlanFailure", "no more")))
+    return script
+
+
+def _round(script: Script, root: int, robot: int, *, simulated: bool) -> None:
+    put = script.put
+    milk = put(ObjectAdded("milk", "MILK", pose(script.episode[-1], 2, 3), {}, root))
+    pr2, it = ObjectReference(robot, robot), ObjectReference(milk, milk)
+    state = RobotValue(pose(0.1, 0.2, 0), "ROBOT", 0.1, pr2)
+    place = {"target_location": pose(1, 1)}
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), place, state, simulated=simulated))
+    candidates = (CandidateValue(pose(1, 1), ("LEFT",), "TOP", 0.3), CandidateValue(pose(2, 1), ("RIGHT", "LEFT")))
+    put(LocationResolved("CostmapLocation", candidates, 0, 10, drive))
+    moved = put(ObjectMoved(robot, "pr2", "ROBOT", pose(1, 1), drive))
+    put(NodeEnded(drive, "SUCCEEDED", result={"metres": 2}))
+    seen = (SeenValue("milk", "MILK", pose(1), it, 0.5), SeenValue("jug", "JUG", pose(2)))
+    put(ObjectDetected("camera", "MILK", seen, root))
+    given = {"object_designator": it, "arm": "LEFT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", root, name_of(PICK_UP), given, state, simulated=simulated))
+    put(JointsMoved(ObjectReference(robot, moved), {"torso": 0.2, "head": -0.5}, pick))
+    put(StateSampled(ObjectReference(robot, moved), {"base.x": 0.1, "torso": 0.2}, pick))
+    put(ObjectAttached(ObjectReference(robot, moved), it, "tool", pick))
+    everything = {
+        "count": 3,
+        "share": 0.25,
+        "sure": True,
+        "when": "2026-01-02T03:04:05.000006Z",
+        "words": ["a", "b"],
+        "places": {"here": pose(1), "there": pose(2)},
+        "things": [it, ObjectValue("BelieveObject", "jug", "JUG", pose(3))],
+        "part": ObjectValue("ObjectPart", "cap", "CAP", pose(4), it),
+        "counts": [1, 2],
+    }
+    every = put(NodeStarted("action", pick, name_of(EVERY), everything, state, simulated=simulated))
+    put(ObjectDetached(ObjectReference(robot, moved), it, "tool", every))
+    put(NodeEnded(every, "FAILED", FailureValue("a.IKError", "far", [1])))
+    put(NodeEnded(pick, "SUCCEEDED"))
+    put(ObjectRemoved(it, root))
+
+
+def lost(number: int) -> Script:
+    """The same until a machine lost its power in the middle; recovery has ended it."""
+    script = Script(number)
+    script.records = full(number).records[:15]
+    script.put_payload(EpisodeEnded.__name__, LOST)
+    return script
+
+
+def running(number: int) -> Script:
+    """The same, and it goes on."""
+    script = Script(number)
+    script.records = full(number).records[:16]
+    return script
+
+
+def parked(number: int) -> Script:
+    """What a newer version of this program has recorded."""
+    script = full(number)
+    script.records[10] = script.records[10]._replace(type="RobotDanced", payload=b"{}")
+    return script
+
+
+# --- looking ----------------------------------------------------------------------------------------------------
+
+
+async def look(log: EventLog, *, episode: int | None = None) -> Verified:
+    """At all of it, or at one episode."""
+    rows = {each.number: each for each in await log.episodes()}
+    return await verify(log, episode=None if episode is None else rows[episode])
+
+
+def findings(found: Verified) -> tuple[Any, ...]:
+    """In an order that does not depend on the parts in which the log was read."""
+    whole = found._replace(damages=[], differences=[])
+    return (*whole, sorted(found.damages, key=repr), sorted(found.differences, key=repr))
+
+
+async def in_parts(log: EventLog, events: int, monkeypatch: pytest.MonkeyPatch) -> Verified:
+    with monkeypatch.context() as patched:
+        patched.setattr(verifying, "_PART_EVENTS", events)
+        return await look(log)
+
+
+def assert_clean(found: Verified) -> None:
+    assert (found.damages, found.differences) == ([], [])
+    assert (found.damage, found.drift) == (0, 0)
+
+
+def at_once(call: Callable[[], Awaitable[None]]) -> None:
+    """In a thread and a loop of its own, from where nothing can be awaited."""
+    faults: list[BaseException] = []
+
+    async def awaited() -> None:
+        await call()
+
+    def run() -> None:
+        try:
+            asyncio.run(awaited())
+        except BaseException as fault:  # noqa: BLE001 - raised again below
+            faults.append(fault)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    if faults:
+        raise faults[0]
+
+
+async def rebuilt(log: EventLog) -> None:
+    async with claimed(log):
+        rebuild = await Rebuild.begin(log)
+        while await rebuild.fold_next_batch() is not None:
+            pass
+        await rebuild.show()
+        await clear(log)
+
+
+async def opened(url: str) -> EventLog:
+    return await EventLog.open(DatabaseAddress.parse(url), create=True)
+
+
+async def fold_in_batches(log: EventLog, scripts: Sequence[Script], events: int) -> None:
+    """Stored at once, and folded so many events at a time."""
+    projector = Projector(log, batch_events=events)
+    await projector.open()
+    await log.append([*TYPES, *(each for script in scripts for each in script.records)])
+    await projector.catch_up()
+
+
+# --- changing ---------------------------------------------------------------------------------------------------
+
+
+class Shown(NamedTuple):
+    """A table as it is in the database."""
+
+    name: str
+    physical: str
+    columns: list[str]
+    key: list[str]
+    kinds: dict[str, str]
+
+
+def shown(url: str) -> list[Shown]:
+    """Every table that people see, asked of the database itself."""
+    on_server = url.startswith("postgresql:")
+    schema = "memory_tables." if on_server else ""
+    if on_server:
+        [(number,)] = ask(url, "SELECT generation FROM memory_tables.pycrorm_generation WHERE projection = 'tables'")
+        listed = ask(
+            url,
+            "SELECT table_name::text, column_name::text, data_type::text, EXISTS (SELECT FROM pg_index"
+            " JOIN pg_attribute ON attrelid = indrelid AND attnum = ANY (indkey)"
+            " WHERE indisprimary AND attname = column_name AND indrelid"
+            " = format('memory_tables.%I', table_name)::regclass)"
+            " FROM information_schema.columns WHERE table_schema = 'memory_tables' ORDER BY 1, ordinal_position",
+        )
+    else:
+        [(number,)] = ask(url, "SELECT generation FROM pycrorm_generation WHERE projection = 'tables'")
+        listed = ask(
+            url,
+            "SELECT each.name, part.name, part.type, part.pk > 0 FROM sqlite_master AS each"
+            " JOIN pragma_table_info(each.name) AS part WHERE each.type = 'table' ORDER BY each.name, part.cid",
+        )
+    tables: dict[str, Shown] = {}
+    for physical, column, kind, is_key in listed:
+        name, mark, generation = physical.rpartition("__")
+        if not mark or generation != str(number) or name.startswith("pycrorm_"):
+            continue
+        table = tables.setdefault(name, Shown(name, f'{schema}"{physical}"', [], [], {}))
+        table.columns.append(column)
+        table.kinds[column] = kind.lower()
+        if is_key:
+            table.key.append(column)
+    return list(tables.values())
+
+
+def named(url: str, table: str) -> str:
+    """The table that people see under this name, in SQL."""
+    return next(each.physical for each in shown(url) if each.name == table)
+
+
+def literal(value: Any, kind: str) -> str:
+    """As SQL text."""
+    if value is None:
+        return "NULL"
+    if kind == "boolean":
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return "'" + value.replace("'", "''") + "'"
+    return json.dumps(value)
+
+
+def another(value: Any, kind: str) -> Any:
+    """A value that the column could have too."""
+    if kind == "boolean":
+        return not value
+    if kind == "text":
+        return f"{value} changed"
+    return (value or 0) + (0.5 if "double" in kind else 1)
+
+
+def where(table: Shown, row: dict[str, Any]) -> str:
+    return " AND ".join(f'"{each}" = {literal(row[each], table.kinds[each])}' for each in table.key)
+
+
+def rows_of(url: str, table: Shown) -> list[dict[str, Any]]:
+    listed = ", ".join(f'"{each}"' for each in table.columns)
+    order = ", ".join(f'"{each}"' for each in table.key)
+    found = ask(url, f"SELECT {listed} FROM {table.physical} ORDER BY {order}")
+    return [dict(zip(table.columns, row, strict=True)) for row in found]
+
+
+def event_of(table: Shown, row: dict[str, Any]) -> tuple[int, int]:
+    """Episode and event that a row says it is of: 22 bits, 26 bits, 5 bits."""
+    key = row[table.key[0]] if "id" not in table.key else row["id"]
+    if table.name in ("process_metadata", "simulated_episode"):
+        return key, 1
+    return key // 2**31, key // 2**5 % 2**26
+
+
+def insert(url: str, table: Shown, row: dict[str, Any]) -> None:
+    names = ", ".join(f'"{each}"' for each in table.columns)
+    values = ", ".join(literal(row[each], table.kinds[each]) for each in table.columns)
+    ask_to_change(url, f"INSERT INTO {table.physical} ({names}) VALUES ({values})")
+
+
+def set_columns(url: str, table: Shown, row: dict[str, Any], values: dict[str, Any]) -> None:
+    changes = ", ".join(f'"{each}" = {literal(value, table.kinds[each])}' for each, value in values.items())
+    ask_to_change(url, f"UPDATE {table.physical} SET {changes} WHERE {where(table, row)}")
+
+
+def delete(url: str, table: Shown, row: dict[str, Any]) -> None:
+    ask_to_change(url, f"DELETE FROM {table.physical} WHERE {where(table, row)}")

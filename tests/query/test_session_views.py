@@ -1,0 +1,275 @@
+"""What was only thought through is left out of every answer, unless it is asked for; on each kind of database."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from sqlalchemy import func, select
+from sqlalchemy.exc import DBAPIError
+
+from pycrorm_async.errors import UnknownEpisode
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.events.types import (
+    CandidateValue,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeReference,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectDetected,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    RobotValue,
+    SeenValue,
+    StateSampled,
+)
+from pycrorm_async.orm import Action, Motion, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import Pose as PoseRow
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.schema.tables import COLUMNS
+from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.query.named_queries import Thinker
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.log import EventLog
+from tests.projections.event_script import (
+    MOVE,
+    NAVIGATE,
+    PICK_UP,
+    Script,
+    declarations,
+    declared,
+    field,
+    name_of,
+    pose,
+    row,
+)
+from tests.projections.sql_queries import ask, names
+
+CAREFUL = declared(
+    "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5),
+    field("via", "list", 6, item="pose"), bases=("PickUpAction",),
+)  # fmt: skip
+EITHER = declared("Either", "either", field("count", "integer", 2), kind="language")
+TYPES = (NAVIGATE, PICK_UP, CAREFUL, MOVE, EITHER)
+REACHED = UserView("reached", select(PickUpAction.arm, PoseRow.x).join(PickUpAction.object).join(PoseRow))
+
+
+def everything(number: int, thinker: NodeReference | None = None) -> Script:
+    """An episode with a row in every table; a thought, if somebody thinks it."""
+    script = Script(number)
+    put, simulated = script.put, thinker is not None
+    put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=simulated, thought_by=thinker))  # 1
+    root = put(NodeStarted("root", simulated=simulated))  # 2
+    milk, table = put(ObjectAdded("milk", "MILK", pose(1, 2, 3))), put(ObjectAdded("table", "ENVIRONMENT", pose()))
+    put(ObjectAttached(ObjectReference(table, table), ObjectReference(milk, milk), "top"))  # 5
+    put(ObjectDetached(ObjectReference(table, table), ObjectReference(milk, milk), "top"))  # 6
+    robot = RobotValue(pose(0.5), "ROBOT", 0.25)
+    either = put(NodeStarted("language", root, name_of(EITHER), {"count": 2}, robot, simulated))  # 7
+    drive = put(NodeStarted("action", either, name_of(NAVIGATE), {"target_location": pose(7)}, robot, simulated))
+    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7)}, robot, simulated))
+    put(StateSampled(ObjectReference(table, table), {"base.x": 0.5}, move))
+    put(JointsMoved(ObjectReference(table, table), {"drawer": 0.25}, move))
+    put(NodeEnded(move, "SUCCEEDED"))
+    put(LocationResolved("CostmapLocation", (CandidateValue(pose(1), ("LEFT",)),), 0, 4, drive))
+    seen = SeenValue("milk", "MILK", pose(1), ObjectReference(milk, milk), 1.0)
+    put(ObjectDetected("camera", "MILK", (seen,), drive))
+    put(NodeEnded(drive, "SUCCEEDED"))
+    moved = put(ObjectMoved(milk, "milk", "MILK", pose(2, 2, 3)))
+    grasp = {"object_designator": ObjectReference(milk, moved), "arm": "LEFT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", either, name_of(PICK_UP), grasp, robot, simulated))
+    put(NodeEnded(pick, "FAILED", FailureValue("a.IKError", "too far")))
+    slowly = grasp | {"speed": 0.5, "via": [pose(3), pose(4)]}
+    careful = put(NodeStarted("action", either, name_of(CAREFUL), slowly, robot, simulated))
+    put(NodeEnded(careful, "SUCCEEDED"))
+    put(ObjectRemoved(ObjectReference(milk, moved)))
+    put(NodeEnded(either, "SUCCEEDED"))
+    put(NodeEnded(root, "SUCCEEDED"))
+    put(EpisodeEnded("SUCCEEDED"))
+    return script
+
+
+REAL, THINKING = Script(1).episode, 8
+THOUGHT = NodeReference(episode_text(REAL), THINKING)
+
+
+async def remembered(log: EventLog, *scripts: Script) -> None:
+    projector = Projector(log, views=[REACHED])
+    await projector.open()
+    await log.append([*declarations(*TYPES), *(record for script in scripts for record in script.records)])
+    await projector.catch_up()
+
+
+async def shown(log: EventLog) -> dict[str, list[Any]]:
+    """Every view with its rows, read past every class of ours."""
+    return {
+        name: sorted(await ask(log, f'SELECT * FROM "{name}"'), key=repr)
+        for name in await names(log, "view")
+        if not name.startswith("pg_")
+    }
+
+
+async def test_every_view_shows_the_same_with_and_without_thoughts(log: EventLog) -> None:
+    await remembered(log, everything(1))
+    before = await shown(log)
+    leaves = {each.table for each in TYPES}
+    own = set(COLUMNS) - {"simulated_episode"} | {"designator", "action", "motion", "language", "robot_state"}
+    own |= {"position", "quaternion", "designator_type", "PickUpWithContextView", "reached", *leaves}
+    assert [name for name in own if not before[name]] == []
+    await remembered(log, everything(2, THOUGHT), everything(3, NodeReference(episode_text(Script(2).episode), 2)))
+    assert await shown(log) == before
+
+
+async def test_a_session_that_asks_for_thoughts_sees_them_in_every_view(log: EventLog) -> None:
+    """As many rows again as the real episode has, in each of the views."""
+    await remembered(log, everything(1), everything(2, THOUGHT))
+    once = {name: len(rows) for name, rows in (await shown(log)).items()}
+    async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
+        connection = await session.connection()
+        for name, count in once.items():
+            answer = await connection.exec_driver_sql(f'SELECT count(*) FROM "{name}"')
+            assert (name, answer.scalar_one()) == (name, count if name == "designator_type" else 2 * count)
+
+
+async def test_the_same_questions_see_thoughts_where_they_are_asked_for(log: EventLog) -> None:
+    await remembered(log, everything(1), everything(2, THOUGHT))
+    asked = select(TaskTreeNode.process_metadata_id, TaskTreeNode.simulated).distinct().order_by("process_metadata_id")
+    async with Reading.open_address(log.address) as reading:
+        async with reading.session() as session:
+            assert [each.dtype for each in await session.scalars(select(Action).order_by(Action.id))] == [
+                "NavigateAction", "PickUpAction", "CarefulPickUpAction",
+            ]  # fmt: skip
+            assert (await session.execute(asked)).all() == [(1, False)]
+        async with reading.session(simulated=True) as session:
+            actions = (await session.scalars(select(Action).order_by(Action.id))).all()
+            assert [(each.id >> 31, each.dtype) for each in actions] == [
+                (1, "NavigateAction"), (1, "PickUpAction"), (1, "CarefulPickUpAction"),
+                (2, "NavigateAction"), (2, "PickUpAction"), (2, "CarefulPickUpAction"),
+            ]  # fmt: skip
+            assert actions[-1].robot_state is not None
+            assert actions[-1].robot_state.pose.position.x == 0.5
+            careful: Any = actions[-1]
+            assert (careful.object.pose.x, careful.speed) == (2.0, 0.5)
+            assert [each.x for each in actions[-1].entries("via")] == [3.0, 4.0]
+            assert (await session.execute(asked)).all() == [(1, False), (2, True)]
+            metadata = (await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id))).all()
+            assert [(each.simulated, each.thought_by, each.thought_by_node) for each in metadata] == [
+                (False, None, None),
+                (True, episode_text(REAL), THINKING),
+            ]
+            mapped = reading.mapped("CarefulPickUpAction")
+            assert (await session.scalar(select(func.count()).select_from(mapped))) == 2
+        frames = [await reading.dataframe(select(PickUpWithContextView), simulated=also) for also in (False, True)]
+        assert [sorted(frame.process_metadata_id) for frame in frames] == [[1, 1], [1, 1, 2, 2]]
+        reached = [await reading.dataframe(select(REACHED.table), simulated=also) for also in (False, True)]
+        assert [list(frame.x) for frame in reached] == [[2.0, 2.0], [2.0] * 4]
+
+
+async def test_nobody_else_sees_what_one_session_asked_for(log: EventLog) -> None:
+    await remembered(log, everything(1), everything(2, THOUGHT))
+    count = select(func.count()).select_from(TaskTreeNode)
+    async with Reading.open_address(log.address) as reading:
+        async with reading.session(simulated=True) as with_thoughts, reading.session() as without:
+            assert await with_thoughts.scalar(count) == 12
+            assert await without.scalar(count) == 6
+            await with_thoughts.commit()
+            assert await with_thoughts.scalar(count) == 12
+        for _ in range(5):
+            async with reading.session() as later:
+                assert await later.scalar(count) == 6
+        async with reading.session(simulated=True) as again:
+            assert await again.scalar(count) == 12
+
+
+async def test_what_came_since_is_seen_with_thoughts_too(log: EventLog) -> None:
+    """Also of a type that was declared since, and in the same session."""
+    new = declared("WaveAction", "wave_action", field("times", "integer", 2))
+    await remembered(log, everything(1))
+    async with Reading.open_address(log.address) as reading:
+        async with reading.session(simulated=True) as session:
+            assert await session.scalar(select(func.count()).select_from(Motion)) == 1
+            await session.commit()
+            await remembered(log, everything(2, THOUGHT))
+            assert await session.scalar(select(func.count()).select_from(Motion)) == 2
+        script = Script(3)
+        script.put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=True))
+        script.put(NodeStarted("action", None, name_of(new), {"times": 3}, simulated=True))
+        projector = Projector(log)
+        await projector.open()
+        await log.append([*declarations(*TYPES, new), *script.records])
+        await projector.catch_up()
+        async with reading.session(simulated=True) as session:
+            wave: Any = reading.mapped("WaveAction")
+            assert [each.times for each in await session.scalars(select(wave))] == [3]
+        async with reading.session() as session:
+            assert (await session.scalars(select(wave))).all() == []
+
+
+async def test_a_session_with_thoughts_writes_nothing(log: EventLog) -> None:
+    await remembered(log, everything(1))
+    before = await names(log, "table", "view")
+    async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
+        with pytest.raises(DBAPIError):
+            await (await session.connection()).exec_driver_sql("UPDATE pose__1 SET x = 5")
+    assert await names(log, "table", "view") == before
+
+
+async def test_the_overview_leaves_thoughts_out_unless_they_are_asked_for(log: EventLog) -> None:
+    deeper = NodeReference(episode_text(Script(2).episode), 2)
+    elsewhere = NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
+    await remembered(log, everything(1), everything(2, THOUGHT), everything(3, deeper), everything(4, elsewhere))
+    async with Reading.open_address(log.address) as reading:
+        assert [(each.number, each.simulated, each.thought_by) for each in await reading.episodes()] == [
+            (1, False, None)
+        ]
+        all_of_them = await reading.episodes(simulated=True)
+    assert [(each.number, each.simulated, each.thought_by) for each in all_of_them] == [
+        (1, False, None),
+        (2, True, Thinker(episode_text(REAL), 1, row(THINKING), "NavigateAction")),
+        (3, True, Thinker(deeper.episode, 2, row(2, number=2), None)),
+        (4, True, Thinker(elsewhere.episode, None, None, None)),
+    ]
+    assert {(each.nodes, each.failed) for each in all_of_them} == {(6, 1)}
+
+
+async def test_an_episode_is_found_though_it_was_only_thought_and_the_last_one_really_happened(log: EventLog) -> None:
+    await remembered(log, everything(1), everything(2, THOUGHT))
+    async with Reading.open_address(log.address) as reading:
+        assert (await reading.episode("2")).simulated
+        assert (await reading.episode(episode_text(Script(2).episode))).number == 2
+        assert (await reading.episode("last")).number == 1
+        with pytest.raises(UnknownEpisode, match="lists the 1 there are"):
+            await reading.episode("3")
+
+
+async def test_a_tree_names_the_thoughts_of_its_nodes_and_that_of_a_thought_is_shown(log: EventLog) -> None:
+    root = NodeReference(episode_text(REAL), 2)
+    await remembered(log, everything(1), everything(2, THOUGHT), everything(3, THOUGHT), everything(4, root))
+    async with Reading.open_address(log.address) as reading:
+        tree, thought = await reading.tree(1), await reading.tree(2)
+    assert [(each.dtype, each.simulated, each.thoughts) for each in tree] == [
+        (None, False, (4,)),
+        ("Either", False, ()),
+        ("NavigateAction", False, (2, 3)),
+        ("MoveMotion", False, ()),
+        ("PickUpAction", False, ()),
+        ("CarefulPickUpAction", False, ()),
+    ]
+    assert [(each.dtype, each.simulated) for each in thought] == [(each.dtype, True) for each in tree]
+    assert thought[4].parameters["object_designator"]["name"] == "milk"
+    assert thought[4].failure_message == "too far"
+
+
+async def test_a_memory_of_thoughts_alone_has_no_last_episode(log: EventLog) -> None:
+    await remembered(log, everything(1, THOUGHT))
+    async with Reading.open_address(log.address) as reading:
+        assert await reading.episodes() == []
+        with pytest.raises(UnknownEpisode, match="lists the 0 there are"):
+            await reading.episode("last")

@@ -1,0 +1,493 @@
+"""What is whole is given, what is torn is left out, and what was safe and is missing is damage."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
+from pycrorm_async.events.ids import episode_id, episode_text
+from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.queue.files.frame import CHECKSUM, EVENT, encode
+from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.recorder_folder import held_by
+from pycrorm_async.queue.files.scan import scan, seal, tails
+from pycrorm_async.queue.files.segment import salt_of
+from tests.queue.factories import (
+    DECLARED,
+    RECORDER,
+    WALL_NS,
+    Author,
+    drain,
+    ended,
+    lost,
+    make,
+    node,
+    overwrite,
+    recover,
+    started,
+)
+
+
+@pytest.fixture
+def author(spool: Path) -> Author:
+    return Author(spool)
+
+
+async def test_records_come_back_in_order_and_open_episodes_end_lost_in_the_order_of_their_ids(author: Author) -> None:
+    for heading in (DECLARED, started(2), started(1), started(3), node(1), ended(3), node(1)):
+        author.put(heading, heading.type.encode())
+    assert await recover(author.folder) == [*author.records, lost(8, 1, 4), lost(9, 2, 2)]
+
+
+async def test_recovering_twice_gives_the_same_and_writes_nothing(author: Author) -> None:
+    author.put(started())
+    author.sync()
+    author.put(node(), b"unsynced")
+    before = author.segments[0].read_bytes()
+    assert await recover(author.folder) == await recover(author.folder) == [*author.records, lost(3, 1, 3)]
+    assert author.segments[0].read_bytes() == before
+    assert sorted(path.name for path in author.folder.iterdir()) == ["00000001.segment", "alive", "drain"]
+
+
+async def test_a_recorder_that_lived_without_a_record_leaves_nothing(author: Author) -> None:
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    assert await drain(recovered) == []
+    assert (recovered.all_stored, recovered.stored, recovered.lost) == (True, 0, ())
+    recovered.remove()
+    assert not author.folder.exists()
+
+
+def test_the_living_and_the_drained_are_not_opened(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    assert open_dead(queue.folder) is None
+    queue.release()
+    draining = FileLock.take(queue.folder / "drain")
+    assert draining is not None
+    assert open_dead(queue.folder) is None
+    draining.release()
+    first = open_dead(queue.folder)
+    assert first is not None
+    assert open_dead(queue.folder) is None
+    first.release()
+    again = open_dead(queue.folder)
+    assert again is not None
+    again.release()
+    assert open_dead(spool / "gone") is None
+
+
+async def test_batches_keep_to_their_limits_computed_ends_included(author: Author) -> None:
+    for number in (1, 2, 3):
+        author.put(started(number), b"x" * 100)
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    positions = []
+    while batch := await recovered.get_batch(events_max=4, bytes_max=210, age_s_max=0.0):
+        positions.append([each.position for each in batch])
+    recovered.release()
+    assert positions == [[1, 2], [3, 4, 5, 6]]
+
+
+# --- torn ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("filling", [b"\0", b"\xff", b"\x01"])
+async def test_torn_at_any_byte_of_what_was_not_synced_keeps_all_whole_records_before(
+    author: Author, filling: bytes
+) -> None:
+    author.put(started())
+    author.put(node(), b"synced")
+    author.sync()
+    safe_end = author.end
+    for payload in (b"", b"x", b"12345678901234567890"):
+        author.put(node(), payload)
+    path, whole = author.segments[0], author.segments[0].read_bytes()
+    for cut in range(safe_end, author.end + 1):
+        path.write_bytes(whole[:cut] + filling * (len(whole) - cut))
+        kept = sum(1 for _, offset, size in author.places if torn_end(whole, offset, size, filling) <= cut)
+        assert kept >= 2
+        assert await recover(author.folder) == [*author.records[:kept], lost(kept + 1, 1, kept + 1)], cut
+
+
+def torn_end(whole: bytes, offset: int, size: int, filling: bytes) -> int:
+    """A record ends, for this purpose, where the filling cannot be told from its own last bytes."""
+    return offset + len(whole[offset : offset + size].rstrip(filling))
+
+
+async def test_a_file_cut_short_keeps_all_whole_records_before(author: Author) -> None:
+    author.put(started())
+    author.sync()
+    safe_end = author.end
+    author.put(node(), b"unsynced")
+    path, whole = author.segments[0], author.segments[0].read_bytes()
+    for cut in range(safe_end, author.end):
+        path.write_bytes(whole[:cut])
+        assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)], cut
+    path.write_bytes(whole[: author.end])
+    assert await recover(author.folder) == [*author.records, lost(3, 1, 3)]
+
+
+async def test_a_record_that_reached_the_disk_before_an_earlier_one_is_a_legal_tail(author: Author) -> None:
+    author.put(started())
+    author.sync()
+    author.put(node(), b"never reached the disk")
+    author.put(node(), b"did")
+    path, offset, size = author.places[1]
+    overwrite(path, offset, bytes(size))
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    assert await drain(recovered) == [author.records[0], lost(2, 1, 2)]
+    recovered.release()
+    [(_, tail)] = tails(author.folder, scan(author.folder, RECORDER))
+    assert tail
+
+
+async def test_a_later_segment_that_reached_the_disk_before_the_end_of_the_one_before_is_a_legal_tail(
+    author: Author,
+) -> None:
+    author.put(started())
+    author.sync()
+    for _ in range(5):
+        author.put(node(), b"x" * 900)
+    assert len(author.segments) == 2
+    path, offset, size = author.places[3]
+    overwrite(path, offset, bytes(size))
+    assert await recover(author.folder) == [*author.records[:3], lost(4, 1, 4)]
+
+
+async def test_a_segment_whose_header_did_not_reach_the_disk_is_a_legal_tail(author: Author) -> None:
+    author.put(started())
+    for _ in range(3):
+        author.put(node(), b"x" * 900)
+    author.sync()
+    author.put(node(), b"x" * 900)
+    overwrite(author.segments[1], 0, bytes(96))
+    assert await recover(author.folder) == [*author.records[:4], lost(5, 1, 5)]
+
+
+async def test_nothing_of_a_first_segment_that_was_never_synced_need_be_there(author: Author) -> None:
+    author.put(started())
+    overwrite(author.segments[0], 0, bytes(40))
+    assert await recover(author.folder) == []
+
+
+async def test_a_record_of_another_file_left_on_the_same_blocks_does_not_come_back_to_life(author: Author) -> None:
+    author.put(started())
+    author.sync()
+    stale = encode(
+        kind=EVENT,
+        version=1,
+        position=2,
+        sequence=2,
+        wall_ns=WALL_NS,
+        monotonic_ns=1,
+        episode=bytes(started()[0] or b""),
+        type_name=b"NodeStarted",
+        payload=b"stale",
+        salt=salt_of(episode_id(1, b"an elder.."), 1),
+    )
+    overwrite(author.segments[0], author.end, stale)
+    assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
+    ours = stale[:56] + CHECKSUM.pack(salt_of(RECORDER, 1)) + stale[60:]
+    overwrite(author.segments[0], author.end, ours)  # the checksum covers the salt
+    assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
+
+
+# --- damaged ---------------------------------------------------------------------------------------------------
+
+
+def test_any_one_bit_flipped_is_damage_where_it_was_safe_and_never_costs_a_synced_record(author: Author) -> None:
+    author.put(started())
+    author.put(node(), b"ab")
+    author.sync()
+    safe_end = author.end
+    author.put(node(), b"unsynced")
+    path, whole = author.segments[0], author.segments[0].read_bytes()
+    for bit in range((author.end + 64) * 8):
+        changed = bytearray(whole)
+        changed[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(changed)
+        if bit // 8 < safe_end - 72:
+            with pytest.raises((SpoolDamaged, SpoolForeign)):
+                scan(author.folder, RECORDER)
+        else:
+            assert scan(author.folder, RECORDER).cut.position == (2 if bit // 8 < author.end else 3), bit
+
+
+async def test_damage_is_told_with_file_and_offset_and_changes_nothing(author: Author) -> None:
+    for heading in (started(), node(), node()):
+        author.put(heading)
+    author.sync()
+    path, offset, _ = author.places[1]
+    overwrite(path, offset + 70, b"#")
+    before = path.read_bytes()
+    with pytest.raises(SpoolDamaged) as damage:
+        open_dead(author.folder)
+    assert (damage.value.path, damage.value.offset) == (path, offset)
+    assert "position 2 is missing" in damage.value.reason
+    assert "up to position 3 was safe" in damage.value.reason
+    assert path.read_bytes() == before
+    assert [each.alive for each in Spool(author.folder.parent).recorders()] == [False]
+
+
+async def test_a_commit_in_a_later_segment_proves_damage_in_an_earlier_one(author: Author) -> None:
+    author.put(started())
+    for _ in range(5):
+        author.put(node(), b"x" * 900)
+    author.sync()
+    path, offset, _ = author.places[3]
+    overwrite(path, offset, b"\0")
+    with pytest.raises(SpoolDamaged) as damage:
+        open_dead(author.folder)
+    assert (damage.value.path, damage.value.offset) == (path, offset)
+
+
+async def test_a_segment_missing_in_the_middle_of_what_was_safe_is_damage(author: Author) -> None:
+    author.put(started())
+    for _ in range(8):
+        author.put(node(), b"x" * 900)
+    author.sync()
+    assert len(author.segments) == 3
+    author.segments[1].unlink()
+    with pytest.raises(SpoolDamaged, match="position 5 is missing"):
+        open_dead(author.folder)
+
+
+async def test_an_unreadable_header_is_damage_when_the_segments_before_are_gone(author: Author) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    author.segments[0].unlink()
+    overwrite(author.segments[1], 60, b"#")
+    with pytest.raises(SpoolDamaged, match="header is unreadable"):
+        open_dead(author.folder)
+
+
+async def test_other_records_than_those_that_were_safe_are_damage(author: Author) -> None:
+    author.put(started())
+    author.put(node(), b"was written")
+    author.sync()
+    path, offset, _ = author.places[1]
+    other = encode(
+        kind=EVENT,
+        version=1,
+        position=2,
+        sequence=2,
+        wall_ns=WALL_NS,
+        monotonic_ns=1,
+        episode=bytes(node()[0] or b""),
+        type_name=b"NodeStarted",
+        payload=b"was forged!",
+        salt=salt_of(RECORDER, 1),
+    )
+    overwrite(path, offset, other)
+    with pytest.raises(SpoolDamaged, match="not those that were safe"):
+        open_dead(author.folder)
+
+
+async def test_a_gap_in_an_episode_is_damage(author: Author) -> None:
+    author.put(started())
+    forged = encode(
+        kind=EVENT,
+        version=1,
+        position=2,
+        sequence=3,
+        wall_ns=WALL_NS,
+        monotonic_ns=1,
+        episode=bytes(node()[0] or b""),
+        type_name=b"NodeStarted",
+        payload=b"{}",
+        salt=salt_of(RECORDER, 1),
+    )
+    overwrite(author.segments[0], author.end, forged)
+    with pytest.raises(SpoolDamaged, match="event 3 of episode"):
+        open_dead(author.folder)
+
+
+# --- foreign ---------------------------------------------------------------------------------------------------
+
+
+def test_a_newer_format_is_refused_by_name(author: Author) -> None:
+    author.put(started())
+    overwrite(author.segments[0], 8, b"\x02")
+    with pytest.raises(SpoolForeign, match=r"1\.segment is in format 2 of a newer program; this one reads format 1"):
+        open_dead(author.folder)
+
+
+def test_a_segment_of_another_recorder_is_refused_by_name(author: Author, tmp_path: Path) -> None:
+    author.put(started())
+    other = author.folder.with_name(episode_text(episode_id(1, b"an elder..")))
+    author.folder.rename(other)
+    with pytest.raises(SpoolForeign, match=f"is segment 1 of recorder {episode_text(RECORDER)}"):
+        open_dead(other)
+
+
+async def test_foreign_files_in_a_folder_are_left_alone_also_when_it_is_deleted(author: Author) -> None:
+    author.put(started())
+    (author.folder / "notes.txt").write_text("mine")
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    assert await drain(recovered) == [author.records[0], lost(2, 1, 2)]
+    await recovered.acknowledge(2)
+    recovered.remove()
+    assert [path.name for path in author.folder.iterdir()] == ["notes.txt"]
+    assert Spool(author.folder.parent).recorders() == []
+
+
+def test_a_folder_that_cannot_be_read_is_one_clear_line(author: Author) -> None:
+    author.put(started())
+    author.segments[0].unlink()
+    author.segments[0].mkdir()
+    with pytest.raises(SpoolUnavailable) as refused:
+        open_dead(author.folder)
+    assert "00000001.segment: Is a directory" in str(refused.value)
+
+
+async def test_a_disk_that_does_not_keep_what_is_left_is_told_before_anything_is_given(
+    author: Author, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for heading in (started(), *[node()] * 4):
+        author.put(heading, b"x" * 900)
+    synced: list[str] = []
+
+    def full(descriptor: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{descriptor}").readlink().name)
+        if len(synced) == 2:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fdatasync", full)
+    with pytest.raises(SpoolUnavailable, match="Input/output error"):
+        open_dead(author.folder)
+    assert synced == ["00000001.segment", "00000002.segment"]
+    monkeypatch.undo()
+    assert await recover(author.folder) == [*author.records, lost(6, 1, 6)]
+
+
+# --- acknowledging and removing --------------------------------------------------------------------------------
+
+
+def test_a_segment_may_only_go_when_the_header_after_it_is_safe(author: Author) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    assert [each.number for each in author.appender.trimmable(stored=4, safe_number=1)] == []
+    assert [each.number for each in author.appender.trimmable(stored=3, safe_number=2)] == []
+    assert [each.number for each in author.appender.trimmable(stored=4, safe_number=2)] == [1]
+    assert [each.number for each in author.appender.trimmable(stored=5, safe_number=2)] == [1]
+
+
+async def test_stored_segments_go_and_the_ends_are_the_same_from_the_header_of_the_next(author: Author) -> None:
+    author.put(started(1))
+    author.put(started(2))
+    for _ in range(7):
+        author.put(node(1), b"x" * 900)
+    ends = [lost(10, 1, 9), lost(11, 2, 2)]
+    assert len(author.segments) == 3
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    assert await drain(recovered) == [*author.records, *ends]
+    left = [sum(1 for path, _, _ in author.places if path == segment) for segment in author.segments]
+    for gone in range(3):
+        await recovered.acknowledge(sum(left[:gone]))
+        assert [path for path in author.segments if path.exists()] == author.segments[gone:]
+        recovered.release()
+        recovered = open_dead(author.folder)
+        assert recovered is not None
+        assert await drain(recovered) == [*author.records[sum(left[:gone]) :], *ends]
+    await recovered.acknowledge(11)
+    assert author.segments[2].exists()
+    recovered.remove()
+    assert not author.folder.exists()
+
+
+async def test_a_commit_that_covers_only_records_that_are_stored_and_gone_is_no_damage(author: Author) -> None:
+    author.put(started(), b"x" * 900)
+    author.put(node(), b"x" * 900)
+    span = author.appender.begin_sync()
+    author.put(node(), b"x" * 1700)
+    for _ in range(4):
+        author.put(node(), b"x" * 100)
+    author.appender.append_commit(span)
+    author.sync()
+    assert [path for path, _, _ in author.places] == [author.segments[0]] * 3 + [author.segments[1]] * 4
+    author.segments[0].unlink()
+    assert await recover(author.folder) == [*author.records[3:], lost(8, 1, 8)]
+
+
+async def test_the_end_of_an_episode_whose_records_are_all_gone_has_the_times_of_its_last_record(
+    author: Author,
+) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    author.segments[0].unlink()
+    path, offset, size = author.places[4]
+    overwrite(path, offset, bytes(size))
+    assert await recover(author.folder) == [lost(5, 1, 5)]
+
+
+async def test_a_removal_that_was_killed_anywhere_leaves_the_same_records_or_nothing(author: Author) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    whole = [*author.records, lost(6, 1, 6)]
+    assert await recover(author.folder) == whole
+    author.segments[0].unlink()
+    assert await recover(author.folder) == whole[4:]
+    author.segments[1].unlink()
+    assert await recover(author.folder) == []
+    (author.folder / "drain").unlink()
+    assert await recover(author.folder) == []
+    (author.folder / "drain").unlink()
+    (author.folder / "alive").unlink()
+    assert Spool(author.folder.parent).recorders() == []
+
+
+# --- sealing ---------------------------------------------------------------------------------------------------
+
+
+async def test_sealing_copies_the_tail_aside_cuts_it_and_gives_the_same_records_twice(author: Author) -> None:
+    author.put(started())
+    author.sync()
+    for _ in range(5):
+        author.put(node(), b"x" * 900)
+    path, offset, size = author.places[2]
+    overwrite(path, offset, bytes(size))
+    first, second = author.segments
+    tails = [first.read_bytes()[offset:].rstrip(b"\0"), second.read_bytes().rstrip(b"\0")]
+    for _ in range(2):
+        seal(author.folder, scan(author.folder, RECORDER))
+        assert await recover(author.folder) == [*author.records[:2], lost(3, 1, 3)]
+        assert first.stat().st_size == offset
+        assert not second.exists()
+        assert [path.with_name(f"{path.name}.tail").read_bytes() for path in (first, second)] == tails
+
+
+async def test_a_sealing_that_was_killed_anywhere_can_be_done_again(author: Author) -> None:
+    author.put(started())
+    author.put(node(), b"torn")
+    path, offset, _ = author.places[1]
+    overwrite(path, offset + 64, b"#")
+    tail = path.read_bytes()[offset:].rstrip(b"\0")
+    copy = path.with_name(f"{path.name}.tail")
+    copy.with_name(f"{copy.name}.making").write_bytes(tail[:10])
+    seal(author.folder, scan(author.folder, RECORDER))
+    assert copy.read_bytes() == tail
+    assert path.stat().st_size == offset
+    assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
+
+
+async def test_a_live_queue_that_was_let_go_has_no_tail(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    queue.release()
+    recovered = open_dead(queue.folder)
+    assert recovered is not None
+    recovered.check()
+    assert len(await drain(recovered)) == 2
+    recovered.release()
+    kept = scan(queue.folder, held_by(queue.name).recorder)
+    assert [tail for _, tail in tails(queue.folder, kept) if tail] == []

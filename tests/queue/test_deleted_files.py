@@ -1,0 +1,357 @@
+"""Files that were deleted or replaced under a queue: never acknowledged, never silent, and recording goes on."""
+
+import asyncio
+import logging
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from itertools import cycle
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.queue import LiveQueue, RecorderQueue, Spool, open_dead
+from pycrorm_async.queue.files.recorder_folder import finish_folder
+from pycrorm_async.queue.maintenance.inspection import inspect_spool
+from tests.crash.test_queue_disk import SLOW
+from tests.queue.factories import SMALL, copy_beside_recording, drain, ended, make, node, recover, started
+
+ROOMY = replace(SLOW, spool_bytes_max=64 * SMALL.segment_bytes)
+GONE = "was deleted or replaced while the queue wrote to it"
+
+
+def delete(folder: Path) -> None:
+    """All at once, while files may be made in it."""
+    trash = Path(tempfile.mkdtemp(dir=queue_root(folder)))
+    folder.rename(trash / "trash")
+    shutil.rmtree(trash)
+
+
+def queue_root(folder: Path) -> Path:
+    """Outside the spool, on the same file system."""
+    return folder.parent if folder.name == "spool" else folder.parent.parent
+
+
+def delete_the_folder(queue: RecorderQueue) -> None:
+    delete(queue.folder)
+
+
+def delete_the_spool(queue: RecorderQueue) -> None:
+    delete(queue.folder.parent)
+
+
+def put_another_in_its_place(queue: RecorderQueue) -> None:
+    queue.folder.rename(queue.folder.parent.parent / "taken away")
+    queue.folder.mkdir()
+    (queue.folder / "mine").touch()
+
+
+def delete_the_segment(queue: RecorderQueue) -> None:
+    queue._appender.begun[-1].path.unlink()
+
+
+def delete_alive(queue: RecorderQueue) -> None:
+    (queue.folder / "alive").unlink()
+
+
+def put_another_file_in_place_of_the_segment(queue: RecorderQueue) -> None:
+    path = queue._appender.begun[-1].path
+    content = path.read_bytes()
+    path.unlink()
+    path.write_bytes(content)
+
+
+DELETIONS = [
+    delete_the_folder,
+    delete_the_spool,
+    put_another_in_its_place,
+    delete_the_segment,
+    delete_alive,
+    put_another_file_in_place_of_the_segment,
+]
+
+
+def put(queue: RecorderQueue, count: int) -> None:
+    for number in range(count):
+        queue.put_nowait(node(), b"%d" % number * 20)
+
+
+def events(records: list[Record]) -> list[tuple[int, int]]:
+    return [(each.position, each.sequence) for each in records if each.payload != LOST]
+
+
+def killed(queue: RecorderQueue, tmp_path: Path) -> Path:
+    """The spool as `kill -9` would leave it now."""
+    return copy_beside_recording(queue.folder.parent, tmp_path / "killed")
+
+
+async def recovered(spool: Path) -> list[tuple[int, int]]:
+    """What recovery of every folder gives, in the order in which they are recovered."""
+    return [each for folder in Spool(spool).recorders() for each in events(await recover(folder.path))]
+
+
+@contextmanager
+def suppress_all_but_losses() -> Iterator[None]:
+    """A sync that meets the deletion raises before it is known what is lost by it."""
+    try:
+        yield
+    except SpoolUnavailable as error:
+        if "lost are" in str(error):
+            raise
+
+
+@pytest.mark.parametrize("displace", DELETIONS)
+@pytest.mark.parametrize("asked", ["with news", "without news"])
+async def test_a_sync_is_refused_once_and_all_that_was_mapped_is_found_after_a_kill(
+    tmp_path: Path, displace: Callable[[RecorderQueue], None], asked: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    queue = make(tmp_path / "spool", settings=SLOW)
+    queue.put_nowait(started(), b"{}")
+    await queue.synced_to()
+    before = queue.folder
+    displace(queue)
+    if asked == "with news":
+        put(queue, 3)
+    count = queue.written
+    with pytest.raises(SpoolUnavailable, match=GONE):
+        await queue.synced_to()
+    assert queue.synced == (count if queue.folder != before else 1)
+    await queue.synced_to()
+    assert (queue.synced, queue.lost, queue.folder.parent) == (count, (), before.parent)
+    assert queue.folder != before
+    assert queue.setback is not None
+    assert f"recording goes on in {queue.folder}, no record is lost" in queue.setback
+    assert [GONE in each.getMessage() for each in caplog.records if each.levelno == logging.ERROR] == [True, True]
+    put(queue, 2)
+    assert await recovered(killed(queue, tmp_path)) == [(n, n) for n in range(1, count + 3)]
+    assert [each.path for each in Spool(queue.folder.parent).recorders()] == [queue.folder]
+    mine = before / "mine"
+    assert mine.exists() == (displace is put_another_in_its_place)
+    queue.close()
+    assert events(await drain(queue)) == [(n, n) for n in range(1, count + 3)]
+    queue.release()
+
+
+async def test_what_was_only_in_deleted_segments_is_named_and_the_rest_goes_on_behind_it(tmp_path: Path) -> None:
+    queue = make(tmp_path / "spool", settings=ROOMY)
+    queue.put_nowait(started(), b"{}")
+    while len(queue._appender.begun) < 4:
+        put(queue, 1)
+    await queue.synced_to()
+    base = queue._appender.begun[-1].base
+    batch = await queue.get_batch(events_max=5, bytes_max=2**20, age_s_max=0.0)
+    await queue.acknowledge(3)
+    delete_the_folder(queue)
+    with pytest.raises(SpoolUnavailable, match=f"{GONE}; .* lost are positions 4 to"):
+        for _ in range(2):
+            with suppress_all_but_losses():
+                await queue.synced_to()
+    put(queue, 3)
+    await queue.synced_to()
+    firsts, lasts = zip(*[(each.split()[1], each.split()[3].rstrip(":")) for each in queue.lost], strict=True)
+    assert (firsts[0], lasts[-1], len(queue.lost)) == ("4", str(base - 1), 3)
+    assert queue.lost[0].startswith("positions 4 to ")
+    assert "events 1 to " in queue.lost[0]
+    assert queue.lost[-1].split(": ")[1].startswith("events ")
+    assert queue.setback is not None
+    assert queue.lost[0] in queue.setback
+    queue.close()
+    given = await drain(queue)
+    assert events([*batch, *given]) == [(n, n) for n in (*range(1, 6), *range(base, queue.written + 1))]
+    queue.release()
+
+
+async def test_losses_are_named_also_when_the_new_folder_goes_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue = make(tmp_path / "spool", settings=ROOMY)
+    queue.put_nowait(started(), b"{}")
+    while len(queue._appender.begun) < 4:
+        put(queue, 1)
+    await queue.synced_to()
+    base = queue._appender.begun[-1].base
+    deleted: list[Path] = []
+
+    def finish(unfinished: Path, *, instead_of: Path | None) -> Path:
+        if not deleted:
+            deleted.append(unfinished)
+            delete(unfinished)
+        return finish_folder(unfinished, instead_of=instead_of)
+
+    monkeypatch.setattr("pycrorm_async.queue.live.relocation.finish_folder", finish)
+    delete_the_folder(queue)
+    raised: list[str] = []
+    while not raised or queue.synced < queue.written or "goes on in" not in (queue.setback or ""):
+        try:
+            await queue.synced_to()
+        except SpoolUnavailable as error:
+            raised.append(str(error))
+    with suppress(SpoolUnavailable):
+        await queue.synced_to()
+    put(queue, 2)
+    await queue.synced_to()
+    assert queue.lost[-1].startswith(f"positions {int(queue.lost[-1].split()[1])} to {base - 1}:")
+    assert len(queue.lost) == 3
+    assert await recovered(killed(queue, tmp_path)) == [(n, n) for n in range(base, queue.written + 1)]
+    queue.release()
+
+
+async def test_segments_that_can_be_read_are_carried_and_no_copy_is_left(tmp_path: Path) -> None:
+    queue = make(tmp_path / "spool", settings=ROOMY)
+    queue.put_nowait(started(), b"{}")
+    while len(queue._appender.begun) < 4:
+        put(queue, 1)
+    await queue.synced_to()
+    delete_the_segment(queue)
+    before = queue.folder
+    with pytest.raises(SpoolUnavailable, match=GONE):
+        await queue.synced_to()
+    await queue.synced_to()
+    assert (queue.lost, before.exists()) == ((), False)
+    assert await recovered(killed(queue, tmp_path)) == [(n, n) for n in range(1, queue.written + 1)]
+    queue.release()
+
+
+async def test_a_plan_goes_on_while_no_folder_can_be_made_and_all_of_it_is_there_when_one_can(tmp_path: Path) -> None:
+    spool = tmp_path / "spool"
+    queue = make(spool, settings=replace(SLOW, sync_interval_ms=5))
+    queue.put_nowait(started(), b"{}")
+    await queue.synced_to()
+    delete_the_spool(queue)
+    spool.write_text("in the way")
+    for _ in range(3):
+        put(queue, 2)
+        with pytest.raises(SpoolUnavailable):
+            await queue.synced_to()
+    with pytest.raises(SpoolUnavailable, match="recording cannot go on in a new folder"):
+        await queue.synced_to()
+    assert (queue.synced, queue.written) == (1, 7)
+    assert queue.setback is not None
+    assert "cannot go on" in queue.setback
+    spool.unlink()
+    while queue.synced < 7:
+        try:
+            await queue.synced_to()
+        except SpoolUnavailable:
+            await asyncio.sleep(0.01)
+    put(queue, 1)
+    await queue.synced_to()
+    assert await recovered(killed(queue, tmp_path)) == [(n, n) for n in range(1, 9)]
+    queue.release()
+
+
+async def test_a_queue_that_is_closed_while_no_folder_can_be_made_ends_and_says_why(tmp_path: Path) -> None:
+    queue = make(tmp_path / "spool", settings=SLOW)
+    queue.put_nowait(started(), b"{}")
+    delete_the_spool(queue)
+    (tmp_path / "spool").write_text("in the way")
+    queue.close()
+    with pytest.raises(SpoolUnavailable, match=GONE):
+        await queue.synced_to()
+    with pytest.raises(SpoolUnavailable, match="recording cannot go on"):
+        await drain(queue)
+    queue.release()
+
+
+async def test_threads_that_put_meanwhile_leave_no_gap_but_what_is_named(tmp_path: Path) -> None:
+    queue = make(tmp_path / "spool", settings=replace(ROOMY, sync_interval_ms=1, spool_bytes_max=2**23))
+    begin = threading.Barrier(3)
+
+    def produce(number: int) -> None:
+        begin.wait()
+        for heading in (started(number), *[node(number)] * 2_000, ended(number)):
+            while True:
+                try:
+                    queue.put_nowait(heading, b"x" * 50)
+                except SpoolUnavailable:  # both segments are full, and the folder was not made yet
+                    assert queue.failure is None
+                else:
+                    break
+
+    threads = [threading.Thread(target=produce, args=(number,)) for number in (1, 2, 3)]
+
+    def close_behind_them() -> None:
+        for thread in threads:
+            thread.join()
+        queue.close()
+
+    for thread in (*threads, closing := threading.Thread(target=close_behind_them)):
+        thread.start()
+    given: list[Record] = []
+    folders = {queue.folder}
+    deletions = cycle(DELETIONS)
+    while batch := await queue.get_batch(events_max=200, bytes_max=2**20, age_s_max=0.0):
+        given += batch
+        if len(folders) < 9 and queue.folder in folders:
+            with suppress(OSError):  # it has moved on meanwhile
+                next(deletions)(queue)
+        folders.add(queue.folder)
+    closing.join()
+    assert len(folders) > 1
+    assert queue.failure is None
+    queue.release()
+    positions = [each.position for each in given]
+    named = [range(int(words[1]), int(words[3].rstrip(":")) + 1) for words in map(str.split, queue.lost)]
+    missing = set(range(1, queue.written + 1)) - set(positions)
+    assert positions == sorted(set(positions))
+    assert all(any(each in span for span in named) for each in missing)
+    assert queue.written == 6_006
+
+
+@pytest.mark.parametrize("displace", DELETIONS)
+async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_the_new_one(
+    tmp_path: Path, displace: Callable[[RecorderQueue], None]
+) -> None:
+    queue = make(tmp_path / "spool", settings=SLOW, offered=True)
+    queue.put_nowait(started(), b"{}")
+    await queue.synced_to()
+    first = LiveQueue.take(queue.folder)
+    assert first is not None
+    [one] = await first.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)
+    await first.acknowledge(1)
+    first.mark_visible(1, {})
+    displace(queue)
+    put(queue, 2)
+    with pytest.raises(SpoolUnavailable, match=GONE):
+        await queue.synced_to()
+    await queue.synced_to()
+    assert await first.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0) == []
+    first.release()
+    [found] = [each for each in Spool(tmp_path / "spool").recorders() if each.alive]
+    assert open_dead(found.path) is None
+    second = LiveQueue.take(found.path)
+    assert second is not None
+    again = await second.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)
+    assert events(again) == [(1, 1), (2, 2), (3, 3)]
+    assert again[0] == one
+    await second.acknowledge(3)
+    second.mark_visible(3, {})
+    queue.close()
+    await queue.synced_to()
+    assert queue.drained_outside is not None
+    assert (queue.drained_outside.stored, queue.drained_outside.folded) == (3, 3)
+    second.release()
+    queue.release()
+
+
+async def test_a_folder_that_was_taken_away_is_alive_until_the_process_ends(tmp_path: Path) -> None:
+    queue = make(tmp_path / "spool", settings=SLOW)
+    queue.put_nowait(started(), b"{}")
+    before, name = queue.folder, queue.name
+    put_another_in_its_place(queue)
+    with pytest.raises(SpoolUnavailable, match=GONE):
+        await queue.synced_to()
+    await queue.synced_to()
+    back = tmp_path / "elsewhere" / name
+    back.parent.mkdir()
+    (tmp_path / "taken away").rename(back)
+    assert [each.alive for each in Spool(back.parent).recorders()] == [True]
+    assert open_dead(back) is None
+    assert before.exists()
+    queue.release()
+    assert [each.damage for each in inspect_spool(back.parent).recorders] == [None]

@@ -1,0 +1,187 @@
+"""Whatever one folder holds concerns that folder alone: it is damage with a file and an offset, and nothing else."""
+
+import os
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import (
+    CallerError,
+    DamageError,
+    FilesError,
+    PycrormError,
+    SpoolDamaged,
+    SpoolForeign,
+    SpoolUnavailable,
+)
+from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.queue.files.drain_status import Progress
+from pycrorm_async.queue.files.names import PROGRESS
+from pycrorm_async.queue.files.scan import scan
+from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, read_segment, segment_numbers
+from pycrorm_async.queue.live.capacity import Capacity
+from pycrorm_async.queue.maintenance.inspection import inspect_recorder, inspect_spool
+from pycrorm_async.queue.maintenance.repair import repair_folder
+from tests.queue.factories import DECLARED, RECORDER, SMALL, Author, node, recover, started
+from tests.queue.forged_segments import change_a_frame, change_the_header
+
+
+def journal(spool: Path) -> Author:
+    author = Author(spool)
+    author.put(DECLARED, b'{"name":"X"}')
+    for number in (1, 2):
+        author.put(started(number))
+    for size in range(12):
+        author.put(node(1 + size % 2), b"n" * 60 * size)
+        if size % 3 == 2:
+            author.sync()
+    author.sync()
+    return author
+
+
+@pytest.mark.parametrize("name", [b"\xff\xfe", b"\xed\xa0\x80", b"Node\0Started", b""])
+async def test_a_name_that_no_recorder_writes_is_damage_at_its_frame_and_a_repair_keeps_the_rest(
+    tmp_path: Path, name: bytes
+) -> None:
+    author = journal(tmp_path)
+    position = change_a_frame(author.segments[-1], random.Random(3), name=name)
+    path, offset, _ = author.places[position - 1]
+    with pytest.raises(SpoolDamaged) as damaged:
+        await recover(author.folder)
+    assert (damaged.value.path, damaged.value.offset) == (path, offset)
+    [report] = inspect_spool(tmp_path).recorders
+    assert report.damage is not None
+    assert (report.damage.file, report.damage.offset) == (str(path), offset)
+    repaired = repair_folder(author.folder)
+    assert repaired is not None
+    assert repaired.unreadable == ((position, position),)
+    hit = author.records[position - 1].episode
+    kept = [each for each in author.records if each.episode != hit or each.position < position]
+    again = [each for each in await recover(author.folder) if each.payload != LOST]
+    assert [each[1:] for each in again] == [each[1:] for each in kept]
+
+
+def test_a_declaration_that_no_database_takes_is_damage_and_not_a_folder_that_is_stuck(tmp_path: Path) -> None:
+    for payload, reason in ((b"\xff", "not text"), (b"\0", "not text")):
+        author = Author(tmp_path / payload.hex())
+        author.put(DECLARED, payload)
+        author.sync()
+        with pytest.raises(SpoolDamaged, match=reason):
+            scan(author.folder, RECORDER)
+        assert repair_folder(author.folder) is not None
+        assert scan(author.folder, RECORDER).cut.position == 0
+
+
+async def recovered(folder: Path) -> tuple[list[Record], PycrormError | None]:
+    """What recovery gives, or why it gives nothing: an error that names the folder."""
+    try:
+        return await recover(folder), None
+    except (DamageError, FilesError) as refusal:
+        if folder.name not in str(refusal):
+            raise
+        return [], refusal
+
+
+@pytest.mark.parametrize("seed", range(60))
+async def test_a_crafted_folder_is_recovered_or_refused_with_its_file_and_a_repair_makes_it_readable(
+    tmp_path: Path, seed: int
+) -> None:
+    rng = random.Random(seed)
+    author = journal(tmp_path)
+    path = rng.choice(author.segments)
+    safe = 0
+    if rng.random() < 0.25:
+        change_the_header(path, rng)
+    else:
+        safe = change_a_frame(path, rng, fitting=rng.random() < 0.7) - 1
+    sure = [each[1:] for each in author.records[:safe]]
+    given, refusal = await recovered(author.folder)
+    assert refusal is not None or [each[1:] for each in given[:safe]] == sure
+    report = inspect_recorder(Spool(tmp_path).recorders()[0])
+    assert (refusal is None) == (report.damage is None and report.refused is None)
+    if isinstance(refusal, SpoolForeign):
+        with pytest.raises(SpoolForeign, match="is segment"):
+            repair_folder(author.folder)
+        return
+    repair_folder(author.folder)
+    kept = await recover(author.folder)
+    following = iter([each[1:] for each in kept])
+    assert all(each in following for each in sure)  # in this order
+
+
+# --- files --------------------------------------------------------------------------------------------------------
+
+
+def as_a_folder(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.mkdir()
+
+
+def as_a_loop(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.symlink_to(path)
+
+
+def as_a_pipe(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+
+
+def as_a_huge_file(path: Path) -> None:
+    os.truncate(path, 2**42)
+
+
+@pytest.mark.parametrize("name", ["00000001.segment", "alive", "drain"])
+@pytest.mark.parametrize("change", [as_a_folder, as_a_loop, as_a_pipe])
+async def test_what_is_no_file_where_one_should_be_is_one_error_that_names_its_folder(
+    tmp_path: Path, name: str, change: Callable[[Path], None]
+) -> None:
+    author = journal(tmp_path)
+    change(author.folder / name)
+    [found] = Spool(tmp_path).recorders()
+    given, refusal = await recovered(found.path)
+    assert given == [] or name != "00000001.segment"
+    assert refusal is None or str(found.path) in str(refusal)
+    report = inspect_recorder(found)
+    assert (report.refused is not None) == (name == "00000001.segment" or (name, change) == ("drain", as_a_loop))
+
+
+async def test_a_file_larger_than_any_segment_is_damage_and_is_not_read(tmp_path: Path) -> None:
+    author = journal(tmp_path)
+    as_a_huge_file(author.segments[0])
+    with pytest.raises(SpoolDamaged, match="takes 4,398,046,511,104 bytes, and a segment at most 1,073,741,824"):
+        open_dead(author.folder)
+    with pytest.raises(CallerError, match="must be at most"):
+        Capacity.of(SMALL.__class__(segment_bytes=SEGMENT_BYTES_MAX + 1, spool_bytes_max=2**40))
+
+
+async def test_numbers_that_no_segment_has_are_not_ours(tmp_path: Path) -> None:
+    author = journal(tmp_path)
+    for stem in ("0" * 8, "9" * 40, "000000001", "\N{ARABIC-INDIC DIGIT ONE}" * 8):
+        (author.folder / f"{stem}.segment").write_bytes(b"x")
+    assert segment_numbers(author.folder) == [int(path.name[:8]) for path in author.segments]
+    assert [each for each in await recover(author.folder) if each.payload != LOST] == author.records
+    with pytest.raises(FileNotFoundError):
+        read_segment(author.folder / "gone")
+
+
+def test_a_hint_of_garbage_is_no_hint(tmp_path: Path) -> None:
+    progress = Progress.make(tmp_path)
+    progress.close()
+    whole = (tmp_path / PROGRESS).read_bytes()
+    for seed in range(20):
+        (tmp_path / PROGRESS).write_bytes(whole[:16] + random.Random(seed).randbytes(len(whole) - 16))
+        opened = Progress.open(tmp_path, writing=False)
+        assert opened is not None
+        assert (opened.recorded(), opened.drained().stored) == (opened.recorded().__class__(), 0)
+        opened.close()
+
+
+def test_a_note_of_the_database_that_is_no_text_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "log").write_bytes(b"\xff\xfe")
+    with pytest.raises(SpoolUnavailable, match="does not hold the id of a log"):
+        Spool(tmp_path).bind(episode_text(RECORDER))

@@ -1,0 +1,163 @@
+"""A full spool: ordinary records stop at the reserve, reserved ones at the end, and room wakes who waits."""
+
+import asyncio
+import contextlib
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
+from pycrorm_async.queue import RecorderQueue
+from tests.queue.factories import DECLARED, SMALL, drain, make, node, started
+
+# Every node takes 976 bytes. The first segment holds the start and 3 of them, each other one 3: 24 in 8 segments.
+# Kept free are 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, and these hold 3.
+ORDINARY, ALL = 18, 24
+PAYLOAD = b"x" * 900
+
+
+def fill(queue: RecorderQueue, *, reserved: bool = False) -> int:
+    count = 0
+    while True:
+        try:
+            queue.put_nowait(node(), PAYLOAD, reserved=reserved)
+        except SpoolFull:
+            return count
+        count += 1
+
+
+@pytest.fixture
+def filled(queue: RecorderQueue) -> RecorderQueue:
+    queue.put_nowait(started(), b"{}")
+    assert fill(queue) == ORDINARY
+    return queue
+
+
+async def drain_all(queue: RecorderQueue) -> None:
+    await queue.synced_to()
+    records = await queue.get_batch(events_max=1000, bytes_max=2**22, age_s_max=0.0)
+    await queue.acknowledge(records[-1].position)
+
+
+def test_the_files_never_hold_more_than_allowed_however_much_is_put(filled: RecorderQueue) -> None:
+    assert fill(filled, reserved=True) == ALL - ORDINARY
+    assert sum(path.stat().st_size for path in filled.folder.glob("*.segment")) == SMALL.spool_bytes_max
+    assert filled.bytes_spooled <= SMALL.spool_bytes_max
+    assert filled.written == 1 + ALL
+
+
+def test_what_is_refused_leaves_no_gap_and_smaller_records_may_still_fit(filled: RecorderQueue) -> None:
+    assert filled.full
+    with pytest.raises(SpoolFull, match="spool_bytes_max is reached"):
+        filled.put_nowait(node(), PAYLOAD)
+    assert filled.put_nowait(node(), b"x") == 2 + ORDINARY
+    assert filled.put_nowait(node(), PAYLOAD, reserved=True) == 3 + ORDINARY
+
+
+async def test_room_comes_when_records_are_stored_and_segments_go(filled: RecorderQueue) -> None:
+    waiting = asyncio.ensure_future(filled.room())
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    await drain_all(filled)
+    await asyncio.wait_for(waiting, 10)
+    assert not filled.full
+    assert filled.put_nowait(node(), PAYLOAD) == 2 + ORDINARY
+    await asyncio.wait_for(filled.room(), 10)
+
+
+async def test_room_for_a_large_record_is_not_announced_while_only_a_small_one_fits(filled: RecorderQueue) -> None:
+    assert filled.put_nowait(node(), b"x") == 2 + ORDINARY
+    assert filled.full  # for what was refused
+
+
+async def test_a_blocked_thread_goes_on_when_records_are_stored(tmp_path: Path) -> None:
+    queue = make(tmp_path, clock=SYSTEM_CLOCK)
+    queue.put_nowait(started(), b"{}")
+    fill(queue, reserved=True)
+    assert queue.block_until_room(0.01) is False
+    answers: list[bool] = []
+    blocked = threading.Thread(target=lambda: answers.append(queue.block_until_room(30.0)))
+    blocked.start()
+    await drain_all(queue)
+    await asyncio.to_thread(blocked.join)
+    assert answers == [True]
+    assert queue.block_until_room(0.0) is True
+    queue.release()
+
+
+async def test_nobody_waits_for_room_in_a_closed_queue(filled: RecorderQueue) -> None:
+    waiting = asyncio.ensure_future(filled.room())
+    blocked = asyncio.ensure_future(asyncio.to_thread(filled.block_until_room, 30.0))
+    await asyncio.sleep(0.01)
+    filled.close()
+    await asyncio.wait_for(asyncio.gather(waiting, blocked), 10)
+    with pytest.raises(SpoolClosed):
+        filled.put_nowait(node(), b"{}")
+
+
+async def test_a_full_queue_gives_everything_away_and_goes_on(filled: RecorderQueue) -> None:
+    fill(filled, reserved=True)
+    for _ in range(20):
+        await drain_all(filled)
+        async with asyncio.timeout(10):
+            await filled.room()
+        filled.put_nowait(node(), PAYLOAD)
+    filled.close()
+    assert [each.position for each in await drain(filled)] == [filled.written]
+    assert filled.written == 1 + ALL + 20
+
+
+async def test_who_waits_for_room_in_a_queue_that_nobody_empties_is_told_why(filled: RecorderQueue) -> None:
+    fill(filled, reserved=True)
+    waiting = asyncio.ensure_future(filled.room())
+    blocked = asyncio.ensure_future(asyncio.to_thread(filled.block_until_room, 1000.0))
+    await asyncio.sleep(0.01)
+    assert not waiting.done()
+    assert not blocked.done()
+    filled.fail("the log is damaged")
+    filled.fail("and something else happened later")
+    async with asyncio.timeout(20):
+        for each in (waiting, blocked, filled.room()):
+            with pytest.raises(SpoolStuck, match=r"is full .* and cannot be emptied: the log is damaged$"):
+                await each
+    with pytest.raises(SpoolStuck, match="the log is damaged"):
+        filled.block_until_room(1000.0)
+    with pytest.raises(SpoolStuck, match="the log is damaged"):
+        filled.put_nowait(node(), PAYLOAD, reserved=True)
+
+
+async def test_a_queue_that_nobody_empties_takes_what_it_has_room_for(queue: RecorderQueue) -> None:
+    queue.put_nowait(started(), b"{}")
+    queue.fail("the log is damaged")
+    for _ in range(ORDINARY):
+        await asyncio.wait_for(queue.room(), 20)
+        queue.put_nowait(node(), PAYLOAD)
+    with pytest.raises(SpoolStuck):
+        queue.put_nowait(node(), PAYLOAD)
+    with pytest.raises(SpoolStuck):
+        await asyncio.wait_for(queue.room(), 20)
+    for _ in range(ALL - ORDINARY):
+        assert queue.block_until_room(0.0) is True
+        queue.put_nowait(node(), PAYLOAD, reserved=True)
+    queue.close()
+    assert await queue.room() is None  # type: ignore[func-returns-value]  # putting says that it is closed
+    assert len(await drain(queue)) == 1 + ALL
+
+
+def test_settings_that_cannot_work_are_refused_before_anything_is_made(tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match="three segments"):
+        make(tmp_path / "spool", settings=replace(SMALL, spool_reserve_bytes=6 * 4096))
+    assert not (tmp_path / "spool").exists()
+
+
+def test_recorder_level_records_count_too(queue: RecorderQueue) -> None:
+    assert not queue.full
+    put = 0
+    with contextlib.suppress(SpoolFull):
+        while True:
+            put += 1 + queue.put_nowait(DECLARED, PAYLOAD)
+    assert put == ORDINARY
+    assert queue.full

@@ -1,0 +1,426 @@
+"""The live queue: places and sequences, safety levels, batches, acknowledging, closing."""
+
+import asyncio
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import EpisodeRefused, InternalError, SpoolClosed, SpoolUnavailable
+from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.hooks.event_sink import EventSink
+from pycrorm_async.queue import RecorderQueue, Spool
+from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.settings import Settings
+from pycrorm_async.writer.ports import Source
+from tests.queue.factories import (
+    DECLARED,
+    SMALL,
+    as_left_by_a_kill,
+    drain,
+    ended,
+    lost,
+    make,
+    node,
+    record,
+    recover,
+    started,
+)
+
+LONG_S = 30.0
+
+
+def batch_of(
+    queue: RecorderQueue, events: int, *, bytes_max: int = 2**22, age_s: float = 0.0
+) -> asyncio.Task[list[Record]]:
+    return asyncio.ensure_future(queue.get_batch(events_max=events, bytes_max=bytes_max, age_s_max=age_s))
+
+
+def test_it_is_what_the_hooks_and_the_writer_ask_for(queue: RecorderQueue) -> None:
+    sink: EventSink = queue
+    source: Source = queue
+    assert sink.full is False
+    assert source.name == queue.folder.name
+
+
+async def test_records_come_back_in_order_as_they_were_put(queue: RecorderQueue) -> None:
+    assert queue.put_nowait(DECLARED, b'{"kind":"action"}') == 0
+    assert queue.put_nowait(started(1), b"{}") == 1
+    assert queue.put_nowait(started(2), b"{}") == 1
+    assert queue.put_nowait(node(1), '{"text":"Grüße"}'.encode()) == 2
+    assert queue.put_nowait(ended(2), b"") == 2
+    assert queue.written == 5
+    queue.close()
+    assert await drain(queue) == [
+        record(1, DECLARED, 0, b'{"kind":"action"}'),
+        record(2, started(1), 1, b"{}"),
+        record(3, started(2), 1, b"{}"),
+        record(4, node(1), 2, '{"text":"Grüße"}'.encode()),
+        record(5, ended(2), 2, b""),
+    ]
+
+
+async def test_what_was_written_is_there_after_a_kill_before_any_sync(tmp_path: Path) -> None:
+    queue = make(tmp_path / "a", settings=Settings(sync_interval_ms=3_600_000))
+    queue.put_nowait(started(), b"{}")
+    queue.put_nowait(node(), b"1")
+    assert queue.synced == 0
+    left = as_left_by_a_kill(queue, tmp_path / "b")
+    queue.release()
+    assert await recover(left) == [record(1, started(), 1, b"{}"), record(2, node(), 2, b"1"), lost(3, 1, 3)]
+
+
+async def test_only_synced_records_are_given_away(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
+    queue.put_nowait(started(), b"{}")
+    waiting = batch_of(queue, 10)
+    assert await asyncio.wait({waiting}, timeout=0.05) == (set(), {waiting})
+    await queue.synced_to()
+    assert queue.synced == 1
+    assert await waiting == [record(1, started(), 1, b"{}")]
+    queue.release()
+
+
+async def test_a_sync_comes_by_itself_and_for_each_of_many_waiters_in_several_loops(queue: RecorderQueue) -> None:
+    queue.put_nowait(started(), b"{}")
+    others = [asyncio.to_thread(asyncio.run, queue.synced_to(1)) for _ in range(3)]
+    await asyncio.gather(queue.synced_to(), queue.synced_to(1), *others)
+    assert queue.synced == 1
+    queue.put_nowait(node(), b"{}")
+    assert [each.position for each in await batch_of(queue, 2, age_s=LONG_S)] == [1, 2]  # nobody asked for this sync
+
+
+async def test_a_waiter_that_gives_up_leaves_the_others_waiting(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
+    queue.put_nowait(started(), b"{}")
+    waiting = batch_of(queue, 1)
+    given_up = batch_of(queue, 1)
+    await asyncio.sleep(0)
+    given_up.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await given_up
+    await queue.synced_to()
+    assert [each.position for each in await waiting] == [1]
+    queue.release()
+
+
+async def test_sequences_of_many_threads_have_no_gaps_and_no_doubles(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12))
+    queue.put_nowait(started(0), b"{}")
+    returned: list[tuple[int, int]] = []
+    begin = threading.Barrier(4)
+
+    def produce(number: int) -> None:
+        begin.wait()
+        queue.put_nowait(started(number), b"{}")
+        mine = [(0, queue.put_nowait(node(0), b"shared")) for _ in range(500)]
+        mine += [(number, queue.put_nowait(node(number), b"own")) for _ in range(500)]
+        returned.extend(mine)
+
+    threads = [threading.Thread(target=produce, args=(number,)) for number in (1, 2, 3, 4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    queue.close()
+    records = await drain(queue)
+    queue.release()
+    assert sorted(returned) == [(0, sequence) for sequence in range(2, 2002)] + [
+        (number, sequence) for number in (1, 2, 3, 4) for sequence in range(2, 502)
+    ]
+    assert [each.position for each in records] == list(range(1, 4006))
+    for number in range(5):
+        mine = [each.sequence for each in records if each.episode == started(number).episode]
+        assert mine == list(range(1, len(mine) + 1))
+
+
+async def test_an_event_of_an_episode_that_is_not_open_is_refused_and_leaves_no_gap(queue: RecorderQueue) -> None:
+    with pytest.raises(InternalError, match="cannot take NodeStarted"):
+        queue.put_nowait(node(1), b"{}")
+    queue.put_nowait(started(1), b"{}")
+    queue.put_nowait(ended(1), b"{}")
+    with pytest.raises(InternalError, match="is not open"):
+        queue.put_nowait(node(1), b"straggler")
+    assert queue.put_nowait(started(2), b"{}") == 1
+    assert queue.written == 3
+
+
+async def test_a_record_that_no_segment_can_hold_is_refused_and_leaves_no_gap(queue: RecorderQueue) -> None:
+    queue.put_nowait(started(), b"{}")
+    largest = 4096 - 56 - 40 - 2 * 72 - 64 - len("NodeStarted")
+    largest -= (largest + len("NodeStarted")) % 8
+    with pytest.raises(InternalError, match="does not fit into a segment"):
+        queue.put_nowait(node(), bytes(largest + 8))
+    assert queue.put_nowait(node(), bytes(largest)) == 2
+    queue.close()
+    assert [len(each.payload) for each in await drain(queue)] == [2, largest]
+
+
+async def test_as_many_episodes_are_open_as_leave_room_for_the_largest_record(queue: RecorderQueue) -> None:
+    most = (4096 - 2 * 72 - 56 - 64 - 2304) // 40
+    for number in range(most):
+        queue.put_nowait(started(number), b"{}")
+    with pytest.raises(EpisodeRefused, match=f"{most} episodes are open"):
+        queue.put_nowait(started(most), b"{}")
+    longest = Heading(started(0).episode, "x" * 255, 1)
+    assert [queue.put_nowait(longest, bytes(2048), reserved=True) for _ in range(3)] == [2, 3, 4]
+    queue.put_nowait(ended(1), b"{}")
+    assert queue.put_nowait(started(most), b"{}") == 1
+    queue.close()
+    assert len(await drain(queue)) == most + 5
+
+
+async def test_a_type_name_that_has_no_place_in_a_frame_is_refused(queue: RecorderQueue) -> None:
+    queue.put_nowait(started(), b"{}")
+    for name in ("", "x" * 256, "ä" * 128):
+        with pytest.raises(InternalError, match="1 to 255 bytes"):
+            queue.put_nowait(Heading(started().episode, name, 1), b"{}")
+    assert queue.put_nowait(Heading(started().episode, "ä" * 127, 1), b"{}") == 2
+
+
+async def test_a_batch_closes_at_the_number_of_events(queue: RecorderQueue) -> None:
+    queue.put_nowait(started(), b"{}")
+    for _ in range(5):
+        queue.put_nowait(node(), b"{}")
+    await queue.synced_to()
+    assert [each.position for each in await batch_of(queue, 4, age_s=LONG_S)] == [1, 2, 3, 4]
+    assert [each.position for each in await batch_of(queue, 2, age_s=LONG_S)] == [5, 6]
+
+
+async def test_a_batch_closes_at_its_bytes_and_a_larger_record_comes_alone(queue: RecorderQueue) -> None:
+    for payload in (started(), node(), node(), node(), node()):
+        queue.put_nowait(payload, b"x" * 100)
+    queue.put_nowait(node(), b"x" * 1000)
+    queue.put_nowait(node(), b"x")
+    await queue.synced_to()
+    batches = [await batch_of(queue, 99, bytes_max=250, age_s=0.01) for _ in range(4)]
+    sizes = [[len(each.payload) for each in batch] for batch in batches]
+    assert sizes == [[100, 100], [100, 100], [100], [1000]]
+    assert [len(each.payload) for each in await batch_of(queue, 99, bytes_max=250)] == [1]
+
+
+async def test_a_batch_closes_at_its_age_and_takes_what_came_until_then(
+    queue: RecorderQueue, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loop = asyncio.get_running_loop()
+    now_s = loop.time()
+    monkeypatch.setattr(loop, "time", lambda: now_s)
+    queue.put_nowait(started(), b"{}")
+    waiting = batch_of(queue, 3, age_s=LONG_S)
+    await queue.synced_to()
+    await steps(10)
+    queue.put_nowait(node(), b"{}")
+    await queue.synced_to()
+    await steps(10)
+    now_s += LONG_S - 0.5
+    await steps(10)
+    assert not waiting.done()
+    now_s += 1.0
+    assert [each.position for each in await waiting] == [1, 2]
+
+
+async def steps(count: int) -> None:
+    """Whatever is ready in the loop takes its turn, so often, and the sync thread before it."""
+    for _ in range(count):
+        time.sleep(0.005)  # noqa: ASYNC251  the loop's own clock stands still
+        await asyncio.sleep(0)
+
+
+async def test_a_cancelled_batch_is_given_again(queue: RecorderQueue) -> None:
+    queue.put_nowait(started(), b"{}")
+    await queue.synced_to()
+    waiting = batch_of(queue, 2, age_s=LONG_S)
+    await asyncio.sleep(0.02)
+    waiting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await waiting
+    assert [each.position for each in await batch_of(queue, 2)] == [1]
+
+
+async def test_a_consumer_in_its_own_loop_and_thread_is_woken_by_producers(queue: RecorderQueue) -> None:
+    async def consume() -> list[int]:
+        positions: list[int] = []
+        while batch := await queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0):
+            positions += [each.position for each in batch]
+            await queue.acknowledge(batch[-1].position)
+        return positions
+
+    consumed = asyncio.ensure_future(asyncio.to_thread(asyncio.run, consume()))
+    queue.put_nowait(started(), b"{}")
+    for _ in range(20):
+        queue.put_nowait(node(), b"{}")
+        await asyncio.sleep(0.001)
+    queue.close()
+    assert await consumed == list(range(1, 22))
+    assert queue.stored == 21
+
+
+async def test_closing_refuses_puts_syncs_drains_and_ends_in_an_empty_batch(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
+    queue.put_nowait(started(), b"{}")
+    queue.put_nowait(node(), b"{}")
+    queue.close()
+    queue.close()
+    with pytest.raises(SpoolClosed):
+        queue.put_nowait(node(), b"{}")
+    assert [each.position for each in await batch_of(queue, 1)] == [1]
+    assert [each.position for each in await batch_of(queue, 1)] == [2]
+    assert await batch_of(queue, 1) == []
+    assert await batch_of(queue, 1) == []
+    queue.release()
+
+
+async def test_closing_wakes_who_waits_for_a_batch(queue: RecorderQueue) -> None:
+    waiting = batch_of(queue, 1, age_s=LONG_S)
+    await asyncio.sleep(0)
+    queue.close()
+    assert await waiting == []
+
+
+async def test_segments_roll_and_go_once_all_in_them_is_acknowledged(queue: RecorderQueue) -> None:
+    def files() -> list[str]:
+        return sorted(path.name for path in queue.folder.glob("*.segment"))
+
+    queue.put_nowait(started(), b"{}")
+    for _ in range(8):
+        queue.put_nowait(node(), b"x" * 900)
+    # The first of 80 bytes and three of 976 in the first segment, three in the next, the last two in the third.
+    await queue.synced_to()
+    records = await batch_of(queue, 9)
+    assert [each.position for each in records] == list(range(1, 10))
+    await queue.acknowledge(3)
+    await settle(queue)
+    assert files()[:3] == ["00000001.segment", "00000002.segment", "00000003.segment"]
+    await queue.acknowledge(4)
+    await until(lambda: files()[0] == "00000002.segment")
+    await queue.acknowledge(9)
+    await until(lambda: files()[0] == "00000003.segment")
+    assert (queue.stored, queue.synced, queue.written) == (9, 11, 11)  # the last two were put to settle
+
+
+async def test_bytes_spooled_counts_headers_records_and_commits(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=replace(SMALL, sync_interval_ms=3_600_000))
+    assert queue.bytes_spooled == 56
+    queue.put_nowait(started(), b"{}")
+    assert queue.bytes_spooled == 56 + 64 + 16
+    await queue.synced_to()
+    await queue.synced_to()
+    assert queue.bytes_spooled == 56 + 80 + 72
+    for _ in range(4):
+        queue.put_nowait(node(), b"x" * 900)
+    assert queue.bytes_spooled == 4096 + 96 + 976
+    queue.release()
+
+
+async def settle(queue: RecorderQueue) -> None:
+    """Two turns of the sync thread have passed."""
+    for _ in range(2):
+        queue.put_nowait(DECLARED, b"{}")
+        await queue.synced_to()
+
+
+async def until(reached: Callable[[], bool]) -> None:
+    async with asyncio.timeout(10):
+        while not reached():  # noqa: ASYNC110  # what it waits for is a file
+            await asyncio.sleep(0.001)
+
+
+async def test_a_queue_of_which_all_is_stored_leaves_nothing_behind(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    queue.put_nowait(ended(), b"{}")
+    queue.close()
+    assert len(await drain(queue)) == 2
+    await queue.acknowledge(2)
+    queue.release()
+    queue.release()
+    assert Spool(spool).recorders() == []
+    assert Spool(spool).strangers() == []
+
+
+async def test_a_queue_with_an_open_episode_leaves_its_folder_for_recovery(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    queue.close()
+    await drain(queue)
+    await queue.acknowledge(1)
+    queue.release()
+    assert await recover(queue.folder) == [record(1, started(), 1, b"{}"), lost(2, 1, 2)]
+
+
+async def test_a_queue_that_is_let_go_undrained_leaves_all_of_it_synced(spool: Path) -> None:
+    queue = make(spool, settings=Settings(sync_interval_ms=3_600_000))
+    queue.put_nowait(started(), b"{}")
+    queue.put_nowait(ended(), b"{}")
+    queue.release()
+    assert queue.synced == 2
+    assert [(each.path, each.alive) for each in Spool(spool).recorders()] == [(queue.folder, False)]
+    assert await recover(queue.folder) == [record(1, started(), 1, b"{}"), record(2, ended(), 2, b"{}")]
+
+
+async def test_a_folder_is_drained_by_one_only(queue: RecorderQueue) -> None:
+    drained_elsewhere = FileLock.take(queue.folder / "drain")
+    assert drained_elsewhere is not None
+    with pytest.raises(SpoolUnavailable, match="drained by another process"):
+        await queue.get_batch(events_max=1, bytes_max=1, age_s_max=0.0)
+    drained_elsewhere.release()
+    queue.close()
+    assert await drain(queue) == []
+    assert FileLock.take(queue.folder / "drain") is None
+
+
+async def test_two_recorders_of_one_name_are_refused(queue: RecorderQueue, spool: Path) -> None:
+    with pytest.raises(SpoolUnavailable):
+        make(spool)
+    assert queue.put_nowait(started(), b"{}") == 1
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_a_spool_that_cannot_be_made_is_one_clear_line(tmp_path: Path, deep: bool) -> None:
+    blocking = tmp_path / "blocking"
+    blocking.touch()
+    with pytest.raises(SpoolUnavailable) as refused:
+        make(blocking / "spool" if deep else blocking)
+    assert str(blocking) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+INTERRUPTS = 2_000
+
+
+async def test_an_interrupt_in_the_middle_of_putting_leaves_a_whole_queue(tmp_path: Path) -> None:
+    queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12), clock=SYSTEM_CLOCK)
+    queue.put_nowait(started(), b"{}")
+    returned = 0
+
+    class Interrupted(BaseException):
+        pass
+
+    def interrupt(number: int, frame: object) -> None:
+        raise Interrupted
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    interrupts = 0
+    try:
+        while interrupts < INTERRUPTS:
+            try:
+                signal.setitimer(signal.ITIMER_REAL, 0.000_05 + (interrupts % 97) * 0.000_001)
+                while True:
+                    queue.put_nowait(node(), b"x" * 100)
+                    returned += 1
+            except Interrupted:
+                interrupts += 1
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+    queue.close()
+    records = await drain(queue)
+    queue.release()
+    assert [each.position for each in records] == list(range(1, len(records) + 1))
+    assert [each.sequence for each in records] == list(range(1, len(records) + 1))
+    assert returned + 1 <= len(records) <= returned + 1 + INTERRUPTS

@@ -1,0 +1,189 @@
+"""A copy of a world is exactly like it, quiet, and nothing that is done in one is done in the other."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, current_world, watcher
+from pycrorm_async.world.errors import WorldClosed
+from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.world_copy import copied, counterpart, original, related
+from tests.world.fakes import CRANE, Witness, crane_links, matrix
+
+TURNED = {"turning": 2.5, "lifting": 0.8, "reaching": 0.3}
+
+
+class Doorman:
+    """A watcher: which worlds were entered and left."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[str, BulletWorld]] = []
+
+    def world_entered(self, world: BulletWorld) -> None:
+        self.told.append(("entered", world))
+
+    def world_left(self, world: BulletWorld) -> None:
+        self.told.append(("left", world))
+
+
+@pytest.fixture
+def yard(world: BulletWorld) -> BulletWorld:
+    """A crane with a load on its hook and a label on the load; a milk that stands by itself."""
+    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([1, 2, 0], yaw_quaternion(0.4)))
+    load = Object("load", ObjectType.BOWL, pose=Pose([3, 3, 3]))
+    label = Object("label", ObjectType.SPOON, pose=Pose([3, 3.1, 3]))
+    Object("milk", ObjectType.MILK, pose=Pose([0, -1, 0.5]))
+    load.attach(label)
+    crane.attach(load, "hook")
+    crane.set_joint_positions(TURNED)
+    crane.set_pose(Pose([1.5, 2, 0.1], yaw_quaternion(-0.7)))
+    return world
+
+
+def test_everything_in_a_copy_is_as_it_is_in_the_world(yard: BulletWorld) -> None:
+    before = yard.save_state()
+    with copied(yard) as copy:
+        assert copy is not yard
+        assert copy.client != yard.client
+        for thing, twin in zip(yard.objects, copy.objects, strict=True):
+            assert twin is not thing
+            assert (twin.name, twin.object_type, twin.world) == (thing.name, thing.object_type, copy)
+            assert (twin.pose, twin.pose.time_ns) == (thing.pose, thing.pose.time_ns)
+            assert twin.joint_positions() == thing.joint_positions()
+            assert twin.original_pose == thing.original_pose
+            assert twin.description_text == thing.description_text
+            # The same numbers went through the same arithmetic: Bullet agrees to the last bit.
+            assert [twin.link_pose(link) for link in twin.links] == [thing.link_pose(link) for link in thing.links]
+            assert twin.bounding_box() == thing.bounding_box()
+        assert copy.save_state() == before
+        names = [(each.parent.name, each.child.name, each.link, each.relative) for each in copy.attachments]
+        assert names == [(each.parent.name, each.child.name, each.link, each.relative) for each in yard.attachments]
+        assert all(each.parent.world is each.child.world is copy for each in copy.attachments)
+    assert yard.save_state() == before
+
+
+def test_what_is_attached_in_a_copy_moves_there_as_geometry_says_and_not_in_the_world(yard: BulletWorld) -> None:
+    """Where the label must be: on the hook, by matrices from the crane's drawing."""
+    witness = Witness()
+    yard.observe(witness)
+    state = yard.save_state()
+    with copied(yard) as copy:
+        crane, label = copy.object("crane"), copy.object("label")
+        hook = crane_links(crane.pose, **TURNED)["hook"]
+        on_hook = np.linalg.inv(hook) @ matrix(label.pose)
+        crane.set_joint_positions({"turning": -1.0, "reaching": 0.1})
+        crane.set_pose(Pose([-2, 0, 1]))
+        there = crane_links(Pose([-2, 0, 1]), turning=-1.0, lifting=0.8, reaching=0.1)["hook"] @ on_hook
+        assert np.allclose(matrix(label.pose), there, atol=1e-6)
+        copy.object("milk").remove()
+        Object("spoon", ObjectType.SPOON)
+        crane.detach_all()
+    assert yard.save_state() == state
+    assert [each.name for each in yard.objects] == ["crane", "load", "label", "milk"]
+    assert witness.told == []
+
+
+def test_what_happens_in_the_world_does_not_happen_in_its_copy(yard: BulletWorld) -> None:
+    with copied(yard) as copy:
+        state = copy.save_state()
+        yard.object("crane").set_joint_position("turning", 0.0)
+        yard.object("milk").remove()
+        assert copy.save_state() == state
+
+
+def test_copying_is_quiet(yard: BulletWorld) -> None:
+    witness, doorman = Witness(), Doorman()
+    yard.observe(witness)
+    token = watcher.set(doorman)
+    try:
+        with copied(yard) as copy:
+            assert copy.observers == ()
+    finally:
+        watcher.reset(token)
+    assert (witness.told, doorman.told) == ([], [])
+    assert yard.observers == (witness,)
+
+
+def test_a_copy_is_the_current_world_inside_and_closed_afterwards_however_it_is_left(yard: BulletWorld) -> None:
+    with pytest.raises(ZeroDivisionError), copied(yard) as copy:
+        assert current_world.get() is copy
+        _ = 1 / 0
+    assert current_world.get() is yard
+    assert not copy.entered
+    with pytest.raises(WorldClosed):
+        copy.object("milk").set_pose(Pose())
+    assert yard.entered
+
+
+def test_a_copy_resets_to_where_its_objects_began(yard: BulletWorld) -> None:
+    with copied(yard) as copy:
+        copy.reset()
+        crane = copy.object("crane")
+        assert crane.pose == Pose([1, 2, 0], yaw_quaternion(0.4))
+        assert set(crane.joint_positions().values()) == {0.0}
+        assert list(copy.attachments) == []
+
+
+def test_counterparts_are_found_from_every_copy_in_every_other(yard: BulletWorld) -> None:
+    milk = yard.object("milk")
+    with copied(yard) as first:
+        with copied(first) as second:
+            deep = second.object("milk")
+            assert counterpart(milk, second) is deep
+            assert counterpart(deep, first) is first.object("milk")
+            assert counterpart(deep, yard) is milk
+            assert (original(second), related(second, yard)) == (yard, True)
+        with copied(yard) as other:
+            assert counterpart(deep, other) is other.object("milk")
+            assert counterpart(milk, yard) is milk
+
+
+def test_what_is_not_there_has_no_counterpart(yard: BulletWorld) -> None:
+    removed, milk = yard.object("label"), yard.object("milk")
+    removed.remove()
+    with copied(yard) as copy:
+        only_here = Object("only here", ObjectType.BOWL)
+        again = Object("label", ObjectType.SPOON)
+        assert counterpart(only_here, yard) is None
+        assert counterpart(removed, copy) is None
+        assert counterpart(removed, yard) is None
+        assert counterpart(again, yard) is None
+        twin = copy.object("milk")
+        twin.remove()
+        assert counterpart(milk, copy) is None
+        assert counterpart(twin, yard) is milk
+    with BulletWorld() as stranger:
+        assert counterpart(milk, stranger) is None
+        assert not related(stranger, yard)
+
+
+def test_a_world_that_was_left_cannot_be_copied() -> None:
+    with BulletWorld() as world:
+        pass
+    with pytest.raises(WorldClosed), copied(world):
+        pass
+
+
+def test_the_robot_of_a_copy_is_the_robot(world: BulletWorld) -> None:
+    Object("a", ObjectType.ROBOT, CRANE)
+    Object("pr2", ObjectType.ROBOT)
+    world.object("a").remove()
+    with copied(world) as copy:
+        assert copy.robot is copy.object("pr2")
+        assert copy.robot.robot_description is world.object("pr2").robot_description
+
+
+async def test_two_tasks_have_a_copy_each(yard: BulletWorld) -> None:
+    async def moved(x: float) -> float:
+        with copied(yard) as copy:
+            copy.object("milk").set_pose(Pose([x, 0, 0]))
+            await asyncio.sleep(0.01)
+            assert current_world.get() is copy
+            return copy.object("milk").pose.position.x
+
+    assert tuple(await asyncio.gather(moved(1.0), moved(2.0))) == (1.0, 2.0)
+    assert yard.object("milk").pose.position == (0, -1, 0.5)
+    assert current_world.get() is yard

@@ -1,0 +1,175 @@
+"""The writer between the real queue and the real log."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.errors import EpisodeParked, PycrormError, SpoolFull, SpoolStuck
+from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
+from pycrorm_async.operations.destination import dead_queues
+from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.queue.sources.dead_source import open_dead
+from pycrorm_async.settings import Settings
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.drain_once import drain_once
+from pycrorm_async.writer.writer_thread import WriterThread
+from tests.databases import ask, ask_to_change
+from tests.store.factories import episode
+from tests.writer.fakes import CountingFold, opener
+
+SETTINGS = Settings(
+    segment_bytes=2**17, record_bytes_max=2**12, batch_events_max=700, sync_interval_ms=5, idle_ms=10**9
+)
+STORED = "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY episode"
+
+
+def queue_in(spool: Path, settings: Settings = SETTINGS) -> RecorderQueue:
+    return RecorderQueue.create(
+        spool, settings=settings, clock=SYSTEM_CLOCK, recorder=episode_id(1_700_000_000_000_000_000, bytes(10))
+    )
+
+
+def kind(of: EpisodeId, number: int) -> Heading:
+    return Heading(of, "EpisodeStarted" if number == 1 else "NodeStarted", 1)
+
+
+def payload(number: int) -> bytes:
+    return b'{"kind":"action","parent":%d,"text":"%s"}' % (number, "é🤖\\u0007".encode() * 20)
+
+
+async def test_what_is_put_into_the_queue_is_in_the_log_byte_for_byte(tmp_path: Path, address: DatabaseAddress) -> None:
+    queue = queue_in(tmp_path / "spool")
+    writer = WriterThread(source=queue, open_destination=opener(address), adopt=tuple, settings=SETTINGS)
+    await writer.start()
+    queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), b'{"dtype":"SayingAction"}')
+    for number in range(1, 2001):
+        assert queue.put_nowait(kind(episode(1), number), payload(number)) == number
+        if number % 10 == 0:
+            queue.put_nowait(kind(episode(2), number // 10), payload(number))
+    await queue.synced_to(queue.written)
+    await writer.flush(queue.written)
+    assert ask(address.path, STORED) == [(1, 2000, 1, 2000), (2, 200, 1, 200)]
+    repeated = queue._appender._current.number - 1  # the declaration begins each segment after the first
+    assert repeated > 1
+    assert queue.stored == queue.written == 2201 + repeated
+    queue.put_nowait(Heading(episode(1), "EpisodeEnded", 1), b'{"status":"SUCCEEDED"}')
+    queue.close()
+    await writer.close()
+    queue.release()
+    rows = ask(address.path, "SELECT payload FROM event WHERE episode = 1 ORDER BY sequence")
+    assert [row[0].encode() for row in rows] == [payload(number) for number in range(1, 2001)] + [
+        b'{"status":"SUCCEEDED"}'
+    ]
+    assert ask(address.path, "SELECT payload FROM pycrorm_declaration") == [('{"dtype":"SayingAction"}',)]
+    assert ask(address.path, "SELECT head, folded FROM episode ORDER BY number") == [(2001, 2001), (200, 200)]
+
+
+SMALL = replace(SETTINGS, segment_bytes=2**14, spool_bytes_max=2**17, spool_reserve_bytes=2**15)
+
+
+async def refused_in(tmp_path: Path, address: DatabaseAddress) -> tuple[RecorderQueue, WriterThread]:
+    """Both at work, and the database has just forgotten two events of the first episode."""
+    queue = queue_in(tmp_path / "spool", SMALL)
+    writer = WriterThread(source=queue, open_destination=opener(address), adopt=tuple, settings=SMALL)
+    for number in (1, 2, 3):
+        queue.put_nowait(kind(episode(1), number), payload(number))
+    await writer.start()
+    await writer.flush(3)
+    ask_to_change(address.path, "UPDATE episode SET head = 1, folded = 1")  # as after a backup was put back
+    return queue, writer
+
+
+async def put_when_there_is_room(queue: RecorderQueue, heading: Heading, content: bytes) -> None:
+    async with asyncio.timeout(60):
+        while True:
+            try:
+                queue.put_nowait(heading, content)
+                break
+            except SpoolFull:
+                await queue.room()
+
+
+async def test_a_refused_episode_is_set_aside_and_the_others_are_never_out_of_room(
+    tmp_path: Path, address: DatabaseAddress
+) -> None:
+    queue, writer = await refused_in(tmp_path, address)
+    queue.put_nowait(kind(episode(2), 1), payload(1))
+    for number in range(2, 2001):  # many times what the spool may hold
+        for which in (1, 2):
+            await put_when_there_is_room(queue, kind(episode(which), number + 2 * (which == 1)), payload(number))
+    with pytest.raises(EpisodeParked, match="events 2 to 3 did not arrive before event 4"):
+        await writer.flush(queue.written)
+    for which in (1, 2):
+        queue.put_nowait(Heading(episode(which), "EpisodeEnded", 1), b'{"status":"SUCCEEDED"}')
+    queue.close()
+    with pytest.raises(EpisodeParked):
+        await writer.close()
+    queue.release()
+    assert ask(address.path, STORED) == [(1, 3, 1, 3), (2, 2001, 1, 2001)]
+    [kept] = Spool(tmp_path / "spool").recorders()
+    assert kept.refused == episode_text(episode(1))
+
+    ask_to_change(address.path, "UPDATE episode SET head = 3 WHERE number = 1")  # they are found after all
+    failures: dict[str, PycrormError] = {}
+    log = await EventLog.open(address, create=True)
+    report = await drain_once(dead_queues(Spool(tmp_path / "spool"), failures), CountingFold(log), settings=SETTINGS)
+    await log.close()
+    assert (failures, report.failed, report.stopped) == ({}, {}, {})
+    assert ask(address.path, STORED) == [(1, 2003, 1, 2003), (2, 2001, 1, 2001)]
+    rows = ask(address.path, "SELECT payload FROM event WHERE episode = 1 AND sequence > 3 ORDER BY sequence")
+    assert [row[0].encode() for row in rows[:-1]] == [payload(number) for number in range(2, 2001)]
+    assert Spool(tmp_path / "spool").recorders() == []
+
+
+async def test_a_refused_episode_that_cannot_be_set_aside_ends_the_waiting_for_room_of_all_others(
+    tmp_path: Path, address: DatabaseAddress
+) -> None:
+    queue, writer = await refused_in(tmp_path, address)
+    queue.folder.with_name(f"{queue.name}.{episode_text(episode(1))}.refused").touch()  # no folder can be made there
+    queue.put_nowait(kind(episode(1), 4), payload(4))
+    with pytest.raises(EpisodeParked):
+        await writer.flush(4)
+    queue.put_nowait(kind(episode(2), 1), payload(1))
+    put = 1
+    with pytest.raises(
+        SpoolStuck, match=r"events 2 to 3 did not arrive .* cannot be set aside: .*refused/alive: Not a directory"
+    ):
+        async with asyncio.timeout(60):
+            while True:
+                await queue.room()
+                put += 1
+                with contextlib.suppress(SpoolFull):
+                    queue.put_nowait(kind(episode(2), 2), payload(put))
+    assert put > 100
+    assert queue.block_until_room(60.0) is True  # the reserve is there still
+    queue.put_nowait(Heading(episode(2), "EpisodeEnded", 1), b'{"status":"FAILED"}', reserved=True)
+    queue.close()
+    with pytest.raises(EpisodeParked):
+        await writer.close()
+    queue.release()
+    assert [each.path for each in Spool(tmp_path / "spool").recorders()] == [queue.folder]
+
+
+async def test_what_a_dead_recorder_left_is_stored_in_one_round(tmp_path: Path, log: EventLog) -> None:
+    queue = queue_in(tmp_path / "spool")
+    for number in range(1, 501):
+        queue.put_nowait(kind(episode(1), number), payload(number))
+    queue.close()
+    queue.release()  # nothing drained it
+    recovered = open_dead(queue.folder)
+    assert recovered is not None
+    report = await drain_once([recovered], CountingFold(log), settings=SETTINGS)
+    recovered.release()
+    assert (report.failed, report.stopped, report.folded) == ({}, {}, 501)
+    assert ask(log.address.path, STORED) == [(1, 501, 1, 501)]  # recovery added that the episode was LOST
+    [[last]] = ask(log.address.path, "SELECT payload FROM event WHERE sequence = 501")
+    assert last == '{"status":"LOST"}'
