@@ -1,1 +1,1 @@
-"""Who saw it: what plans and worlds tell becomes events, with the values of the moment, in the queue."""
+"""The hooks turn what a plan and its world report into events, with copies of the values, and put them in the queue."""

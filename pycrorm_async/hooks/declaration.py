@@ -1,8 +1,8 @@
-"""From a designator class to its declaration: which fields it has, of which type, in which slot and column.
+"""This module derives the declaration of a designator class: its fields with their types, slots and columns.
 
-Each parameter of the class (`parameter_types`) becomes a field. One that cannot be a column stays out of the
-declaration, and its values are recorded as missing; where the class as a whole cannot be declared, its nodes are
-recorded without a type. In strict mode both are refused by name instead, the first time the class is performed.
+Each parameter of the class (see `parameter_types`) becomes a field. A parameter that cannot be a column is omitted from
+the declaration, and its values are recorded as missing. If the whole class cannot be declared, its nodes are recorded
+without a type. In strict mode both cases raise `DeclarationRefused` the first time the class is performed.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from pycrorm_async.hooks.values.parameter_types import (
     Parameter,
     Shape,
     Unresolved,
-    bare_fields,
-    in_words,
     parameters_of,
     shape_of,
+    type_text,
+    undecorated_fields,
 )
 from pycrorm_async.hooks.values.texts import clean, cut, message_of
 from pycrorm_async.plan.designator import Designator
@@ -45,13 +45,15 @@ __all__ = ["DeclaredType", "Field", "Undeclared", "Declarations", "declared_type
 
 
 _NESTED_MAX = 8
+"""Bounds the nesting of dataclasses in a parameter, so that a dataclass that contains itself ends."""
 _REASON_MAX = 500
-_TAKEN = "is {!r} already (set a class attribute `dtype` on one of them)"
-_ALIASED = "was {!r} already (only one of them can have that alias)"
+"""Bounds the characters of the reason why a field or class cannot be declared; reasons may quote a user's names."""
+_DTYPE_IN_USE = "already has the dtype or table {!r} (set a class attribute `dtype` on one of the two)"
+_ALIAS_IN_USE = "already has the alias {!r} (only one class can have it)"
 
 
 class Field(NamedTuple):
-    """A declared field, the attribute path that leads to its value, and the enum class if it is one."""
+    """A declared field, the attribute path to its value, and its enum class if it is an enum."""
 
     declared: FieldDeclared
     path: tuple[str, ...]
@@ -59,7 +61,7 @@ class Field(NamedTuple):
 
 
 class Undeclared(NamedTuple):
-    """A field without a column, the attribute path that leads to its value, and why it has none."""
+    """A field without a column, the attribute path to its value, and the reason."""
 
     name: str
     path: tuple[str, ...]
@@ -67,12 +69,13 @@ class Undeclared(NamedTuple):
 
 
 class DeclaredType(NamedTuple):
-    """A designator class as the memory knows it.
+    """The declaration of a designator class, encoded, with the paths to read its parameters.
 
     Attributes:
-        fingerprint: of the payload; empty if the class cannot be declared.
+        payload: the encoded declaration; empty if the class cannot be declared.
+        fingerprint: fingerprint of the payload; empty if the class cannot be declared.
         undeclared: fields whose values are recorded as missing.
-        fault: why the class, or one of its aliases, cannot be declared.
+        fault: reason why the class, or one of its aliases, cannot be declared.
     """
 
     dtype: str
@@ -85,38 +88,43 @@ class DeclaredType(NamedTuple):
 
 
 class Declarations:
-    """The live designator classes of one memory. Two classes of one dtype are not both declared.
+    """Holds the declarations of all designator classes that one memory has recorded.
+
+    Only one of two live classes with the same dtype is declared.
 
     Args:
-        strict: refuse what cannot be declared, with `DeclarationRefused`, instead of leaving it out.
+        strict: raise `DeclarationRefused` for a class or field that cannot be declared, instead of omitting it.
     """
 
     def __init__(self, *, strict: bool = True) -> None:
         self._strict = strict
         self._declared: weakref.WeakKeyDictionary[type, DeclaredType] = weakref.WeakKeyDictionary()
-        self._classes: dict[str, weakref.ref[type]] = {}
-        self._former: dict[str, weakref.ref[type]] = {}
-        self._shapes: dict[str, dict[str, str]] = {}
+        self._classes_by_name: dict[str, weakref.ref[type]] = {}
+        self._classes_by_alias: dict[str, weakref.ref[type]] = {}
+        self._field_types_by_dtype: dict[str, dict[str, str]] = {}
 
     def of(self, designator: type[Designator], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
-        """The declaration of this class; `on_new` is called before the first time it is given out."""
-        known = self._declared.get(designator)
-        if known is not None:
-            return known
+        """Return the declaration of a class; before returning it for the first time, call `on_new` with it."""
+        cached = self._declared.get(designator)
+        if cached is not None:
+            return cached
         declared = self._new(designator)
         if declared.fingerprint:
             on_new(declared)
             declaration = declared.declaration
-            self._classes |= dict.fromkeys((declaration.dtype, declaration.table), weakref.ref(designator))
-            self._former |= dict.fromkeys(declaration.aliases, weakref.ref(designator))
-            self._shapes.setdefault(declaration.dtype, {}).update(_shape_of(declared))
+            self._classes_by_name |= dict.fromkeys((declaration.dtype, declaration.table), weakref.ref(designator))
+            self._classes_by_alias |= dict.fromkeys(declaration.aliases, weakref.ref(designator))
+            self._field_types_by_dtype.setdefault(declaration.dtype, {}).update(_field_types(declared))
         self._declared[designator] = declared
         return declared
 
     def _new(self, designator: type[Designator]) -> DeclaredType:
         try:
             declared = declared_type(
-                designator, strict=self._strict, shapes=self._shapes.get(designator.dtype, {}), former=self._former
+                designator,
+                strict=self._strict,
+                field_types=self._field_types_by_dtype.get(designator.dtype, {}),
+                classes_by_alias=self._classes_by_alias,
             )
             fault = declared.fault or self._fault_in_names(designator, declared)
         except DeclarationRefused:
@@ -124,8 +132,8 @@ class Declarations:
         except Exception as error:
             if self._strict:
                 raise
-            unread = f"its fields cannot be read: {type(error).__name__}: {message_of(error)}"
-            return _without_type(designator, (), (), cut(clean(unread), _REASON_MAX))
+            reason = f"its fields cannot be read: {type(error).__name__}: {message_of(error)}"
+            return _without_type(designator, (), (), cut(clean(reason), _REASON_MAX))
         if fault is None or not declared.fingerprint:
             return declared
         if self._strict:
@@ -133,29 +141,31 @@ class Declarations:
         return _without_type(designator, declared.fields, declared.undeclared, fault)
 
     def _fault_in_names(self, designator: type[Designator], declared: DeclaredType) -> str | None:
-        """Which other live class has one of its names already."""
+        """Return the reason why another live class already has the dtype or table name; None if none has."""
         if not designator.__module__.startswith(OUR_PACKAGE):
-            for other in _ours(designator.dtype):
-                return f"{_path(other)} is {other.dtype!r} already (set a class attribute `dtype`)"
+            for other in _built_in_classes(designator.dtype):
+                return f"{_path(other)} already has the dtype {other.dtype!r} (set a class attribute `dtype`)"
         names = (declared.declaration.dtype, declared.declaration.table)
-        return _taken(designator, self._classes, names, _TAKEN)
+        return _conflict(designator, self._classes_by_name, names, _DTYPE_IN_USE)
 
 
-def _taken(designator: type, taken: Mapping[str, weakref.ref[type]], names: Sequence[str], reason: str) -> str | None:
+def _conflict(
+    designator: type, classes_by_name: Mapping[str, weakref.ref[type]], names: Sequence[str], reason: str
+) -> str | None:
     for name in names:
-        reference = taken.get(name)
+        reference = classes_by_name.get(name)
         other = reference() if reference is not None else None
         if other is not None and _path(other) != _path(designator):
             return f"{_path(other)} {reason.format(name)}"
     return None
 
 
-def _shape_of(declared: DeclaredType) -> dict[str, str]:
-    """Each field's type, in words; a member of an enum is stored as text."""
-    return {each.name: _kind_of(each) for each in declared.declaration.fields}
+def _field_types(declared: DeclaredType) -> dict[str, str]:
+    return {each.name: _type_text(each) for each in declared.declaration.fields}
 
 
-def _kind_of(field: FieldDeclared) -> str:
+def _type_text(field: FieldDeclared) -> str:
+    """Describe a field's type; an enum counts as text, because its members are stored as text."""
     return f"{'text' if field.type == 'enum' else field.type}{f' of {field.item}' if field.item else ''}"
 
 
@@ -170,16 +180,16 @@ def declared_type(
     designator: type[Designator],
     *,
     strict: bool = True,
-    shapes: Mapping[str, str] | None = None,
-    former: Mapping[str, weakref.ref[type]] | None = None,
+    field_types: Mapping[str, str] | None = None,
+    classes_by_alias: Mapping[str, weakref.ref[type]] | None = None,
 ) -> DeclaredType:
-    """The declaration of one class.
+    """Derive the declaration of one class.
 
     Args:
         designator: the class.
-        strict: raise `DeclarationRefused`, naming class and field, for what cannot be declared.
-        shapes: types of the fields of earlier classes of its dtype, which must not change.
-        former: classes by their aliases, of which each belongs to one class.
+        strict: raise `DeclarationRefused`, naming class and field, for a field or class that cannot be declared.
+        field_types: field types of earlier classes with the same dtype; a field must not change its type.
+        classes_by_alias: classes by the aliases they have; an alias belongs to one class.
     """
     undeclared: list[Undeclared] = []
 
@@ -188,12 +198,16 @@ def declared_type(
             raise DeclarationRefused(_path(designator), f"field {name!r} {reason}")
         undeclared.append(Undeclared(name, path, cut(clean(reason), _REASON_MAX)))
 
-    bare = bare_fields(designator)
-    if strict and bare and not designator.__module__.startswith(OUR_PACKAGE):
+    undecorated = undecorated_fields(designator)
+    if strict and undecorated and not designator.__module__.startswith(OUR_PACKAGE):
         raise DeclarationRefused(
-            _path(designator), f"it has the field {bare[0]!r} but is no dataclass (add @dataclass)"
+            _path(designator), f"it has the field {undecorated[0]!r} but is not a dataclass (add @dataclass)"
         )
-    fields = tuple(_fitting(designator, list(_fields(designator, leave_out)), shapes or {}, undeclared, strict=strict))
+    fields = tuple(
+        _declarable_fields(
+            designator, list(_fields(designator, leave_out)), field_types or {}, undeclared, strict=strict
+        )
+    )
     orm_class = vars(designator).get("orm_class")
     table = getattr(orm_class, "__tablename__", None) or table_name(designator.dtype)
     fault = fault_in_dtype(designator.dtype) or fault_in_table(table)
@@ -201,7 +215,7 @@ def declared_type(
         if strict:
             raise DeclarationRefused(_path(designator), fault)
         return _without_type(designator, fields, tuple(undeclared), fault)
-    aliases, fault = _aliases_or_fault(designator, former or {})
+    aliases, fault = _aliases_or_fault(designator, classes_by_alias or {})
     if strict and fault is not None:
         raise DeclarationRefused(_path(designator), fault)
     declaration = DesignatorTypeDeclared(
@@ -213,10 +227,10 @@ def declared_type(
         fields=tuple(field.declared for field in fields),
         aliases=aliases,
     )
-    if (unfit := fault_in_declaration(declaration)) is not None:
+    if (reason := fault_in_declaration(declaration)) is not None:
         if strict:
-            raise DeclarationRefused(_path(designator), unfit)
-        return _without_type(designator, fields, tuple(undeclared), unfit)
+            raise DeclarationRefused(_path(designator), reason)
+        return _without_type(designator, fields, tuple(undeclared), reason)
     payload = encode(declaration)
     return DeclaredType(designator.dtype, payload, fingerprint(payload), fields, declaration, tuple(undeclared), fault)
 
@@ -224,25 +238,25 @@ def declared_type(
 def _without_type(
     designator: type[Designator], fields: tuple[Field, ...], undeclared: tuple[Undeclared, ...], fault: str
 ) -> DeclaredType:
-    """For a class that cannot be declared: its nodes are recorded with their parameters, and without a type."""
+    """Build the record of a class that cannot be declared: its nodes keep their parameters, but have no type."""
     dtype = cut(clean(designator.dtype), _REASON_MAX)
-    nothing = DesignatorTypeDeclared(kind=designator.kind, dtype=dtype, table="")
-    return DeclaredType(dtype, b"", "", fields, nothing, undeclared, fault)
+    placeholder = DesignatorTypeDeclared(kind=designator.kind, dtype=dtype, table="")
+    return DeclaredType(dtype, b"", "", fields, placeholder, undeclared, fault)
 
 
-def _fitting(
-    designator: type, fields: list[Field], shapes: Mapping[str, str], undeclared: list[Undeclared], *, strict: bool
+def _declarable_fields(
+    designator: type, fields: list[Field], field_types: Mapping[str, str], undeclared: list[Undeclared], *, strict: bool
 ) -> typing.Iterator[Field]:
-    """Those that can be columns of one table, each in a slot of its own."""
+    """Yield the fields that can be columns of one table, each with its own slot; add the others to `undeclared`."""
     accepted: list[FieldDeclared] = []
     all_fit = fault_in_fields([field.declared for field in fields])
     if strict and all_fit is not None:
         raise DeclarationRefused(_path(designator), all_fit)
     for field in fields:
-        name, kind = field.declared.name, _kind_of(field.declared)
+        name, kind = field.declared.name, _type_text(field.declared)
         fault = fault_in_fields([*accepted, field.declared]) if all_fit is not None else None
-        if shapes.get(name, kind) != kind:
-            fault = f"field {name!r} was {shapes[name]} before and is {kind} now (rename it, or set another dtype)"
+        if field_types.get(name, kind) != kind:
+            fault = f"field {name!r} was {field_types[name]} before and is {kind} now (rename it, or set another dtype)"
         if fault is None:
             accepted.append(replace(field.declared, slot=SLOT_FIRST_FIELD + len(accepted)))
             yield field._replace(declared=accepted[-1])
@@ -253,7 +267,7 @@ def _fitting(
 
 
 def _bases(designator: type[Designator]) -> tuple[str, ...]:
-    """dtypes of the recorded ancestors; the abstract roots of the plan layer are none."""
+    """Return the dtypes of the base classes, nearest first, without the abstract roots of the plan layer."""
     return tuple(
         base.dtype
         for base in designator.__mro__[1:]
@@ -262,52 +276,53 @@ def _bases(designator: type[Designator]) -> tuple[str, ...]:
 
 
 def _aliases_or_fault(
-    designator: type[Designator], former: Mapping[str, weakref.ref[type]]
+    designator: type[Designator], classes_by_alias: Mapping[str, weakref.ref[type]]
 ) -> tuple[tuple[str, ...], str | None]:
-    """Its aliases; none of them, and the reason, where one cannot be an alias."""
+    """Return the aliases of a class; if one of them is not allowed, return no aliases and the reason."""
     try:
         aliases = _aliases(designator)
     except DeclarationRefused as refused:
         return (), refused.reason
-    fault = _taken(designator, former, aliases, _ALIASED)
+    fault = _conflict(designator, classes_by_alias, aliases, _ALIAS_IN_USE)
     return (aliases, None) if fault is None else ((), fault)
 
 
 def _aliases(designator: type[Designator]) -> tuple[str, ...]:
-    """The class attribute `aliases`: names that the type itself had before, so a subclass does not inherit them."""
-    given = vars(designator).get("aliases", ())
+    """Read the class attribute `aliases`, the classes_by_alias names of this type; a subclass does not inherit them."""
+    aliases = vars(designator).get("aliases", ())
     if dataclasses.is_dataclass(designator) and "aliases" in {each.name for each in dataclasses.fields(designator)}:
         return ()
-    if not isinstance(given, tuple | list) or not all(isinstance(each, str) for each in given):
-        raise DeclarationRefused(_path(designator), f"its aliases {given!r} are no tuple of names: ('OldAction',)")
-    for each in given:
+    if not isinstance(aliases, tuple | list) or not all(isinstance(each, str) for each in aliases):
+        raise DeclarationRefused(
+            _path(designator), f"its aliases {aliases!r} are not a tuple of names such as ('OldAction',)"
+        )
+    for each in aliases:
         fault = _fault_in_alias(each, designator)
         if fault is not None:
             raise DeclarationRefused(_path(designator), f"its alias {each!r} {fault}")
-    return tuple(given)
+    return tuple(aliases)
 
 
 def _fault_in_alias(alias: str, designator: type[Designator]) -> str | None:
     if fault_in_dtype(alias) is not None:
         return "is not a name (letters, digits and single underscores)"
     if alias == designator.dtype:
-        return "is its present name"
+        return "is its current dtype"
     if alias in _bases(designator):
-        return "is that of a class it descends from, which is another type"
-    for other in _ours(alias):
-        return f"is that of {_path(other)}"
+        return "is the dtype of one of its base classes, which is another type"
+    for other in _built_in_classes(alias):
+        return f"is the dtype of {_path(other)}"
     return None
 
 
-def _ours(dtype: str) -> typing.Iterator[type[Designator]]:
-    """The built-in classes of that name."""
+def _built_in_classes(dtype: str) -> typing.Iterator[type[Designator]]:
     for other in _descendants(Designator):
         if other.__module__.startswith(OUR_PACKAGE) and getattr(other, "dtype", None) == dtype:
             yield other
 
 
 def _fields(designator: type, leave_out: Callable[[str, tuple[str, ...], str], None]) -> typing.Iterator[Field]:
-    for name, path, shape in _flat(designator, (), (), leave_out, optional=False):
+    for name, path, shape in _flattened_parameters(designator, (), (), leave_out, optional=False):
         yield Field(
             FieldDeclared(
                 name=name,
@@ -323,7 +338,7 @@ def _fields(designator: type, leave_out: Callable[[str, tuple[str, ...], str], N
         )
 
 
-def _flat(
+def _flattened_parameters(
     owner: type,
     outer: tuple[str, ...],
     prefix: tuple[str, ...],
@@ -343,14 +358,14 @@ def _flat(
             leave_out(name, path, f"is nested more than {_NESTED_MAX} deep")
         else:
             inner_optional = optional or shape.optional
-            yield from _flat(shape.nested, names, path, leave_out, optional=inner_optional)
+            yield from _flattened_parameters(shape.nested, names, path, leave_out, optional=inner_optional)
 
 
 def _without_column(parameter: Parameter) -> str:
     if isinstance(parameter.hint, Unresolved):
         return parameter.hint.reason
     return (
-        f"has the type {in_words(parameter.hint)}, which has no column: use int, float, str, bool, an Enum, an aware"
+        f"has the type {type_text(parameter.hint)}, which has no column: use int, float, str, bool, an Enum, an aware"
         " datetime, a Pose, an object designator, a dataclass of these, or a list or dict of these"
     )
 

@@ -44,15 +44,15 @@ from pycrorm_async.events.types import (
 from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.emitter import UNAWAITED_MAX, Emitter
 from pycrorm_async.hooks.values.event_fitting import (
-    detection_that_fits,
-    episode_end_that_fits,
-    episode_that_fits,
-    node_end_that_fits,
-    resolution_that_fits,
+    fit_detection,
+    fit_episode_end,
+    fit_episode_start,
+    fit_node_end,
+    fit_resolution,
 )
-from pycrorm_async.hooks.values.parameters import ROBOT, parameters_of, start_that_fits
+from pycrorm_async.hooks.values.parameters import ROBOT, fit_node_start, read_parameters
 from pycrorm_async.hooks.values.texts import clean
-from pycrorm_async.hooks.values.value_snapshot import failure_value, missing_in, pose_value, written_or_missing
+from pycrorm_async.hooks.values.value_snapshot import encode_or_missing, failure_value, missing_in, pose_value
 from pycrorm_async.hooks.world_recorder import WorldRecorder
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.execution.observer import Candidate, Seen
@@ -143,7 +143,7 @@ class Episode:
             thought_by=opening.thought_by,
             continues=episode_text(continues) if continues is not None else None,
         )
-        started, shortened = episode_that_fits(started, self._emitter.settings.record_bytes_max)
+        started, shortened = fit_episode_start(started, self._emitter.settings.record_bytes_max)
         for name in shortened:
             self._emitter.missing.note("Episode", name, "its text is longer than an episode's may be, and was cut")
         self._emitter.put(self.id, started)
@@ -202,7 +202,7 @@ class Episode:
             kind=node.kind,
             parent=self._parent_of(node.parent),
             designator=declared.fingerprint or None,
-            parameters=parameters_of(node.designator, declared, self, missing),
+            parameters=read_parameters(node.designator, declared, self, missing),
             robot=self._robot(),
             simulated=self.simulated,
             continues=continues,
@@ -213,7 +213,7 @@ class Episode:
             sequence = self._emitter.put(self.id, event)
         except NotEncodable:
             missing = {}
-            event = start_that_fits(event, self._emitter.settings.record_bytes_max, missing)
+            event = fit_node_start(event, self._emitter.settings.record_bytes_max, missing)
             self._note_parameters(declared, missing, may_refuse=continues is None)
             sequence = self._emitter.put(self.id, event)
         self._open_nodes[sequence] = node
@@ -225,7 +225,7 @@ class Episode:
         if self._open_nodes.get(record.sequence) is not node:
             return
         failure = failure_value(node.failure, self) if node.failure is not None else None
-        result = written_or_missing(node.result, self) if node.result is not None else None
+        result = encode_or_missing(node.result, self) if node.result is not None else None
         status: NodeStatus = node.status.value
         assert node.designator is not None
         self._put_end(NodeEnded(record.sequence, status, failure, result), node.designator.dtype)
@@ -256,7 +256,7 @@ class Episode:
             return self._emitter.put(self.id, resolved)
         except NotEncodable as error:
             self._emitter.missing.note(resolved.location, "offered", error.reason)
-            return self._emitter.put(self.id, resolution_that_fits(resolved, self._emitter.settings.record_bytes_max))
+            return self._emitter.put(self.id, fit_resolution(resolved, self._emitter.settings.record_bytes_max))
 
     def detect(
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
@@ -279,7 +279,7 @@ class Episode:
             return self._emitter.put(self.id, detected)
         except NotEncodable as error:
             self._emitter.missing.note("ObjectDetected", "seen", error.reason)
-            return self._emitter.put(self.id, detection_that_fits(detected, self._emitter.settings.record_bytes_max))
+            return self._emitter.put(self.id, fit_detection(detected, self._emitter.settings.record_bytes_max))
 
     def end(self, failure: BaseException | None) -> None:
         """The last event. Nodes that outlive the episode are out of its sight: LOST."""
@@ -299,7 +299,7 @@ class Episode:
         try:
             self._emitter.put(self.id, ended)
         except NotEncodable:
-            self._emitter.put(self.id, episode_end_that_fits(ended, self._emitter.settings.record_bytes_max))
+            self._emitter.put(self.id, fit_episode_end(ended, self._emitter.settings.record_bytes_max))
 
     def continue_as(self, follow_up: EpisodeId, declared: Callable[[TaskTreeNode], DeclaredType]) -> dict[int, int]:
         """End the episode and go on under this id; the new sequences of the nodes that are open, by their old ones."""
@@ -383,7 +383,7 @@ class Episode:
             self._emitter.put(self.id, event)
         except NotEncodable as error:
             self._emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
-            self._emitter.put(self.id, node_end_that_fits(event, self._emitter.settings.record_bytes_max))
+            self._emitter.put(self.id, fit_node_end(event, self._emitter.settings.record_bytes_max))
 
 
 def _outcome(failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:

@@ -1,4 +1,4 @@
-"""What the hooks need of a queue: a place to put an event, in the caller's thread, that never awaits."""
+"""The hooks define this port, which a queue implements: put an event from the caller's thread, without awaiting."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ __all__ = ["EventSink"]
 
 
 class EventSink(Protocol):
-    """The producer's side of a queue."""
+    """The producing end of a queue."""
 
     def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
-        When it returns the event survives the death of the process. From any thread. Raises `SpoolFull` when there is
-        no room, and with `reserved` only when the reserve kept for ends and world observations is gone as well;
-        `SpoolClosed` after closing or in a forked child. An event that is refused leaves no gap.
+        Any thread may call it. Once it returns, the event survives the death of the process. Raises `SpoolFull` if
+        there is no room; with `reserved`, only if the reserve for ends and world observations is used up as well.
+        Raises `SpoolClosed` after closing or in a forked child. A refused event leaves no gap in the sequence.
         """
         ...
 
     @property
     def full(self) -> bool:
-        """Whether an ordinary event would be refused now."""
+        """Whether the queue would refuse an event without `reserved` now."""
         ...
 
     def room(self) -> Awaitable[None]:
-        """Done when an ordinary event fits again."""
+        """Wait until an event without `reserved` fits again."""
         ...
 
     def block_until_room(self, timeout_s: float) -> bool:
-        """Block this thread until even a reserved event fits; False if the time is over."""
+        """Block the calling thread until a reserved event fits; return False after `timeout_s` seconds."""
         ...

@@ -24,7 +24,7 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from pycrorm_async.hooks.emitter import Emitter
-from pycrorm_async.hooks.values.event_fitting import with_plain_texts
+from pycrorm_async.hooks.values.event_fitting import clean_texts
 from pycrorm_async.hooks.values.texts import clean
 from pycrorm_async.hooks.values.value_snapshot import pose_value
 from pycrorm_async.plan.task_tree import current_node
@@ -172,7 +172,7 @@ class WorldRecorder:
                 sequence = self._emitter.put(self._episode, event)
             except NotEncodable as unencodable:
                 self._emitter.missing.note(type(event).__name__, "value", str(unencodable))
-                sequence = self._emitter.put(self._episode, with_plain_texts(event))
+                sequence = self._emitter.put(self._episode, clean_texts(event))
             self.last = sequence
         except Exception as error:  # noqa: BLE001  a world's setter never fails because of a memory
             self._emitter.note_fault("a change of the world", error)

@@ -160,9 +160,9 @@ def test_a_plan_that_goes_wrong_ends_with_one_line_and_what_it_did_is_remembered
 @pytest.mark.parametrize(
     ("function", "line", "second"),
     [
-        ("unrecordable", "NoteAction.weight is recorded as missing: a str stands where a float", "NoteAction"),
+        ("unrecordable", "NoteAction.weight is recorded as missing: declared as float, got a str", "NoteAction"),
         ("reserved", "BadAction.robot_state is recorded as missing: field 'robot_state' has a reserved", "BadAction"),
-        ("twins", "plans.NoteActionPerformable is 'NoteAction' already", None),
+        ("twins", "plans.NoteActionPerformable already has the dtype or table 'NoteAction'", None),
     ],
 )
 def test_a_plan_with_what_cannot_be_recorded_runs_to_its_end_with_a_warning(

@@ -211,7 +211,7 @@ def test_a_class_with_the_name_of_a_built_in_one_is_refused() -> None:
             """Nothing."""
 
     with pytest.raises(
-        DeclarationRefused, match=r"pycrorm_async\.plan\.actions\.basic\.NavigateActionPerformable is 'Nav"
+        DeclarationRefused, match=r"plan\.actions\.basic\.NavigateActionPerformable already has the dtype"
     ):
         Declarations().of(NavigateAction, lambda _: None)
 
@@ -254,15 +254,15 @@ def test_a_field_may_be_called_aliases() -> None:
 @pytest.mark.parametrize(
     ("aliases", "reason"),
     [
-        ("GreetAction", r"its aliases 'GreetAction' are no tuple of names"),
-        ((1,), r"its aliases \(1,\) are no tuple of names"),
+        ("GreetAction", r"its aliases 'GreetAction' are not a tuple of names"),
+        ((1,), r"its aliases \(1,\) are not a tuple of names"),
         (("Greet Action",), r"its alias 'Greet Action' is not a name"),
-        (("WelcomeAction",), r"its alias 'WelcomeAction' is its present name"),
+        (("WelcomeAction",), r"its alias 'WelcomeAction' is its current dtype"),
         (
             ("PickUpAction",),
-            r"its alias 'PickUpAction' is that of pycrorm_async\.plan\.actions\.basic\.PickUpActionPerformable",
+            r"its alias 'PickUpAction' is the dtype of pycrorm_async\.plan\.actions\.basic\.PickUpActionPerformable",
         ),
-        (("EverythingAction",), r"its alias 'EverythingAction' is that of a class it descends from"),
+        (("EverythingAction",), r"its alias 'EverythingAction' is the dtype of one of its base classes"),
     ],
 )
 def test_an_alias_that_cannot_be_one_is_refused(aliases: Any, reason: str) -> None:
@@ -274,7 +274,7 @@ def test_two_live_classes_that_had_one_name_are_refused() -> None:
     live = Declarations()
     welcome, hello = renamed(("GreetAction",)), renamed(("GreetAction",), "HelloAction")
     live.of(welcome, lambda _: None)
-    with pytest.raises(DeclarationRefused, match=r"WelcomeAction was 'GreetAction' already"):
+    with pytest.raises(DeclarationRefused, match=r"WelcomeAction already has the alias 'GreetAction'"):
         live.of(hello, lambda _: None)
 
 

@@ -231,7 +231,8 @@ async def test_a_long_text_is_cut_and_marked_and_every_other_field_is_recorded()
     start = started(rig.sink.of(episode))
     assert start.parameters["weight"] == 2.5
     assert (
-        start.parameters["text"]["missing"] == "takes 2,097,154 bytes, 1,048,576 are allowed for all (record_bytes_max)"
+        start.parameters["text"]["missing"]
+        == "takes 2,097,154 bytes, 1,048,576 are allowed for the record (record_bytes_max)"
     )
     assert start.parameters["text"]["repr"].startswith("'xxxx")
     assert start.parameters["text"]["repr"].endswith("xxx'… (2,097,152 characters)")
@@ -263,7 +264,7 @@ async def test_fields_that_cannot_be_declared_are_missing_and_the_others_recorde
     reasons = {name: value["missing"] for name, value in parameters.items() if isinstance(value, dict)}
     assert reasons.keys() == {"odd", "nowhere", "robot_state", "inner_depth"}
     assert reasons["odd"].startswith("has the type set[str], which has no column")
-    assert reasons["nowhere"] == "has a type that cannot be read: name 'Nowhere' is not defined"
+    assert reasons["nowhere"] == "has a type that cannot be resolved: name 'Nowhere' is not defined"
     assert reasons["robot_state"] == "field 'robot_state' has a reserved name (robot_state)"
     assert parameters["odd"]["repr"] == "{'a'}"
     assert rig.emitter.missing.count.total == 4
@@ -296,7 +297,8 @@ def test_warnings_are_bounded_by_a_number_of_fields(caplog: pytest.LogCaptureFix
         values.note("AnAction", f"field_{number}", "it is odd")
     assert values.count.total == missing_values.WARNED_MAX + 50
     assert len(caplog.records) == missing_values.WARNED_MAX + 1
-    assert caplog.records[-1].getMessage() == "values of more than 1000 fields are missing; the others are only counted"
+    warning = "more than 1000 fields have missing values; further ones are only counted in status"
+    assert caplog.records[-1].getMessage() == warning
     assert len(values._warned) == missing_values.WARNED_MAX + 1
 
 

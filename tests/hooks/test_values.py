@@ -17,7 +17,12 @@ from pycrorm_async.events.types import (
     PoseValue,
 )
 from pycrorm_async.hooks.values.texts import clean_repr
-from pycrorm_async.hooks.values.value_snapshot import Unwritable, failure_value, written, written_or_missing
+from pycrorm_async.hooks.values.value_snapshot import (
+    UnrecordableValue,
+    encode_or_missing,
+    encode_parameter,
+    failure_value,
+)
 from pycrorm_async.plan.failures import ObjectLost, PlanFailure, PlanFailures
 from pycrorm_async.plan.language.outcome import Outcome
 from pycrorm_async.plan.object_designators import BelieveObject, ObjectDesignator
@@ -43,7 +48,7 @@ class Broken:
 
 
 def write(kind: FieldType, value: Any, enum_class: type[enum.Enum] | None = None, item: Any = None) -> Any:
-    return written(FieldDeclared("f", "f", kind, 2, item=item), enum_class, value, NOBODY)
+    return encode_parameter(FieldDeclared("f", "f", kind, 2, item=item), enum_class, value, NOBODY)
 
 
 @pytest.mark.parametrize(
@@ -83,27 +88,27 @@ def test_lists_and_dicts_are_written_item_by_item() -> None:
     ("kind", "value", "reason"),
     [
         ("real", math.nan, "nan is not a finite number"),
-        ("real", "1.0", "a str stands where a float was declared"),
-        ("real", None, "a NoneType stands where a float was declared"),
-        ("integer", 1.5, "a float stands where an int was declared"),
+        ("real", "1.0", "declared as float, got a str"),
+        ("real", None, "declared as float, got a NoneType"),
+        ("integer", 1.5, "declared as int, got a float"),
         ("integer", 2**63, "the integer does not fit into 64 bits"),
-        ("text", b"x", "a bytes stands where a str was declared"),
+        ("text", b"x", "declared as str, got a bytes"),
         ("text", "a\x00", "the text holds U+0000"),
-        ("boolean", 1, "a int stands where a bool was declared"),
+        ("boolean", 1, "declared as bool, got a int"),
         ("datetime", datetime(2024, 1, 1), "the datetime has no time zone"),  # noqa: DTZ001
-        ("pose", (1, 2, 3), "a tuple stands where a Pose was declared"),
+        ("pose", (1, 2, 3), "declared as Pose, got a tuple"),
         ("pose", Pose([math.inf, 0, 0]), "the pose holds a number that is not finite"),
-        ("object", "milk", "a str stands where an object designator was declared"),
+        ("object", "milk", "declared as object designator, got a str"),
     ],
 )
 def test_what_cannot_be_written_is_refused_with_the_reason(kind: FieldType, value: Any, reason: str) -> None:
-    with pytest.raises(Unwritable) as refused:
+    with pytest.raises(UnrecordableValue) as refused:
         write(kind, value)
     assert reason in str(refused.value)
 
 
 def test_a_member_of_another_enum_is_refused() -> None:
-    with pytest.raises(Unwritable, match="is no member of Arms"):
+    with pytest.raises(UnrecordableValue, match="is not a member of Arms"):
         write("enum", ObjectType.MILK, Arms)
 
 
@@ -120,7 +125,7 @@ def test_an_object_outside_the_recorded_world_brings_its_own_value() -> None:
 def test_a_result_is_written_as_far_as_it_can_be() -> None:
     moment = datetime(2024, 7, 1, tzinfo=UTC)
     result = {"arm": Arms.LEFT, "n": [np.int8(1), 2.5, None], "when": moment}
-    assert written_or_missing(result, NOBODY) == {
+    assert encode_or_missing(result, NOBODY) == {
         "arm": "LEFT",
         "n": [1, 2.5, None],
         "when": "2024-07-01T00:00:00.000000+00:00",
@@ -128,23 +133,23 @@ def test_a_result_is_written_as_far_as_it_can_be() -> None:
 
 
 def test_a_result_without_a_form_is_missing_with_reason_and_repr() -> None:
-    assert written_or_missing({1, 2}, NOBODY) == MissingValue("a set has no form in JSON", "{1, 2}")
-    assert written_or_missing(math.nan, NOBODY) == MissingValue("nan is not a finite number", "nan")
-    assert written_or_missing(Broken(), NOBODY) == MissingValue(
-        "a Broken has no form in JSON", "<a Broken whose repr raised RuntimeError>"
+    assert encode_or_missing({1, 2}, NOBODY) == MissingValue("JSON cannot hold a set", "{1, 2}")
+    assert encode_or_missing(math.nan, NOBODY) == MissingValue("nan is not a finite number", "nan")
+    assert encode_or_missing(Broken(), NOBODY) == MissingValue(
+        "JSON cannot hold a Broken", "<a Broken whose repr raised RuntimeError>"
     )
 
 
 def test_a_circle_is_missing_and_no_recursion_error() -> None:
     circle: list[Any] = []
     circle.append(circle)
-    missing = written_or_missing(circle, NOBODY)
+    missing = encode_or_missing(circle, NOBODY)
     assert isinstance(missing, MissingValue)
-    assert missing.missing == "it holds itself"
+    assert missing.missing == "it contains itself"
     deep: list[Any] = []
     for _ in range(9):
         deep = [deep]
-    assert written_or_missing(deep, NOBODY).missing == "it is nested more than 8 deep"
+    assert encode_or_missing(deep, NOBODY).missing == "it is nested more than 8 deep"
 
 
 def test_a_failure_keeps_class_message_and_arguments() -> None:
@@ -154,7 +159,7 @@ def test_a_failure_keeps_class_message_and_arguments() -> None:
     assert failure.arguments == [
         MissingValue("the text holds a lone surrogate", "'spilled \\ud800'"),
         3,
-        MissingValue("a set has no form in JSON", "{1}"),
+        MissingValue("JSON cannot hold a set", "{1}"),
     ]
 
 
@@ -163,7 +168,7 @@ def test_a_failure_whose_message_cannot_be_made_is_kept_all_the_same() -> None:
         def __str__(self) -> str:
             raise RuntimeError
 
-    assert failure_value(Mute(), NOBODY).message == "<its message could not be made: RuntimeError>"
+    assert failure_value(Mute(), NOBODY).message == "<its __str__ raised RuntimeError>"
 
 
 def test_of_a_group_each_failure_is_kept_with_class_message_and_arguments() -> None:
@@ -179,7 +184,7 @@ def test_of_a_group_each_failure_is_kept_with_class_message_and_arguments() -> N
     late = {
         "type": "PlanFailure",
         "message": "late",
-        "arguments": ["late", MissingValue("a set has no form in JSON", "{1}")],
+        "arguments": ["late", MissingValue("JSON cannot hold a set", "{1}")],
     }
     group = {"type": "ExceptionGroup", "message": "inner (1 sub-exception)", "arguments": ["inner", [late]]}
     assert failure.arguments == ["2 of 2 branches failed", [lost, group]]
@@ -207,9 +212,9 @@ def group_at(group: ExceptionGroup[Exception], depth: int) -> BaseException:
 def test_an_outcome_of_the_plan_language_is_a_small_dict() -> None:
     outcome = Outcome(results=(None, object()), succeeded=(1,), failures=(ObjectLost("gone"),))
     brief = {"succeeded": [1], "failures": ["ObjectLost: gone"]}
-    assert written_or_missing(outcome, NOBODY) == brief
-    assert written_or_missing([outcome, Outcome(rounds=3)], NOBODY) == [brief, {"rounds": 3}]
-    assert written_or_missing(Outcome(interrupted=True), NOBODY) == {"interrupted": True}
+    assert encode_or_missing(outcome, NOBODY) == brief
+    assert encode_or_missing([outcome, Outcome(rounds=3)], NOBODY) == [brief, {"rounds": 3}]
+    assert encode_or_missing(Outcome(interrupted=True), NOBODY) == {"interrupted": True}
 
 
 def test_a_text_that_is_also_an_enum_is_written_as_its_text() -> None:
@@ -230,5 +235,5 @@ def test_none_in_a_list_or_a_dict_is_none() -> None:
 
 
 def test_two_keys_of_one_text_are_refused() -> None:
-    with pytest.raises(Unwritable, match="two keys of the dict have the same text"):
+    with pytest.raises(UnrecordableValue, match="two keys of the dict have the same text"):
         write("dict", {"LEFT": 1, Arms.LEFT: 2}, item="integer")

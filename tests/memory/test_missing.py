@@ -103,5 +103,5 @@ async def test_a_designator_that_is_no_dataclass_is_recorded_with_the_arguments_
             assert (shout.volume, shout.text, shout.loud) == (9.5, "hey", False)
         assert memory.status.missing.total == 1
         assert memory.status.missing.last == (
-            "HailAction.tone: has no type: write `tone: str`, or whatever it is, in `__init__`"
+            "HailAction.tone: has no type: annotate it in `__init__`, for example `tone: str`"
         )

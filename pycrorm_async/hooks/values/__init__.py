@@ -1,1 +1,1 @@
-"""Values of parameters as events hold them: read, shortened where they are too long, marked where they are missing."""
+"""This package converts parameter values to event values, shortens long ones and marks missing ones."""

@@ -1,4 +1,4 @@
-"""Shortens events that cannot be encoded as they are: too long, or with a number or a text that JSON cannot hold."""
+"""These functions shorten events that cannot be encoded: too long, or with values that JSON cannot hold."""
 
 from __future__ import annotations
 
@@ -26,25 +26,27 @@ from pycrorm_async.hooks.values.texts import clean, cut
 __all__ = [
     "EPISODE_TEXT_MAX",
     "fits",
-    "detection_that_fits",
-    "node_end_that_fits",
-    "episode_end_that_fits",
-    "episode_that_fits",
-    "resolution_that_fits",
-    "with_plain_texts",
+    "fit_detection",
+    "fit_node_end",
+    "fit_episode_end",
+    "fit_episode_start",
+    "fit_resolution",
+    "clean_texts",
 ]
 
 EPISODE_TEXT_MAX = 10_000
-"""Characters of an episode's description, plan and world. Each is a column that people read."""
+"""Bounds the characters of an episode's description, plan and world, so that their columns stay readable."""
 
-_BYTES_A_CHARACTER = 7
-"""In JSON a control character takes six; the seventh is for what stands around the texts."""
-_CUT_TO = (1_000, 100, 10)
+_BYTES_PER_CHARACTER_MAX = 7
+"""Bounds the encoded size: a control character takes six bytes in JSON; the seventh covers the keys and quotes."""
+_CUT_LENGTHS = (1_000, 100, 10)
+"""Characters to shorten a text to, tried in turn until the event fits."""
 _NAME_MAX = 1_000
+"""Bounds the characters of a name, far above real names."""
 
 
-def episode_that_fits(started: EpisodeStarted, bytes_max: int) -> tuple[EpisodeStarted, list[str]]:
-    """The start with its long texts cut and marked, and the names of those."""
+def fit_episode_start(started: EpisodeStarted, bytes_max: int) -> tuple[EpisodeStarted, list[str]]:
+    """Shorten the long texts of an episode's start; return the event and the names of the shortened fields."""
     texts = {
         name: text
         for name in ("description", "plan", "world", "created_by", "host", "software")
@@ -52,10 +54,10 @@ def episode_that_fits(started: EpisodeStarted, bytes_max: int) -> tuple[EpisodeS
     }
     if (
         max(map(len, texts.values())) <= EPISODE_TEXT_MAX
-        and _BYTES_A_CHARACTER * sum(map(len, texts.values())) < bytes_max
+        and _BYTES_PER_CHARACTER_MAX * sum(map(len, texts.values())) < bytes_max
     ):
         return started, []
-    for characters_max in (EPISODE_TEXT_MAX, *_CUT_TO):
+    for characters_max in (EPISODE_TEXT_MAX, *_CUT_LENGTHS):
         shortened = [name for name, text in texts.items() if len(text) > characters_max]
         if shortened:
             started = replace(started, **{name: cut(texts[name], characters_max) for name in shortened})
@@ -64,38 +66,41 @@ def episode_that_fits(started: EpisodeStarted, bytes_max: int) -> tuple[EpisodeS
     return started, shortened
 
 
-def node_end_that_fits(ended: NodeEnded, bytes_max: int) -> NodeEnded:
-    """The end without what it cannot hold of its result, or of its failure."""
+def fit_node_end(ended: NodeEnded, bytes_max: int) -> NodeEnded:
+    """Replace a result that cannot be encoded by a `MissingValue`, then shorten the failure until the event fits."""
     if ended.result is not None:
         try:
             encode(ended, bytes_max=bytes_max)
         except NotEncodable as error:
             ended = replace(ended, result=MissingValue(error.reason))
-    for failure in _shorter(ended.failure):
+    for failure in _shortened_failures(ended.failure):
         if fits(ended, bytes_max):
             break
         ended = replace(ended, failure=failure)
     return ended
 
 
-def episode_end_that_fits(ended: EpisodeEnded, bytes_max: int) -> EpisodeEnded:
-    """The end without what it cannot hold of its failure."""
-    for failure in _shorter(ended.failure):
+def fit_episode_end(ended: EpisodeEnded, bytes_max: int) -> EpisodeEnded:
+    """Shorten the failure of an episode's end until the event fits."""
+    for failure in _shortened_failures(ended.failure):
         if fits(ended, bytes_max):
             break
         ended = replace(ended, failure=failure)
     return ended
 
 
-def _shorter(failure: FailureValue | None) -> Iterator[FailureValue]:
-    """Without arguments, then with its message cut more and more."""
+def _shortened_failures(failure: FailureValue | None) -> Iterator[FailureValue]:
+    """Yield ever shorter versions of a failure: first without its arguments, then with a shortened message."""
     if failure is not None:
-        for characters_max in (len(failure.message), *_CUT_TO):
+        for characters_max in (len(failure.message), *_CUT_LENGTHS):
             yield FailureValue(cut(failure.type, _NAME_MAX), cut(failure.message, characters_max))
 
 
-def resolution_that_fits(resolved: LocationResolved, bytes_max: int) -> LocationResolved:
-    """Without the places that JSON cannot hold, and with as many of the others as fit; the one taken stays."""
+def fit_resolution(resolved: LocationResolved, bytes_max: int) -> LocationResolved:
+    """Drop candidates until the event fits: first those with non-finite numbers, never the one that was taken.
+
+    A taken candidate that itself holds a non-finite number is dropped, and `taken` becomes None.
+    """
     taken = resolved.offered[resolved.taken] if resolved.taken is not None else None
     others = [each for index, each in enumerate(resolved.offered) if index != resolved.taken and _is_finite(each)]
     last = (taken,) if taken is not None and _is_finite(taken) else ()
@@ -107,9 +112,9 @@ def resolution_that_fits(resolved: LocationResolved, bytes_max: int) -> Location
         others = others[: len(others) // 2]
 
 
-def detection_that_fits(detected: ObjectDetected, bytes_max: int) -> ObjectDetected:
-    """With its texts cut, and with as many of what was seen as fit, the best first."""
-    shorter = with_plain_texts(detected)
+def fit_detection(detected: ObjectDetected, bytes_max: int) -> ObjectDetected:
+    """Shorten the texts of a detection, then drop the least visible objects until the event fits."""
+    shorter = clean_texts(detected)
     assert isinstance(shorter, ObjectDetected)
     while shorter.seen and not fits(shorter, bytes_max):
         shorter = replace(shorter, seen=shorter.seen[: len(shorter.seen) // 2])
@@ -122,27 +127,27 @@ def _is_finite(candidate: CandidateValue) -> bool:
     return all(map(math.isfinite, numbers))
 
 
-def with_plain_texts(event: Happening) -> Happening:
-    """The event with every text in it cleaned and cut, and without entries of dicts that are no finite number."""
-    plain: Happening = _plain(event)
-    return plain
+def clean_texts(event: Happening) -> Happening:
+    """Clean and shorten every text of an event, and drop dict entries whose number is not finite."""
+    cleaned: Happening = _cleaned(event)
+    return cleaned
 
 
-def _plain(value: Any) -> Any:
+def _cleaned(value: Any) -> Any:
     if isinstance(value, str):
         return cut(clean(value), _NAME_MAX)
     if isinstance(value, msgspec.Struct):
-        return replace(value, **{name: _plain(getattr(value, name)) for name in value.__struct_fields__})
+        return replace(value, **{name: _cleaned(getattr(value, name)) for name in value.__struct_fields__})
     if isinstance(value, tuple):
-        return tuple(map(_plain, value))
+        return tuple(map(_cleaned, value))
     if isinstance(value, dict):
         finite = {key: each for key, each in value.items() if not isinstance(each, float) or math.isfinite(each)}
-        return {_plain(key): _plain(each) for key, each in finite.items()}
+        return {_cleaned(key): _cleaned(each) for key, each in finite.items()}
     return value
 
 
 def fits(event: Happening, bytes_max: int) -> bool:
-    """Whether the event can be encoded."""
+    """Return whether the event can be encoded in `bytes_max` bytes."""
     try:
         encode(event, bytes_max=bytes_max)
     except NotEncodable:

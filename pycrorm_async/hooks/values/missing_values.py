@@ -1,7 +1,7 @@
-"""Counts the values that could not be recorded, and warns once for each type and field.
+"""This module counts the values that could not be recorded, and logs one warning for each type and field.
 
-A plan performs the same action a million times, so a warning for each perform would bury the log. The counter says how
-often, the first warning of a field says why.
+A plan may perform the same action a million times, so one warning per perform would bury the log. The warning states
+the reason, the counter the number of values.
 """
 
 from __future__ import annotations
@@ -12,20 +12,20 @@ from typing import NamedTuple
 __all__ = ["Missing", "MissingValues"]
 
 WARNED_MAX = 1_000
-"""Types and fields that are warned about by name. Classes made in a loop could otherwise grow the set for ever."""
+"""Bounds the (type, field) pairs with a warning of their own, because classes created in a loop would never stop."""
 
 _log = logging.getLogger("pycrorm_async")
 
 
 class Missing(NamedTuple):
-    """How many values were recorded as missing, and the last of them with its reason; status shows both."""
+    """The number of values recorded as missing, and the last one with its reason; `status` shows both."""
 
     total: int
     last: str | None
 
 
 class MissingValues:
-    """The counter of one memory. Any thread may note a value."""
+    """Counts the missing values of one memory. Any thread may call `note`."""
 
     def __init__(self) -> None:
         self._total = 0
@@ -37,13 +37,18 @@ class MissingValues:
         return Missing(self._total, self._last)
 
     def note(self, owner: str, field: str, reason: str) -> None:
-        """Count one value of that field of that type as missing."""
+        """Count one missing value, and warn if it is the first of its type and field."""
         self._total += 1
         self._last = f"{owner}.{field}: {reason}"
         if (owner, field) in self._warned or len(self._warned) > WARNED_MAX:
             return
         self._warned.add((owner, field))
         if len(self._warned) > WARNED_MAX:
-            _log.warning("values of more than %d fields are missing; the others are only counted", WARNED_MAX)
+            _log.warning("more than %d fields have missing values; further ones are only counted in status", WARNED_MAX)
         else:
-            _log.warning("%s.%s is recorded as missing: %s (said once; status counts how often)", owner, field, reason)
+            _log.warning(
+                "%s.%s is recorded as missing: %s (further missing values of this field are only counted in status)",
+                owner,
+                field,
+                reason,
+            )

@@ -1,8 +1,8 @@
-"""Finds the parameters of a designator class with their types: dataclass fields, annotated attributes, and arguments.
+"""This module lists the parameters of a designator class with their types.
 
-A dataclass has the fields that its constructor takes and whose name has no leading underscore. Another class of the
-user's own has its annotated attributes, and the arguments of its `__init__` (`plan.constructor` keeps them). A type
-that cannot be resolved costs that one parameter its column, and no other.
+The parameters of a dataclass are the fields that its constructor accepts, except those with a leading underscore. The
+parameters of any other user class are its annotated attributes and the arguments of its `__init__`
+(`plan.constructor_arguments` keeps their values). If a type cannot be resolved, only that one parameter has no column.
 """
 
 from __future__ import annotations
@@ -23,13 +23,22 @@ from pycrorm_async.plan.constructor_arguments import ARGUMENTS
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["Parameter", "Shape", "Unresolved", "parameters_of", "shape_of", "in_words", "bare_fields", "OUR_PACKAGE"]
+__all__ = [
+    "Parameter",
+    "Shape",
+    "Unresolved",
+    "parameters_of",
+    "shape_of",
+    "type_text",
+    "undecorated_fields",
+    "OUR_PACKAGE",
+]
 
 OUR_PACKAGE = "pycrorm_async."
 
 
 class Unresolved(NamedTuple):
-    """Stands for the type of a parameter that has none, or none that can be looked up."""
+    """The substitute for a parameter's type if the parameter has none or the type cannot be resolved."""
 
     reason: str
 
@@ -43,33 +52,33 @@ class Parameter(NamedTuple):
 
 
 def parameters_of(owner: type) -> Iterator[Parameter]:
-    """The parameters of a designator class, or the fields of a dataclass that is one of its parameters."""
+    """Yield the parameters of a designator class, or the fields of a dataclass nested in its parameters."""
     names: set[str] = set()
     for field in dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ():
         names.add(field.name)
         if field.init and not field.name.startswith("_"):
             yield Parameter(field.name, (field.name,), _class_hint(owner, field.name))
     for kind in reversed(owner.__mro__):
-        for each in _undecorated(kind):
+        for each in _parameters_without_decorator(kind):
             if each.name not in names:
                 names.add(each.name)
                 yield each
 
 
-def bare_fields(owner: type) -> list[str]:
-    """The annotated attributes of a class that looks like a dataclass and is none."""
+def undecorated_fields(owner: type) -> list[str]:
+    """List the annotated attributes of a class that lacks the `@dataclass` decorator; empty for a dataclass."""
     if "__dataclass_fields__" in vars(owner):
         return []
     annotations = vars(owner).get("__annotations__", {})
     return [name for name, kind in annotations.items() if "ClassVar" not in str(kind)]
 
 
-def _undecorated(kind: type) -> Iterator[Parameter]:
-    """What a class that is no dataclass declares itself."""
+def _parameters_without_decorator(kind: type) -> Iterator[Parameter]:
+    """Yield the parameters that one class without `@dataclass` adds: its annotated attributes, then its arguments."""
     own = vars(kind)
     if not issubclass(kind, Designator) or kind.__module__.startswith(OUR_PACKAGE) or "__dataclass_fields__" in own:
         return
-    for name in bare_fields(kind):
+    for name in undecorated_fields(kind):
         if not name.startswith("_"):
             yield Parameter(name, (name,), _class_hint(kind, name))
     initialise = own.get("__init__")
@@ -88,12 +97,12 @@ def _own_parameters(kind: type) -> Iterator[object]:
     if "__dataclass_fields__" in vars(kind):
         yield from dataclasses.fields(kind)
     else:
-        yield from _undecorated(kind)
+        yield from _parameters_without_decorator(kind)
 
 
 def _argument_hint(initialise: Any, argument: inspect.Parameter) -> Any:
     if argument.annotation is argument.empty:
-        return Unresolved(f"has no type: write `{argument.name}: str`, or whatever it is, in `__init__`")
+        return Unresolved(f"has no type: annotate it in `__init__`, for example `{argument.name}: str`")
     hint = _resolved(argument.annotation, initialise.__globals__, {})
     if isinstance(hint, Unresolved):
         return hint
@@ -112,19 +121,19 @@ def _class_hint(owner: type, name: str) -> Any:
 
 
 def _resolved(annotation: Any, globals_: Mapping[str, Any], locals_: Mapping[str, Any]) -> Any:
-    """The type that the annotation stands for, looked up on its own, so that another one's fault is not its own."""
+    """Resolve one annotation alone, so that a faulty annotation of another parameter does not affect it."""
     holder = types.SimpleNamespace(__annotations__={"it": annotation})
     try:
         return typing.get_type_hints(holder, dict(globals_), dict(locals_), include_extras=False)["it"]
     except Exception as error:  # noqa: BLE001  an annotation is any expression
-        return Unresolved(f"has a type that cannot be read: {error}")
+        return Unresolved(f"has a type that cannot be resolved: {error}")
 
 
-# --- the kind of field that a type makes ---
+# --- from type hints to field types ---
 
 
 class Shape(NamedTuple):
-    """The kind of field that a type makes; `nested` is a dataclass whose fields take its place."""
+    """The field type of a parameter; `nested` is a dataclass, whose fields replace the parameter."""
 
     kind: FieldType
     optional: bool = False
@@ -134,22 +143,22 @@ class Shape(NamedTuple):
 
 
 def shape_of(hint: Any) -> Shape | None:
-    """What kind of field a type hint makes; None if none."""
+    """Map a type hint to a field type; None if no column can hold it."""
     origin = typing.get_origin(hint)
     if isinstance(hint, typing.NewType):
         return shape_of(hint.__supertype__)
     if origin in (typing.Union, types.UnionType):
-        return _union(hint)
+        return _union_shape(hint)
     if origin is typing.Literal:
         return Shape("text") if all(isinstance(each, str) for each in typing.get_args(hint)) else None
     if origin is not None and isinstance(origin, type):
-        return _container(origin, typing.get_args(hint))
+        return _container_shape(origin, typing.get_args(hint))
     if isinstance(hint, type):
-        return _plain(hint)
+        return _class_shape(hint)
     return None
 
 
-def _plain(kind: type) -> Shape | None:
+def _class_shape(kind: type) -> Shape | None:
     if issubclass(kind, Enum):
         return Shape("enum", enum=kind)
     for python, name in _SCALARS:
@@ -172,7 +181,7 @@ _SCALARS: tuple[tuple[type, FieldType], ...] = (
 )
 
 
-def _union(hint: Any) -> Shape | None:
+def _union_shape(hint: Any) -> Shape | None:
     members = [each for each in typing.get_args(hint) if each is not type(None)]
     optional = len(members) < len(typing.get_args(hint))
     shapes = {shape._replace(optional=False) if shape else None for shape in map(shape_of, members)}
@@ -185,7 +194,7 @@ def _union(hint: Any) -> Shape | None:
     return shape._replace(optional=optional) if shape is not None else None
 
 
-def _container(origin: type, arguments: tuple[Any, ...]) -> Shape | None:
+def _container_shape(origin: type, arguments: tuple[Any, ...]) -> Shape | None:
     kind: FieldType
     if issubclass(origin, Mapping) and len(arguments) == 2:
         key = shape_of(arguments[0])
@@ -202,5 +211,5 @@ def _container(origin: type, arguments: tuple[Any, ...]) -> Shape | None:
     return Shape(kind, item=typing.cast("ItemType", item.kind), enum=item.enum)
 
 
-def in_words(hint: Any) -> str:
+def type_text(hint: Any) -> str:
     return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)

@@ -1,6 +1,6 @@
-"""Reads the parameters of a designator when it is performed, and makes the event fit where it cannot be encoded.
+"""This module reads a designator's parameters when it is performed, and shortens a node's start that is too long.
 
-Each parameter is read on its own: what is wrong with one costs no other its value.
+Each parameter is read on its own, so a fault in one leaves the values of the others intact.
 """
 
 from __future__ import annotations
@@ -14,21 +14,24 @@ from pycrorm_async.events.types import MissingValue, NodeStarted
 from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.values.event_fitting import fits
 from pycrorm_async.hooks.values.texts import reading_fault
-from pycrorm_async.hooks.values.value_snapshot import References, Unwritable, missing_value, written
+from pycrorm_async.hooks.values.value_snapshot import References, UnrecordableValue, encode_parameter, missing_value
 from pycrorm_async.plan.designator import Designator
 
-__all__ = ["ROBOT", "parameters_of", "start_that_fits"]
+__all__ = ["ROBOT", "read_parameters", "fit_node_start"]
 
 ROBOT = "robot state"
-"""The name under which the robot's state is missing; no field has a blank in its name."""
+"""The name under which a missing robot state is counted; the blank keeps it apart from every field's name."""
 _MISSING_BYTES = 400
-"""About what a `MissingValue` takes: what is smaller saves nothing by being left out."""
+"""Bounds from below the parameters worth dropping: about the encoded size of the `MissingValue` that replaces one."""
 
 
-def parameters_of(
+def read_parameters(
     designator: Designator, declared: DeclaredType, references: References, missing: dict[str, str]
 ) -> dict[str, Any]:
-    """Its parameters as JSON, by field; for each that is a `MissingValue`, `missing` is given the reason."""
+    """Read the parameters of a designator as JSON values by field name.
+
+    For each parameter that becomes a `MissingValue`, the function adds the reason to `missing`.
+    """
     parameters: dict[str, Any] = {}
     for field, path, enum in declared.fields:
         value: Any = designator
@@ -36,8 +39,8 @@ def parameters_of(
             for name in path:
                 value = getattr(value, name, None)
             if value is not None:
-                parameters[field.name] = written(field, enum, value, references)
-        except Unwritable as reason:
+                parameters[field.name] = encode_parameter(field, enum, value, references)
+        except UnrecordableValue as reason:
             parameters[field.name] = missing_value(str(reason), value)
             missing[field.name] = str(reason)
         except KeyboardInterrupt:
@@ -68,10 +71,11 @@ def _read_undeclared(
             missing[field] = reason
 
 
-def start_that_fits(event: NodeStarted, bytes_max: int, missing: dict[str, str]) -> NodeStarted:
-    """The start without what JSON cannot hold, and without its largest parameters as far as it is too large.
+def fit_node_start(event: NodeStarted, bytes_max: int, missing: dict[str, str]) -> NodeStarted:
+    """Replace parts of a node's start by `MissingValue` until it can be encoded.
 
-    For each part left out, `missing` is given the reason.
+    First the parts that JSON cannot hold, then the largest parameters, then the reprs of the missing values, at last
+    all parameters. For each replaced part, the function adds the reason to `missing`.
     """
     sizes: dict[str, int] = {}
     parameters = dict(event.parameters)
@@ -93,7 +97,7 @@ def start_that_fits(event: NodeStarted, bytes_max: int, missing: dict[str, str])
     while not fits(replace(event, parameters=parameters), bytes_max):
         if small and sizes[small[-1]] > _MISSING_BYTES:
             name = small.pop()
-            missing[name] = f"takes {sizes[name]:,} bytes, {bytes_max:,} are allowed for all (record_bytes_max)"
+            missing[name] = f"takes {sizes[name]:,} bytes, {bytes_max:,} are allowed for the record (record_bytes_max)"
             parameters[name] = missing_value(missing[name], parameters[name])
         elif any(isinstance(each, MissingValue) and each.repr for each in parameters.values()):
             parameters = {name: _without_repr(each) for name, each in parameters.items()}

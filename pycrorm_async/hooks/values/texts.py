@@ -1,4 +1,4 @@
-"""Texts that the log can hold: cleaned, cut and marked, of exceptions and of any value, whatever its class raises."""
+"""These functions make texts that the log can hold from exceptions and from values whose code may raise anything."""
 
 from __future__ import annotations
 
@@ -8,55 +8,58 @@ from typing import Any
 __all__ = ["clean", "clean_repr", "cut", "message_of", "reading_fault"]
 
 _REPR_MAX = 200
+"""Bounds the characters of a repr that stands for a missing value; enough to recognise the value."""
 _TEXT_MAX = 150
-"""Of a text inside a repr, so that there is room for how long it was."""
+"""Bounds the characters of a text inside a repr, below `_REPR_MAX` so that the mark with its full length fits."""
 
 
 def reading_fault(error: BaseException) -> str:
-    """The reason why a value is missing whose own code raised this."""
+    """Describe why a value is missing if the value's own code raised `error`."""
     message = cut(clean(message_of(error)), _REPR_MAX)
     return f"reading it raised {type(error).__name__}{': ' if message else ''}{message}"
 
 
 def message_of(failure: BaseException) -> str:
-    """The text of an exception. Never raises."""
+    """Return the message of an exception. Never raises anything but `KeyboardInterrupt`."""
     try:
         return str(failure)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # noqa: BLE001  a user's __str__ may raise anything
-        return f"<its message could not be made: {type(error).__name__}>"
+        return f"<its __str__ raised {type(error).__name__}>"
 
 
 def clean(text: str) -> str:
-    """The text without what the log cannot hold: U+0000 and lone surrogates become escapes."""
+    """Replace U+0000 and lone surrogates, which the log cannot hold, by escapes."""
     return str.replace(text, "\x00", "\\x00").encode("utf-8", "backslashreplace").decode()
 
 
 def cut(text: str, characters_max: int) -> str:
-    """The text, or its beginning, marked as cut with how long it was."""
-    return text[:characters_max] + _more(len(text), "characters", characters_max)
+    """Shorten a text to `characters_max` characters; a shortened text ends with a mark that gives its full length."""
+    return text[:characters_max] + _cut_mark(len(text), "characters", characters_max)
 
 
-def _more(length: int, unit: str, length_max: int = _TEXT_MAX) -> str:
-    """The mark of what was cut."""
+def _cut_mark(length: int, unit: str, length_max: int = _TEXT_MAX) -> str:
     return f"… ({length:,} {unit})" if length > length_max else ""
 
 
 def clean_repr(value: Any) -> str:
-    """A cut repr for people, made without writing out all of a large container. Never raises."""
+    """Return a shortened repr without building the whole repr of a large container.
+
+    Never raises anything but `KeyboardInterrupt`.
+    """
     text = clean(_Brief().repr(value))
     return text if len(text) <= _REPR_MAX else f"{text[:_REPR_MAX]}…"
 
 
 class _Brief(Repr):
-    """The standard library's bounded repr, for bytes and subclasses of str too, and with faults named."""
+    """The standard library's bounded repr, extended to bytes and subclasses of str; it names a repr that raises."""
 
     def __init__(self) -> None:
         super().__init__()
         self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = self.maxdict = 20
         self.maxother = self.maxlong = self.maxstring = 2 * _REPR_MAX
-        self._left = _REPR_MAX  # each part takes a character at least
+        self._left = _REPR_MAX  # a part takes at least one character, so more parts would be cut off anyway
 
     def repr1(self, x: Any, level: int) -> str:
         self._left -= 1
@@ -64,14 +67,14 @@ class _Brief(Repr):
             return "…"
         try:
             if isinstance(x, str) and type(x).__repr__ is str.__repr__:
-                return repr(str.__getitem__(x, slice(_TEXT_MAX))) + _more(str.__len__(x), "characters")
+                return repr(str.__getitem__(x, slice(_TEXT_MAX))) + _cut_mark(str.__len__(x), "characters")
             if isinstance(x, bytes | bytearray):
-                return repr(bytes(x[:_TEXT_MAX])) + _more(len(x), "bytes")
+                return repr(bytes(x[:_TEXT_MAX])) + _cut_mark(len(x), "bytes")
             return super().repr1(x, level)
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001  a user's __repr__ may raise anything
             return f"<a {type(x).__name__} whose repr raised {type(error).__name__}>"
 
-    def repr_instance(self, x: Any, level: int) -> str:  # noqa: ARG002  the signature of the class it extends
+    def repr_instance(self, x: Any, level: int) -> str:  # noqa: ARG002  the signature of `Repr`
         return str.__str__(repr(x))

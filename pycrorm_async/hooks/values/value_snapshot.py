@@ -1,10 +1,10 @@
-"""The border: live values become frozen ones, copied at the moment they are seen.
+"""This module copies live values of a plan into frozen event values at the moment a hook observes them.
 
-A parameter that cannot be written down without changing its meaning raises `Unwritable` with the reason. Results,
-arguments of failures and texts of the world never raise: what cannot be recorded becomes a `MissingValue`. The code of
-a value's class runs here (`__float__`, `__repr__`, properties) and may raise anything, so every exception but Ctrl-C is
-the reason why that value is missing. Reading a value is bounded in depth and in items, so a structure that holds itself
-ends as well.
+A parameter that cannot be recorded without changing its meaning raises `UnrecordableValue` with the reason. Results,
+arguments of failures and texts of the world never raise: a value that cannot be recorded becomes a `MissingValue`.
+Reading a value runs the code of its class (`__float__`, `__repr__`, properties), which may raise anything, so every
+exception but `KeyboardInterrupt` becomes the reason why that value is missing. Reading is bounded in depth and in
+items, so it also ends for a structure that contains itself.
 """
 
 from __future__ import annotations
@@ -35,73 +35,78 @@ from pycrorm_async.world.pose import Pose
 
 __all__ = [
     "OBJECT_TYPES",
-    "Unwritable",
+    "UnrecordableValue",
     "References",
     "pose_value",
-    "written",
-    "written_or_missing",
+    "encode_parameter",
+    "encode_or_missing",
     "failure_value",
     "missing_in",
     "missing_value",
 ]
 
 OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
-"""Field types that mean an object; parts and believed objects are object designators too."""
+"""Field types whose values are recorded as objects; `ObjectPart` and `BelieveObject` are object designators too."""
 
 ObjectDtype: TypeAlias = Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
 
 _TEXT_MAX = 2_000
+"""Bounds the characters of a failure's message."""
 _REASON_MAX = 500
+"""Bounds the characters of the reason why a value is missing, and of the messages inside an exception group."""
 _NAME_MAX = 500
+"""Bounds the characters of an exception's qualified class name."""
 _DEPTH_MAX = 8
+"""Bounds the nesting of a result, of a failure's arguments and of exception groups."""
 _GROUP_MAX = 100
+"""Bounds the recorded exceptions of one exception group."""
 ITEMS_MAX = 2**19
-"""Items of one value. Each takes two bytes at least, so that many are above the usual `record_bytes_max`."""
+"""Bounds the items of one value. An item takes at least two bytes, so more exceed the default `record_bytes_max`."""
 
 
-class Unwritable(ValueError):
-    """A value that JSON or its column cannot hold as it is."""
+class UnrecordableValue(ValueError):
+    """JSON or the declared column cannot hold the value unchanged; the message states the reason."""
 
 
 class References(Protocol):
-    """What the episode knows of the objects in its world."""
+    """Looks up the rows of an episode's world objects."""
 
     def reference(self, world_object: Object) -> ObjectReference | None:
-        """The row in force of this object; None if the episode never saw it."""
+        """Return the object's current row; None if the episode has no row of it."""
         ...
 
 
 def pose_value(pose: Pose) -> PoseValue:
-    """The pose as it is now."""
+    """Copy a pose."""
     return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
 
 
-def written(field: FieldDeclared, enum: type[Enum] | None, value: Any, references: References) -> Any:
-    """A parameter as JSON, by the type its field was declared with. Raises `Unwritable`."""
+def encode_parameter(field: FieldDeclared, enum: type[Enum] | None, value: Any, references: References) -> Any:
+    """Convert a parameter to a JSON value of its field's declared type. Raises `UnrecordableValue`."""
     if field.type == "list":
         if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
-            raise Unwritable(f"{_a(value)} stands where a list was declared")
+            raise _mismatch("list", value)
         scalar = _WRITERS[field.item or "text"]
         return [scalar(each, enum, references) if each is not None else None for each in _bounded(value, value)]
     if field.type == "dict":
         if not isinstance(value, Mapping):
-            raise Unwritable(f"{_a(value)} stands where a dict was declared")
+            raise _mismatch("dict", value)
         scalar = _WRITERS[field.item or "text"]
         entries = {
             _key(key): scalar(each, enum, references) if each is not None else None
             for key, each in _bounded(value, value.items())
         }
         if len(entries) < len(value):
-            raise Unwritable("two keys of the dict have the same text")
+            raise UnrecordableValue("two keys of the dict have the same text")
         return entries
     return _WRITERS[field.type](value, enum, references)
 
 
-def written_or_missing(value: Any, references: References) -> Any:
-    """Any value as JSON, as far as it can be; a `MissingValue` where it cannot. Never raises."""
+def encode_or_missing(value: Any, references: References) -> Any:
+    """Convert any value to a JSON value, or to a `MissingValue`. Never raises anything but `KeyboardInterrupt`."""
     try:
-        return _Freely(references).read(value, 0)
-    except Unwritable as reason:
+        return _ValueReader(references).read(value, 0)
+    except UnrecordableValue as reason:
         return missing_value(str(reason), value)
     except KeyboardInterrupt:
         raise
@@ -110,12 +115,12 @@ def written_or_missing(value: Any, references: References) -> Any:
 
 
 def missing_value(reason: str, value: Any) -> MissingValue:
-    """What stands for a value that cannot be recorded."""
+    """Build the `MissingValue` that replaces a value, with a shortened reason and repr."""
     return MissingValue(cut(clean(reason), _REASON_MAX), clean_repr(value))
 
 
 def missing_in(value: Any) -> Iterator[MissingValue]:
-    """Each `MissingValue` in what was written."""
+    """Yield each `MissingValue` inside an encoded value."""
     if isinstance(value, MissingValue):
         yield value
     elif isinstance(value, list | dict):
@@ -124,7 +129,7 @@ def missing_in(value: Any) -> Iterator[MissingValue]:
 
 
 def failure_value(failure: BaseException, references: References) -> FailureValue:
-    """Class, message and arguments of an exception. Never raises."""
+    """Copy class, message and arguments of an exception. Never raises anything but `KeyboardInterrupt`."""
     return FailureValue(
         type=cut(_path_of(type(failure)), _NAME_MAX),
         message=cut(clean(message_of(failure)), _TEXT_MAX),
@@ -149,9 +154,9 @@ def _arguments_or_missing(failure: BaseException, references: References) -> lis
 
 
 def _arguments(failure: BaseException, references: References, depth: int) -> list[Any]:
-    """What it was raised with; of a group its message, and class, message and arguments of each that is in it."""
+    """Encode the arguments of an exception; for a group, its message and the encoded exceptions inside it."""
     if not isinstance(failure, BaseExceptionGroup):
-        return [written_or_missing(each, references) for each in failure.args]
+        return [encode_or_missing(each, references) for each in failure.args]
     if depth > _DEPTH_MAX:
         return [missing_value(f"it is nested more than {_DEPTH_MAX} deep", failure)]
     inside = [
@@ -172,100 +177,100 @@ def _integer(value: Any, _enum: type[Enum] | None, _references: References) -> i
     try:
         number = operator.index(value)
     except TypeError:
-        raise Unwritable(f"{_a(value)} stands where an int was declared") from None
+        raise _mismatch("int", value) from None
     if not -(2**63) <= number < 2**63:
-        raise Unwritable("the integer does not fit into 64 bits")
+        raise UnrecordableValue("the integer does not fit into 64 bits")
     return int(number)
 
 
 def _real(value: Any, _enum: type[Enum] | None, _references: References) -> float:
     if type(value) is not float:
         if isinstance(value, str | bytes) or not hasattr(value, "__float__"):
-            raise Unwritable(f"{_a(value)} stands where a float was declared")
+            raise _mismatch("float", value)
         try:
             value = float.__float__(value) if isinstance(value, float) else float(value)
         except (TypeError, ValueError, OverflowError) as error:
-            raise Unwritable(f"{_a(value)} stands where a float was declared: {error}") from None
+            raise UnrecordableValue(f"declared as float, got a {type(value).__name__}: {error}") from None
     if not math.isfinite(value):
-        raise Unwritable(f"{value} is not a finite number")
+        raise UnrecordableValue(f"{value} is not a finite number")
     return float.__float__(value)
 
 
 def _text(value: Any, _enum: type[Enum] | None, _references: References) -> str:
     if not isinstance(value, str):
-        raise Unwritable(f"{_a(value)} stands where a str was declared")
+        raise _mismatch("str", value)
     return str.__str__(_checked(str.__str__(value)))
 
 
 def _boolean(value: Any, _enum: type[Enum] | None, _references: References) -> bool:
     if not isinstance(value, bool | np.bool_):
-        raise Unwritable(f"{_a(value)} stands where a bool was declared")
+        raise _mismatch("bool", value)
     return bool(value)
 
 
 def _datetime(value: Any, _enum: type[Enum] | None, _references: References) -> str:
     if not isinstance(value, datetime):
-        raise Unwritable(f"{_a(value)} stands where a datetime was declared")
+        raise _mismatch("datetime", value)
     if value.tzinfo is None:
-        raise Unwritable("the datetime has no time zone")
+        raise UnrecordableValue("the datetime has no time zone")
     return value.astimezone(UTC).isoformat(timespec="microseconds")
 
 
 def _member(value: Any, enum: type[Enum] | None, _references: References) -> str:
     if enum is not None and not isinstance(value, enum):
-        raise Unwritable(f"{clean_repr(value)} is no member of {enum.__name__}")
+        raise UnrecordableValue(f"{clean_repr(value)} is not a member of {enum.__name__}")
     name = value.name
     if not isinstance(name, str):
-        raise Unwritable(f"{clean_repr(value)} has no name in {type(value).__name__}")
+        raise UnrecordableValue(f"{clean_repr(value)} is not a named member of {type(value).__name__}")
     return str(_checked(name))
 
 
 def _pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
     if not isinstance(value, Pose):
-        raise Unwritable(f"{_a(value)} stands where a Pose was declared")
+        raise _mismatch("Pose", value)
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
-        raise Unwritable(f"the pose holds a number that is not finite: {value}")
+        raise UnrecordableValue(f"the pose holds a number that is not finite: {value}")
     if unwritable(value.frame):
-        raise Unwritable(f"the pose's frame: {unwritable(value.frame)}")
+        raise UnrecordableValue(f"the pose's frame: {unwritable(value.frame)}")
     return pose_value(value)
 
 
 def _object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
     if isinstance(value, Object):
-        return references.reference(value) or _outside(value)
+        return references.reference(value) or _unrecorded_object(value)
     if isinstance(value, ObjectPart):
-        return _told("ObjectPart", value, _in_force(value.part_of, references))
+        return _object_value("ObjectPart", value, _row_in_force(value.part_of, references))
     if isinstance(value, LocatedObject):
-        return _told("LocatedObject", value, _in_force(value.reference, references))
+        return _object_value("LocatedObject", value, _row_in_force(value.reference, references))
     if isinstance(value, BelieveObject):
-        return _told("BelieveObject", value)
+        return _object_value("BelieveObject", value)
     if isinstance(value, ObjectDesignator):
-        known = references.reference(value.world_object) if value.world_object is not None else None
-        return known or _outside(value)
-    raise Unwritable(f"{_a(value)} stands where an object designator was declared")
+        row = references.reference(value.world_object) if value.world_object is not None else None
+        return row or _unrecorded_object(value)
+    raise _mismatch("object designator", value)
 
 
-def _outside(value: Any) -> ObjectValue:
-    return _told("Object", value)
+def _unrecorded_object(value: Any) -> ObjectValue:
+    return _object_value("Object", value)
 
 
-def _told(dtype: ObjectDtype, value: Any, part_of: ObjectReference | None = None) -> ObjectValue:
-    return ObjectValue(dtype, clean(value.name), _type_name(value), _maybe_pose(value), part_of)
+def _object_value(dtype: ObjectDtype, value: Any, part_of: ObjectReference | None = None) -> ObjectValue:
+    return ObjectValue(dtype, clean(value.name), _type_name(value), _pose_or_none(value), part_of)
 
 
-def _in_force(meant: ObjectDesignator, references: References) -> ObjectReference | None:
-    """The row in force of the object of the world that is meant, or that the part belongs to."""
-    while isinstance(meant, ObjectPart):
-        meant = meant.part_of
-    return references.reference(meant.world_object) if meant.world_object is not None else None
+def _row_in_force(designator: ObjectDesignator, references: References) -> ObjectReference | None:
+    """Return the current row of the designated world object; for a part, of the object it belongs to."""
+    while isinstance(designator, ObjectPart):
+        designator = designator.part_of
+    return references.reference(designator.world_object) if designator.world_object is not None else None
 
 
-def _maybe_pose(value: Any) -> PoseValue | None:
+def _pose_or_none(value: Any) -> PoseValue | None:
     try:
         pose = value.pose
-    except Exception:  # noqa: BLE001  a part of what was removed, a link that is not there: `perform` says so itself
+    except Exception:  # noqa: BLE001  the object or link was removed; `perform` reports it
         return None
-    return _pose(pose, None, _NOBODY) if pose is not None else None
+    return _pose(pose, None, _NO_REFERENCES) if pose is not None else None
 
 
 def _type_name(value: Any) -> str | None:
@@ -285,67 +290,67 @@ _WRITERS: dict[str, Callable[[Any, type[Enum] | None, References], Any]] = {
 }
 
 
-class _Nobody:
+class _NoReferences:
     def reference(self, world_object: Object) -> ObjectReference | None:  # noqa: ARG002  the port's signature
         return None
 
 
-_NOBODY = _Nobody()
+_NO_REFERENCES = _NoReferences()
 
 
 def _key(key: Any) -> str:
     if isinstance(key, Enum):
         return str(key.name)
     if not isinstance(key, str):
-        raise Unwritable(f"{_a(key)} stands where a dict's key must be a str")
+        raise UnrecordableValue(f"a key of the dict is a {type(key).__name__}, not a str")
     return str(_checked(key))
 
 
 def _checked(value: Any) -> Any:
     reason = unwritable(value)
     if reason is not None:
-        raise Unwritable(reason)
+        raise UnrecordableValue(reason)
     return value
 
 
 def _bounded(holder: Any, items: Iterable[Any]) -> Iterable[Any]:
-    """The items, if there are not too many. Raises `Unwritable`."""
+    """Return the items of a container. Raises `UnrecordableValue` if there are more than `ITEMS_MAX`."""
     if len(holder) > ITEMS_MAX:
-        raise Unwritable(f"it holds {len(holder):,} items, {ITEMS_MAX:,} are the most")
-    return items if type(holder) in _HONEST else _counted(items)
+        raise UnrecordableValue(f"it holds {len(holder):,} items, at most {ITEMS_MAX:,} are allowed")
+    return items if type(holder) in _BUILT_IN_CONTAINERS else _counted(items)
 
 
-_HONEST = (list, tuple, dict, np.ndarray)
-"""Their length is what iterating them gives; a class of the user's own may go on for ever."""
+_BUILT_IN_CONTAINERS = (list, tuple, dict, np.ndarray)
+"""Types whose `len` bounds their iteration; a user's own class may yield items without end."""
 
 
 def _counted(items: Iterable[Any]) -> Iterator[Any]:
     for number, each in enumerate(items):
         if number == ITEMS_MAX:
-            raise Unwritable(f"it holds more than {ITEMS_MAX:,} items")
+            raise UnrecordableValue(f"it holds more than {ITEMS_MAX:,} items")
         yield each
 
 
-class _Freely:
-    """Reads a value of no declared type, as far as JSON can hold it. Raises `Unwritable`."""
+class _ValueReader:
+    """Converts one value without a declared type to a JSON value. Raises `UnrecordableValue`."""
 
     def __init__(self, references: References) -> None:
         self._references = references
         self._left = ITEMS_MAX
-        self._around: set[int] = set()
+        self._enclosing_ids: set[int] = set()
 
     def read(self, value: Any, depth: int) -> Any:
         self._left -= 1
         if self._left < 0:
-            raise Unwritable(f"it holds more than {ITEMS_MAX:,} items")
+            raise UnrecordableValue(f"it holds more than {ITEMS_MAX:,} items")
         if depth > _DEPTH_MAX:
-            raise Unwritable(f"it is nested more than {_DEPTH_MAX} deep")
+            raise UnrecordableValue(f"it is nested more than {_DEPTH_MAX} deep")
         if isinstance(value, Enum):
             return _checked(value.name)
         if value is None or isinstance(value, bool | np.bool_):
             return None if value is None else bool(value)
         if isinstance(value, str | int | float):
-            return _checked(_plainly(value))
+            return _checked(_as_built_in(value))
         if isinstance(value, np.generic):
             return self.read(value.item(), depth + 1)
         for kind, writer in ((Pose, _pose), (datetime, _datetime), (OBJECT_TYPES, _object)):
@@ -355,29 +360,29 @@ class _Freely:
             value = value.in_brief()
         if isinstance(value, Mapping | list | tuple | np.ndarray):
             return self._container(value, depth)
-        raise Unwritable(f"{_a(value)} has no form in JSON")
+        raise UnrecordableValue(f"JSON cannot hold a {type(value).__name__}")
 
     def _container(self, value: Any, depth: int) -> Any:
-        if id(value) in self._around:
-            raise Unwritable("it holds itself")
-        self._around.add(id(value))
-        written: Any
+        if id(value) in self._enclosing_ids:
+            raise UnrecordableValue("it contains itself")
+        self._enclosing_ids.add(id(value))
+        items: Any
         if isinstance(value, Mapping):
-            written = {_key(key): self.read(each, depth + 1) for key, each in value.items()}
+            items = {_key(key): self.read(each, depth + 1) for key, each in value.items()}
         else:
-            written = [self.read(each, depth + 1) for each in value]
-        self._around.discard(id(value))
-        return written
+            items = [self.read(each, depth + 1) for each in value]
+        self._enclosing_ids.discard(id(value))
+        return items
 
 
-def _plainly(value: str | float) -> str | int | float:
-    """The value as one of the built-in types, whose form in JSON no subclass can change."""
+def _as_built_in(value: str | float) -> str | int | float:
+    """Convert a value of a subclass to the built-in type, so that the subclass cannot change its JSON."""
     if isinstance(value, str):
         return str.__str__(value)
     if isinstance(value, float):
         return float.__float__(value)
-    return _integer(value, None, _NOBODY)
+    return _integer(value, None, _NO_REFERENCES)
 
 
-def _a(value: Any) -> str:
-    return f"a {type(value).__name__}"
+def _mismatch(declared: str, value: Any) -> UnrecordableValue:
+    return UnrecordableValue(f"declared as {declared}, got a {type(value).__name__}")
