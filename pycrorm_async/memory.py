@@ -229,7 +229,7 @@ class Memory:
         told = self._parts.recorder
         for episode in told.open_episodes:
             told.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
-        self._parts.emitter.over = self._parts.experience.over = True
+        self._parts.emitter.is_closed = self._parts.experience.over = True
         told.close()
         await self._stack.__aexit__(kind, error, traceback)
 
@@ -267,7 +267,7 @@ class Memory:
     def _forked(self) -> None:
         """In a forked child: the memory is its parent's; plans go on and nothing is told."""
         if self._parts is not None:
-            self._parts.emitter.over = self._parts.experience.over = True
+            self._parts.emitter.is_closed = self._parts.experience.over = True
             self._parts = None
 
     # --- recording --------------------------------------------------------------------------------------------

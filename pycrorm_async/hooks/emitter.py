@@ -1,4 +1,4 @@
-"""Puts events into the queue, and counts every fault of ours instead of letting it reach a plan."""
+"""The `Emitter` puts events into the queue and counts faults of the hooks, so that they do not reach a plan."""
 
 from __future__ import annotations
 
@@ -20,35 +20,41 @@ __all__ = ["Emitter", "Faults"]
 
 _log = logging.getLogger("pycrorm_async")
 _BLOCK_S = 1.0
-_OUR_THREADS = "pycrorm "
+"""Bounds one wait for room. `put_payload` then tries again, so the value limits only the delay of a missed wake-up."""
+_THREAD_NAME_PREFIX = "pycrorm "
+"""The names of all threads of the memory begin with this."""
 _REASON_MAX = 2_000
+"""Bounds the characters of the last fault's message in `status`."""
 UNAWAITED_MAX = 100
-"""Designator types that are named; the latest, if there are more."""
+"""Bounds the designator types listed with a perform that was never awaited; the latest are kept."""
 
 
 class Faults(NamedTuple):
-    """How often the hooks failed to record something, and the last reason; status shows both."""
+    """The number of events the hooks failed to record, and the last reason; `status` shows both."""
 
     total: int
     last: str | None
 
 
 class Emitter:
-    """The hooks' way to the queue.
+    """Puts the events of one memory into its queue.
 
-    Only the start of a node or an episode waits for room, before it is written (`Recorder.admit`). Everything else, a
-    thought's start too, must not wait, so all that is put may use the reserve; when that is gone as well, the calling
-    thread blocks until something was stored. Nothing is dropped.
+    Only the start of a node or an episode waits for room, before it is written (`Recorder.admit`). All other events,
+    including the start of a simulation, must not wait, so `put` may use the spool's reserve. If the reserve is used up
+    as well, `put` blocks the calling thread until a record was stored. It drops no event.
+
+    Attributes:
+        is_closed: whether the memory is closed, or belongs to the process that forked this one; hooks then do nothing.
+        missing: counts the values that could not be recorded.
+        unawaited: for each designator type whose perform was called and never awaited, a sentence for the user.
     """
 
     def __init__(self, sink: EventSink, settings: Settings) -> None:
         self.sink = sink
         self.settings = settings
-        self.over = False
-        """Whether the memory is closed, or belongs to the process that forked this one: nothing is told any more."""
+        self.is_closed = False
         self.missing = MissingValues()
         self.unawaited: tuple[str, ...] = ()
-        """For each designator type whose perform was called and never awaited: a sentence that says so."""
         self._fault_count = 0
         self._last_fault: str | None = None
 
@@ -57,30 +63,31 @@ class Emitter:
         return Faults(self._fault_count, self._last_fault)
 
     def put(self, episode: EpisodeId | None, event: Happening) -> int:
-        """Append the event; its sequence. Raises `NotEncodable` before anything was written."""
+        """Append an event and return its sequence. Raises `NotEncodable` before anything is written."""
         kind = type(event)
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
         return self.put_payload(Heading(episode, kind.__name__, kind.version), payload)
 
     def put_payload(self, heading: Heading, payload: bytes) -> int:
-        """The same for an event that is encoded already."""
+        """Append an encoded event and return its sequence."""
         while True:
             try:
                 return self.sink.put_nowait(heading, payload, reserved=True)
             except SpoolFull:
-                # The collector may close a dropped plan in a thread of ours, and these are the ones that make room.
-                if threading.current_thread().name.startswith(_OUR_THREADS):
+                # The garbage collector may close a dropped plan in a thread of the memory. Such a thread must not
+                # block here, because these threads are the ones that free space.
+                if threading.current_thread().name.startswith(_THREAD_NAME_PREFIX):
                     raise
                 self.sink.block_until_room(_BLOCK_S)
 
     def offer(self, episode: EpisodeId, event: Happening) -> int:
-        """As `put`, only if there is ordinary room for it: raises `SpoolFull` otherwise, and never waits."""
+        """Append an event without using the reserve and without waiting; raise `SpoolFull` if there is no room."""
         kind = type(event)
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
         return self.sink.put_nowait(Heading(episode, kind.__name__, kind.version), payload)
 
     def note_unawaited(self, dtype: str) -> None:
-        """A perform of the plan that never ran: counted among the faults, and named."""
+        """Count a perform that was called and never awaited as a fault, and log a warning for the first of a type."""
         text = f"{dtype}.perform() was called and never awaited, so it did not run: write `await`"
         self._fault_count += 1
         self._last_fault = text
@@ -89,9 +96,9 @@ class Emitter:
             _log.warning("%s", text)
 
     def note_fault(self, where: str, error: BaseException) -> None:
-        """A fault of ours: counted, kept, logged once in a while, never raised into the plan."""
+        """Count an exception of the hooks, and log it when the count is a power of two, so that the log stays short."""
         self._fault_count += 1
         self._last_fault = f"{where}: {type(error).__name__}: {cut(clean(message_of(error)), _REASON_MAX)}"
         if self._fault_count & (self._fault_count - 1) == 0:
-            _log.error("not recorded (%d so far): %s", self._fault_count, self._last_fault)
-            _log.debug("where it happened", exc_info=error)
+            _log.error("an event was not recorded (%d so far): %s", self._fault_count, self._last_fault)
+            _log.debug("traceback of the event that was not recorded", exc_info=error)

@@ -1,24 +1,32 @@
-"""One open episode: numbers its nodes, watches its world, and writes down how it ended.
+"""An `Episode` records one open episode: it numbers the nodes, observes the world and writes how the episode ended.
 
-Theory of operation of follow-up episodes. A sequence has 26 bits. An episode that comes near its last one
-(`continue_at`) is ended, and the same `Episode` object goes on under a new id, so that contexts and nodes that hold it
-need not know. Everything open is cut at that moment: each open node ends INTERRUPTED with the reason EpisodeContinued,
-innermost first, then the root and the episode itself; the follow-up begins with EpisodeStarted, which names the former
-episode, a root, the world as it is then, and each of those nodes started again, outermost first. A node started again
-names the sequence it continues, and takes its parameters and the robot's state as they are then. So each perform has
-exactly one row whose status says how it ended, and the time of a node is the sum of its parts.
+Theory of operation. Starts of nodes, observations and changes of the world reach an episode in the thread of the plan,
+through `Recorder` and `WorldRecorder`. Ends of nodes do so too, except when a plan is dropped unfinished: then the
+garbage collector closes its coroutines and thereby ends its nodes, in any thread and in the middle of whatever that
+thread is doing. The sampler's thread reads `id`, `world` and `continue_at`.
 
-A start, an observation or a change of the world that reaches `continue_at` does this in the plan's thread, when it is
-recorded itself. An end never does, because the collector ends the nodes of a dropped plan in the middle of whatever a
-thread is doing. What comes before the next start finds room in the reserve below the last sequence; of the samples of
-the robot's state only the first and the last of a motion are taken then.
+`_open_nodes` holds every node that started and whose end is not written. `end_node` removes a node only after it has
+put the node's end into the queue, so a node whose end could not be written ends LOST with the episode.
+
+A sequence has 26 bits, so an episode can run out of sequences. When one reaches `continue_at`, `continue_as` ends it,
+and the same `Episode` object continues under a new id, so that contexts and nodes that refer to it stay valid. Every
+open node ends INTERRUPTED with the reason EpisodeContinued, innermost first, then the root and the episode itself. The
+follow-up begins with EpisodeStarted, which names the former episode, then a root, the world as it is then, and a start
+of each interrupted node, outermost first. Such a start names the sequence that it continues and holds the node's
+parameters and the robot's state as they are then. So each perform has exactly one row whose status is its outcome, and
+the duration of a node is the sum of its parts.
+
+Only a start, an observation or a change of the world triggers a follow-up, after it has been recorded itself. An end
+never does, because the garbage collector may cause it. Until the next start, events use the reserve of sequences behind
+`continue_at`, and the sampler takes only the first and the last sample of each motion. `continue_as` removes a node
+from `_open_nodes` before it writes the node's end, and skips a node that has been removed meanwhile, because the
+garbage collector may have ended it in this thread. `NodeRecord.episode_id` is the id under which the node's sequence
+counts; a node whose `episode_id` is not the episode's current id is never referred to in the follow-up.
 """
 
 from __future__ import annotations
 
 import asyncio
-import getpass
-import platform
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Literal, NamedTuple
 
@@ -26,23 +34,24 @@ from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.types import (
-    CandidateValue,
     EpisodeEnded,
-    EpisodeStarted,
-    EpisodeStatus,
     FailureValue,
-    LocationResolved,
     NodeEnded,
     NodeReference,
     NodeStarted,
     NodeStatus,
-    ObjectDetected,
     ObjectReference,
     RobotValue,
-    SeenValue,
 )
 from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.emitter import UNAWAITED_MAX, Emitter
+from pycrorm_async.hooks.episode_events import (
+    EpisodeOpening,
+    end_statuses,
+    episode_started,
+    location_resolved,
+    object_detected,
+)
 from pycrorm_async.hooks.values.event_fitting import (
     fit_detection,
     fit_episode_end,
@@ -51,64 +60,56 @@ from pycrorm_async.hooks.values.event_fitting import (
     fit_resolution,
 )
 from pycrorm_async.hooks.values.parameters import ROBOT, fit_node_start, read_parameters
-from pycrorm_async.hooks.values.texts import clean
-from pycrorm_async.hooks.values.value_snapshot import encode_or_missing, failure_value, missing_in, pose_value
+from pycrorm_async.hooks.values.value_snapshot import encode_or_missing, failure_value, missing_in
 from pycrorm_async.hooks.world_recorder import WorldRecorder
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.execution.observer import Candidate, Seen
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
-from pycrorm_async.plan.failures import is_plan_failure
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.observers import current_world
 
-__all__ = ["Episode", "NodeRecord", "EpisodeOpening", "CONTINUED", "current_task"]
+__all__ = ["Episode", "NodeRecord", "CONTINUED", "current_task"]
 
 CONTINUED: Final = "EpisodeContinued"
-"""The reason of nodes and episodes that ended because the episode goes on in a follow-up episode."""
+"""The failure type of nodes and episodes that ended because a follow-up episode continues them."""
 
 _RESERVE_EVENTS_MAX = 2**20
-"""Sequences kept back for the ends of open nodes: more nodes than a process has memory for."""
-
-
-class EpisodeOpening(NamedTuple):
-    """What an episode begins with."""
-
-    description: str
-    software: str
-    plan: str | None = None
-    seed: int | None = None
-    world: str | None = None
-    simulated: bool = False
-    thought_by: NodeReference | None = None
+"""Bounds the sequences reserved behind `continue_at`: more open nodes than fit into a process' memory."""
 
 
 class NodeRecord(NamedTuple):
-    """What the memory keeps at a running node."""
+    """The hooks' record of a running node, kept as `TaskTreeNode.record`.
+
+    Attributes:
+        episode: the episode that recorded the node.
+        sequence: sequence of the node's NodeStarted; its id.
+        implicit: whether the episode was opened for this node alone and ends with it.
+        outer_episode: the current episode of the context before the node started.
+        episode_id: the episode's id when the node started; `sequence` counts under this id.
+    """
 
     episode: Episode
     sequence: int
     implicit: bool
-    """Whether the episode was opened for this node and ends with it."""
-    before: Episode | None
-    """The current episode of the context when the node started."""
-    part: EpisodeId
-    """The id of the episode when the node started: its sequence counts in that one."""
+    outer_episode: Episode | None
+    episode_id: EpisodeId
 
 
 class Episode:
-    """An episode that is open, or was.
+    """An open or closed episode.
 
     Attributes:
-        id: 16 bytes of a UUIDv7; `str(episode)` is its text. That of the latest follow-up, if it was continued.
-        continue_at: the sequence from which on it is to be continued in a follow-up.
-        task: the asyncio task that opened it; None outside any.
-        simulated: it is thought through in a copy of the world, and nothing of it happens.
-        world: who watches its world; None without one.
-        faults: mistakes of the plan that were noticed in it, each once: performs that were never awaited.
-        calls: performs that were called in its context.
+        id: 16 bytes of a UUIDv7; `str(episode)` is its text. A continued episode has the id of its latest follow-up.
+        continue_at: the first sequence that triggers a follow-up episode.
+        task: the asyncio task that opened the episode; None outside any task.
+        closed: whether the last event has been written, or its writing has begun.
+        simulated: whether the episode is a simulation, performed in a copy of the world.
+        world: the recorder of its world; None without a world.
+        faults: faults of the plan, each type once: performs that were never awaited.
+        calls: performs called in the episode's context.
     """
 
     def __init__(self, emitter: Emitter, episode: EpisodeId, opening: EpisodeOpening) -> None:
@@ -128,26 +129,13 @@ class Episode:
         self._root = self._start(None, None)
 
     def _start(self, continues: EpisodeId | None, root: int | None) -> int:
-        """Write down that the episode starts; the sequence of its root."""
-        opening = self._opening
-        started = EpisodeStarted(
-            description=clean(opening.description),
-            created_by=clean(_user()),
-            host=clean(platform.node()),
-            software=opening.software,
-            python=platform.python_version(),
-            plan=clean(opening.plan) if opening.plan is not None else None,
-            seed=opening.seed,
-            world=clean(opening.world) if opening.world is not None else None,
-            simulated=opening.simulated,
-            thought_by=opening.thought_by,
-            continues=episode_text(continues) if continues is not None else None,
-        )
+        """Write the start of the episode and of its root node; return the root's sequence."""
+        started = episode_started(self._opening, continues)
         started, shortened = fit_episode_start(started, self._emitter.settings.record_bytes_max)
         for name in shortened:
-            self._emitter.missing.note("Episode", name, "its text is longer than an episode's may be, and was cut")
+            self._emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
         self._emitter.put(self.id, started)
-        return self._emitter.put(self.id, NodeStarted("root", simulated=opening.simulated, continues=root))
+        return self._emitter.put(self.id, NodeStarted("root", simulated=self._opening.simulated, continues=root))
 
     def __str__(self) -> str:
         return episode_text(self.id)
@@ -158,26 +146,26 @@ class Episode:
     # --- world ------------------------------------------------------------------------------------------------
 
     def enter_world(self, world: BulletWorld, continue_: Callable[[], None]) -> None:
-        """This world belongs to the episode from now on. A second one at the same time is not recorded, and counted.
+        """Record this world from now on. A second world at the same time is not recorded, but counted as missing.
 
-        `continue_` is called when a change of the world has reached `continue_at`.
+        The world's recorder calls `continue_` when a change of the world has reached `continue_at`.
         """
         if self.world is None:
             self.world = WorldRecorder(self._emitter, self.id, world, continue_)
             self.world.continue_at = self.continue_at
         elif self.world.world is not world:
-            self._emitter.missing.note("Episode", "second world", f"{self} records the world that was entered first")
+            self._emitter.missing.note("Episode", "second world", f"{self} records only the world entered first")
 
     @property
-    def in_its_world(self) -> bool:
-        """Whether the plan acts in the recorded world now, and not in a second one."""
+    def acts_in_recorded_world(self) -> bool:
+        """Whether the current world of this context is the recorded world, and not a second one."""
         if self.world is None:
             return False
         current = current_world.get()
         return current is None or current is self.world.world
 
     def leave_world(self, world: BulletWorld, *, emptied: bool) -> None:
-        """Look at it no longer; `emptied` if it is gone with all its objects, and not only the episode over."""
+        """Stop recording this world; with `emptied`, record first that all its objects were removed."""
         if self.world is not None and self.world.world is world:
             if emptied:
                 self.world.empty()
@@ -185,17 +173,20 @@ class Episode:
             self.world = None
 
     def reference(self, world_object: Object) -> ObjectReference | None:
-        """The row in force of this object in this episode."""
+        """Return the object's current row in this episode; None without a row."""
         return self.world.reference(world_object) if self.world is not None else None
 
-    def naming(self, node: TaskTreeNode | None) -> NodeReference:
-        """How other episodes name this node of it, or the nearest recorded one above; the root for None."""
+    def node_reference(self, node: TaskTreeNode | None) -> NodeReference:
+        """Return a reference to this node, or to its nearest recorded ancestor; None gives the root."""
         return NodeReference(str(self), self._parent_of(node))
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
     def start_node(self, node: TaskTreeNode, declared: DeclaredType, continues: int | None = None) -> int:
-        """Write down that the node starts; its sequence. Raises `Unrecordable` for a parameter, if so chosen."""
+        """Write the start of a node and return its sequence.
+
+        Raises `Unrecordable` for a parameter, with `on_unrecordable="refuse"` only.
+        """
         assert node.designator is not None
         missing: dict[str, str] = {}
         event = NodeStarted(
@@ -220,7 +211,7 @@ class Episode:
         return sequence
 
     def end_node(self, node: TaskTreeNode) -> None:
-        """Write down how the node ended."""
+        """Write how a node ended."""
         record: NodeRecord = node.record
         if self._open_nodes.get(record.sequence) is not node:
             return
@@ -229,52 +220,28 @@ class Episode:
         status: NodeStatus = node.status.value
         assert node.designator is not None
         self._put_end(NodeEnded(record.sequence, status, failure, result), node.designator.dtype)
-        # Only now: an end that was not written is LOST when the episode ends.
+        # Not before the put: if it raises, the node must stay open, so that `end` writes it as LOST.
         self._open_nodes.pop(record.sequence, None)
 
-    def locate(
+    def record_location(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
         node: TaskTreeNode | None,
     ) -> int:  # fmt: skip
-        """Write down what a location designator offered and which was taken; the sequence of that."""
-        resolved = LocationResolved(
-            location=clean(location),
-            offered=tuple(
-                CandidateValue(
-                    pose_value(each.pose),
-                    tuple(arm.name for arm in each.arms),
-                    each.grasp.name if each.grasp is not None else None,
-                    each.torso_height,
-                )
-                for each in offered
-            ),
-            taken=taken,
-            considered=considered,
-            node=self._sequence_of(node),
-        )
+        """Write which candidates a location designator offered and which one was taken; return the sequence."""
+        number = self._sequence_of(node)
+        resolved = location_resolved(location, offered, taken=taken, considered=considered, node=number)
         try:
             return self._emitter.put(self.id, resolved)
         except NotEncodable as error:
             self._emitter.missing.note(resolved.location, "offered", error.reason)
             return self._emitter.put(self.id, fit_resolution(resolved, self._emitter.settings.record_bytes_max))
 
-    def detect(
+    def record_detection(
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
         node: TaskTreeNode | None,
     ) -> int:  # fmt: skip
-        """Write down what perception was asked and what it found; the sequence of that."""
-        found = tuple(
-            SeenValue(
-                clean(each.thing.name),
-                each.thing.object_type.name,
-                pose_value(each.thing.pose),
-                self.reference(each.thing),
-                each.visible,
-            )
-            for each in seen
-        )
-        looked_for = object_type.name if object_type is not None else None
-        detected = ObjectDetected(source, looked_for, found, self._sequence_of(node))
+        """Write the request to perception and its result; return the sequence."""
+        detected = object_detected(source, object_type, seen, self, node=self._sequence_of(node))
         try:
             return self._emitter.put(self.id, detected)
         except NotEncodable as error:
@@ -282,7 +249,7 @@ class Episode:
             return self._emitter.put(self.id, fit_detection(detected, self._emitter.settings.record_bytes_max))
 
     def end(self, failure: BaseException | None) -> None:
-        """The last event. Nodes that outlive the episode are out of its sight: LOST."""
+        """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded."""
         if self.closed:
             return
         self.calls.close()
@@ -292,7 +259,7 @@ class Episode:
         for sequence in sorted(self._open_nodes, reverse=True):
             self._put_end(NodeEnded(sequence, "LOST"), "Episode")
         self._open_nodes.clear()
-        status, root_status = _outcome(failure)
+        status, root_status = end_statuses(failure)
         value = failure_value(failure, self) if failure is not None else None
         self._put_end(NodeEnded(self._root, root_status, value), "Episode")
         ended = EpisodeEnded(status, value)
@@ -302,17 +269,17 @@ class Episode:
             self._emitter.put(self.id, fit_episode_end(ended, self._emitter.settings.record_bytes_max))
 
     def continue_as(self, follow_up: EpisodeId, declared: Callable[[TaskTreeNode], DeclaredType]) -> dict[int, int]:
-        """End the episode and go on under this id; the new sequences of the nodes that are open, by their old ones."""
+        """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
         former, open_nodes, root, world = self.id, sorted(self._open_nodes.items()), self._root, self.world
         if world is not None:
             world.stop()
-        why = FailureValue(CONTINUED, f"the episode goes on in episode {episode_text(follow_up)}")
+        reason = FailureValue(CONTINUED, f"the episode continues in episode {episode_text(follow_up)}")
         for sequence, node in reversed(open_nodes):
-            if self._open_nodes.pop(sequence, None) is node:  # the collector may have ended it just now, in this thread
-                cut = NodeEnded(sequence, "INTERRUPTED", why)
-                self._put_end(cut if node.ended_ns is None else NodeEnded(sequence, "LOST"), "Episode")
-        self._put_end(NodeEnded(root, "INTERRUPTED", why), "Episode")
-        self._emitter.put(former, EpisodeEnded("INTERRUPTED", why, episode_text(follow_up)))
+            if self._open_nodes.pop(sequence, None) is node:  # the garbage collector may have just ended it
+                interrupted = NodeEnded(sequence, "INTERRUPTED", reason)
+                self._put_end(interrupted if node.ended_ns is None else NodeEnded(sequence, "LOST"), "Episode")
+        self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
+        self._emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up)))
         self.id = follow_up
         last = self._root = self._start(former, root)
         if world is not None:
@@ -324,11 +291,11 @@ class Episode:
                 continue
             try:
                 last = renumbered[sequence] = self.start_node(node, declared(node), continues=sequence)
-            except Exception as error:  # noqa: BLE001  the other nodes go on all the same
+            except Exception as error:  # noqa: BLE001  the other nodes continue nevertheless
                 self._emitter.note_fault("NodeStarted", error)
                 continue
-            node.record = node.record._replace(sequence=last, part=follow_up)
-        # A world or a tree so large that the follow-up begins near its end must not be continued for ever.
+            node.record = node.record._replace(sequence=last, episode_id=follow_up)
+        # The world and the tree may reach the limit at once; doubling it prevents an endless chain of follow-ups.
         self.continue_at = max(self._continue_at, 2 * last)
         if self.world is not None:
             self.world.continue_at = self.continue_at
@@ -342,20 +309,20 @@ class Episode:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _parent_of(self, above: TaskTreeNode | None) -> int:
-        return self._sequence_of(above) or self._root
+    def _parent_of(self, node: TaskTreeNode | None) -> int:
+        return self._sequence_of(node) or self._root
 
     def _sequence_of(self, node: TaskTreeNode | None) -> int | None:
-        """The nearest recorded node of this episode, from this one upwards."""
+        """Return the sequence of the node, or of its nearest ancestor recorded under the current id; else None."""
         while node is not None:
             record: NodeRecord | None = node.record
-            if record is not None and record.episode is self and record.part == self.id:
+            if record is not None and record.episode is self and record.episode_id == self.id:
                 return record.sequence
             node = node.parent
         return None
 
     def _note_parameters(self, declared: DeclaredType, missing: Mapping[str, str], *, may_refuse: bool) -> None:
-        """Count what is missing of a start. Raises `Unrecordable` for a parameter, if so chosen."""
+        """Count the missing values of a start. Raises `Unrecordable` if `may_refuse` and the settings ask for it."""
         parameters = [name for name in missing if name != ROBOT]
         if may_refuse and parameters and self._emitter.settings.on_unrecordable == "refuse":
             raise Unrecordable(declared.dtype, " and ".join(parameters), missing[parameters[0]])
@@ -365,12 +332,12 @@ class Episode:
     def _robot(self) -> RobotValue | None:
         if self.world is None:
             return None
-        if not self.in_its_world:
-            self._emitter.missing.note("Episode", "robot of a second world", "the episode records the first world")
+        if not self.acts_in_recorded_world:
+            self._emitter.missing.note("Episode", "robot of a second world", "the episode records only the first world")
             return None
         try:
             return self.world.robot()
-        except Exception as error:  # noqa: BLE001  the action itself is recorded all the same
+        except Exception as error:  # noqa: BLE001  the node is recorded without the robot's state
             self._emitter.note_fault("robot state", error)
             return None
 
@@ -386,26 +353,8 @@ class Episode:
             self._emitter.put(self.id, fit_node_end(event, self._emitter.settings.record_bytes_max))
 
 
-def _outcome(failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
-    """How an exception that leaves the episode is written: its status, and that of the root node."""
-    if failure is None:
-        return "SUCCEEDED", "SUCCEEDED"
-    if is_plan_failure(failure):
-        return "FAILED", "FAILED"
-    if isinstance(failure, asyncio.CancelledError | KeyboardInterrupt):
-        return "INTERRUPTED", "CANCELLED"
-    return "ERROR", "ERROR"
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # no entry for this uid, as in many containers
-        return "unknown"
-
-
 def current_task() -> asyncio.Task[Any] | None:
-    """The running task; None outside any loop."""
+    """Return the running asyncio task; None outside an event loop."""
     try:
         return asyncio.current_task()
     except RuntimeError:

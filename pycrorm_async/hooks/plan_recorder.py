@@ -1,8 +1,21 @@
-"""The memory as plans and worlds meet it: finds the episode an observation belongs to and hands it on.
+"""The `Recorder` receives what the plan and the world report and passes it to the episode it belongs to.
 
-A plan that runs without a memory runs with one. What reaches it, before `perform` runs, is the caller's choice alone:
-`SpoolFull` with `on_full="fail"`, `Unrecordable` and `DeclarationRefused` with `on_unrecordable="refuse"`. What cannot
-be recorded otherwise is recorded as missing, and every fault of ours is counted and stays here.
+Theory of operation. The plan layer and the world call the recorder synchronously, in the thread and context of the
+plan. `current_episode` holds the episode of a context. It is used only if it is open in this memory and if it is a
+simulation exactly when the context is in one, so that no simulated event gets into a real episode. A node that starts
+without an episode opens an implicit one, which ends with the node; that node's context then sees the implicit episode
+until the node ends.
+
+A plan that runs without a memory also runs with one, because the recorder catches and counts every exception of its
+own. Only the caller's settings let an exception reach a plan, and only before `perform` runs: `SpoolFull` with
+`on_full="fail"`; `Unrecordable` and `DeclarationRefused` with `on_unrecordable="refuse"`. Without these settings, a
+value that cannot be recorded is recorded as missing.
+
+`node_ended` may also run in a thread and context of the garbage collector, when it closes a plan that was dropped
+unfinished. So it resets `current_episode` only if the context still holds the node's episode, and it never starts a
+follow-up (see `episode`). `_continue` moves an episode to its follow-up. `_continuing` holds the former id meanwhile,
+so that another event cannot start a second move, and `_open` holds the episode under both ids, because `_open_episode`
+looks it up by its current id, which changes during the move.
 """
 
 from __future__ import annotations
@@ -22,7 +35,8 @@ from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.events.types import NodeReference
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
-from pycrorm_async.hooks.episode import Episode, EpisodeOpening, NodeRecord, current_task
+from pycrorm_async.hooks.episode import Episode, NodeRecord, current_task
+from pycrorm_async.hooks.episode_events import EpisodeOpening
 from pycrorm_async.hooks.sampler import Sampler
 from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
 from pycrorm_async.plan.execution.observer import Candidate, Seen, Thought, thinking
@@ -36,8 +50,10 @@ __all__ = ["Recorder", "current_episode"]
 
 _log = logging.getLogger("pycrorm_async")
 RECENT_MAX = 100
+"""Bounds the ids in `recent_episodes`, because a process may open any number of episodes."""
 
 current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
+"""The innermost episode opened in this context; it may be closed already."""
 
 
 class Recorder:
@@ -59,7 +75,7 @@ class Recorder:
         self._declarations = Declarations(strict=self._strict)
         self._sampler = _sampler_of(emitter)
         self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "dtype", "it")))
-        """Performs that were called outside any episode."""
+        """Performs called outside any episode."""
         self._open: dict[EpisodeId, Episode] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
         self.opened_count = 0
@@ -67,37 +83,40 @@ class Recorder:
         self._continuing: set[EpisodeId] = set()
 
     @property
-    def over(self) -> bool:
-        """Whether its memory is closed."""
-        return self._emitter.over
+    def is_closed(self) -> bool:
+        """Whether the memory is closed, or belongs to the process that forked this one."""
+        return self._emitter.is_closed
 
     # --- episodes ---------------------------------------------------------------------------------------------
 
     def open_episode(self, *, description: str, plan: str | None = None, seed: int | None = None) -> Episode:
-        """Begin an episode in this context; `close_episode` ends it. Refused if this task has one open already."""
-        open_here = self._open_here()
-        if open_here is not None and open_here.task is current_task():
+        """Open an episode in this context; `close_episode` ends it.
+
+        Raises `EpisodeRefused` if this task has an open episode, `CallerError` for an argument that does not fit.
+        """
+        open_episode = self._open_episode()
+        if open_episode is not None and open_episode.task is current_task():
             raise EpisodeRefused(
-                f"episode {open_here} is open in this task already: end it first, or open the second in its own task"
+                f"episode {open_episode} is open in this task already: end it first, or open the other in its own task"
             )
         _check_arguments(description=description, plan=plan, seed=seed, strict=self._strict)
-        return self._begin(description, plan=plan, seed=seed)
+        return self._start(description, plan=plan, seed=seed)
 
-    def _begin(self, description: str, *, plan: str | None = None, seed: int | None = None) -> Episode:
-        """An episode of what happens in this context, or is thought in it."""
-        thought, world = thinking.get(), current_world.get()
-        name = episode_id(self._clock.wall_ns(), self._randomness(10))
+    def _start(self, description: str, *, plan: str | None = None, seed: int | None = None) -> Episode:
+        """Start an episode; a simulation if this context is in one."""
+        simulation, world = thinking.get(), current_world.get()
+        new_id = episode_id(self._clock.wall_ns(), self._randomness(10))
         opening = EpisodeOpening(
             description,
             self._software,
             plan,
             seed,
             world.description if world else None,
-            simulated=thought is not None,
-            thought_by=_thinker(thought),
+            simulated=simulation is not None,
+            thought_by=_simulating_node(simulation),
         )
-        episode = Episode(self._emitter, name, opening)
-        self._open[name] = episode
+        episode = Episode(self._emitter, new_id, opening)
+        self._open[new_id] = episode
         self._note_opened(episode)
         if world is not None:
             self._enter(episode, world)
@@ -107,26 +126,26 @@ class Recorder:
         episode.enter_world(world, lambda: self._continue(episode))
 
     def _continue(self, episode: Episode) -> None:
-        """Go on with an episode that comes near its last sequence in a follow-up. A fault of ours is counted."""
-        if episode.id in self._continuing or self._emitter.over:
+        """Continue an episode that reached `continue_at` in a follow-up episode. Exceptions are counted, not raised."""
+        if episode.id in self._continuing or self._emitter.is_closed:
             return
-        former, name = episode.id, episode_id(self._clock.wall_ns(), self._randomness(10))
+        former, follow_up = episode.id, episode_id(self._clock.wall_ns(), self._randomness(10))
         self._continuing.add(former)
-        self._open[name] = episode
+        self._open[follow_up] = episode
         try:
             with self._sampler.renumbering(episode) if self._sampler is not None else nullcontext() as renumber:
-                renumbered = episode.continue_as(name, self._declared)
+                renumbered = episode.continue_as(follow_up, self._declared)
                 if renumber is not None:
                     renumber(renumbered)
-        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("EpisodeStarted", error)
         finally:
-            self._open.pop(former if episode.id == name else name, None)
+            self._open.pop(former if episode.id == follow_up else follow_up, None)
             self._continuing.discard(former)
-        if episode.id == name:
+        if episode.id == follow_up:
             self.continued_count += 1
             self._note_opened(episode)
-            _log.info("episode %s came near its last sequence and goes on in episode %s", episode_text(former), episode)
+            _log.info("episode %s reached its event limit and continues in episode %s", episode_text(former), episode)
 
     def _declared(self, node: TaskTreeNode) -> DeclaredType:
         assert node.designator is not None
@@ -138,111 +157,113 @@ class Recorder:
             self.opened_count += 1
 
     def close_episode(self, episode: Episode, failure: BaseException | None) -> None:
-        """Its last event. A fault of ours is counted, not raised."""
-        if self._emitter.over:
+        """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
+        if self._emitter.is_closed:
             return
         self._open.pop(episode.id, None)
         try:
             if self._sampler is not None:
-                self._sampler.drop(episode)
+                self._sampler.stop_episode(episode)
             episode.end(failure)
-        except Exception as error:  # noqa: BLE001  the plan's own outcome matters more
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not replace the plan's outcome
             self._emitter.note_fault("EpisodeEnded", error)
 
     @property
     def samples_left_out(self) -> int:
-        """How many samples of the robot's state the spool had no room for."""
-        return self._sampler.left_out if self._sampler is not None else 0
+        """The number of samples omitted because the spool or the episode had no room."""
+        return self._sampler.omitted if self._sampler is not None else 0
 
     def close(self) -> None:
-        """The memory is over, and so is the sampling."""
+        """Stop the sampler and report performs that were never awaited."""
         self.calls.close()
         if self._sampler is not None:
             self._sampler.close()
 
     @property
     def open_episodes(self) -> tuple[Episode, ...]:
-        """Those that have begun and not ended, oldest first."""
+        """The open episodes, oldest first."""
         return tuple(self._open.values())
 
     @property
     def recent_episodes(self) -> tuple[str, ...]:
-        """The ids of the last hundred that were opened, also of those that have ended."""
+        """The ids of the last 100 episodes opened, including ended ones, without simulations."""
         return tuple(map(episode_text, self._recent))
 
-    def _open_here(self) -> Episode | None:
-        """The open episode of this memory in this context; never that of a thought where things happen."""
+    def _open_episode(self) -> Episode | None:
+        """Return the open episode of this memory in this context; None if only one of the two is a simulation."""
         episode = current_episode.get()
         if episode is None or episode.closed or episode.id not in self._open:
             return None
         return episode if episode.simulated is (thinking.get() is not None) else None
 
-    # --- the plan layer's port ----------------------------------------------------------------------------------
+    # --- the port of the plan layer ----------------------------------------------------------------------------------
 
     def admit(self) -> Awaitable[None] | None:
-        if self._emitter.over or not self._emitter.sink.full:
+        if self._emitter.is_closed or not self._emitter.sink.full:
             return None
         if self._emitter.settings.on_full == "fail":
-            raise SpoolFull("the spool is full (spool_bytes_max) and on_full is 'fail': start a writer or make room")
+            raise SpoolFull("the spool is full (spool_bytes_max) and on_full is 'fail': start a writer to drain it")
         return self._emitter.sink.room()
 
     def node_started(self, node: TaskTreeNode) -> None:
-        if self._emitter.over:
+        if self._emitter.is_closed:
             return
         assert node.designator is not None
-        before = current_episode.get()
+        outer_episode = current_episode.get()
         implicit: Episode | None = None
         try:
             declared = self._declarations.of(type(node.designator), self._declare)
-            episode = self._open_here()
+            episode = self._open_episode()
             if episode is None:
-                name = declared.dtype
-                episode = implicit = self.open_episode(description=name, plan=name)
+                dtype = declared.dtype
+                episode = implicit = self.open_episode(description=dtype, plan=dtype)
             sequence = episode.start_node(node, declared)
         except (Unrecordable, DeclarationRefused) as refused:
             if implicit is not None:
                 self.close_episode(implicit, refused)
             raise
-        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("NodeStarted", error)
             if implicit is not None:
                 self.close_episode(implicit, error)
         else:
-            node.record = NodeRecord(episode, sequence, implicit is not None, before, episode.id)
+            node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode, episode.id)
             if implicit is not None:
                 current_episode.set(implicit)
             if declared.fault is not None:
                 self._emitter.missing.note(declared.dtype, "type", declared.fault)
-            if self._sampler is not None and node.kind == "motion" and episode.in_its_world:
+            if self._sampler is not None and node.kind == "motion" and episode.acts_in_recorded_world:
                 self._sample(self._sampler.begin, node.record)
             if sequence >= episode.continue_at:
                 self._continue(episode)
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
-        if record is None or self._emitter.over:
+        if record is None or self._emitter.is_closed:
             return
         if self._sampler is not None and node.kind == "motion":
             self._sample(self._sampler.end, record)
         try:
             record.episode.end_node(node)
-        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("NodeEnded", error)
         if record.implicit:
             self.close_episode(record.episode, node.failure)
-            if current_episode.get() is record.episode:  # a dropped plan is closed in whatever context drops it
-                current_episode.set(record.before)
+            if current_episode.get() is record.episode:  # the garbage collector may close the plan in another context
+                current_episode.set(record.outer_episode)
 
     def location_resolved(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
         node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
-        episode = self._open_here()
-        if episode is None or self._emitter.over:
+        episode = self._open_episode()
+        if episode is None or self._emitter.is_closed:
             return
         try:
-            sequence = episode.locate(location=location, offered=offered, taken=taken, considered=considered, node=node)
-        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            sequence = episode.record_location(
+                location=location, offered=offered, taken=taken, considered=considered, node=node
+            )
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("LocationResolved", error)
         else:
             if sequence >= episode.continue_at:
@@ -252,61 +273,63 @@ class Recorder:
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
         node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
-        episode = self._open_here()
-        if episode is None or self._emitter.over:
+        episode = self._open_episode()
+        if episode is None or self._emitter.is_closed:
             return
         try:
-            sequence = episode.detect(source=source, object_type=object_type, seen=seen, node=node)
-        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            sequence = episode.record_detection(source=source, object_type=object_type, seen=seen, node=node)
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("ObjectDetected", error)
         else:
             if sequence >= episode.continue_at:
                 self._continue(episode)
 
     def thought_began(self, thought: Thought) -> None:
-        if self._emitter.over:
+        if self._emitter.is_closed:
             return
-        before = current_episode.get()
-        thought.record = record = _ThoughtRecord(before.naming(thought.by) if before is not None else None, before)
+        outer = current_episode.get()
+        thought.record = record = _SimulationRecord(
+            outer.node_reference(thought.by) if outer is not None else None, outer
+        )
         try:
-            record.episode = self._begin(_description_of(thought))
-        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            record.episode = self._start(_description_of(thought))
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("EpisodeStarted", error)
-        # None, if it could not begin: what is only thought never gets into the episode around it.
+        # None if the episode could not start, so that no simulated event gets into the outer episode.
         current_episode.set(record.episode)
 
     def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
-        record: _ThoughtRecord | None = thought.record
+        record: _SimulationRecord | None = thought.record
         if record is None:
             return
         if record.episode is not None:
             self.close_episode(record.episode, failure)
-        if current_episode.get() is record.episode:  # a dropped plan is closed in whatever context drops it
-            current_episode.set(record.before)
+        if current_episode.get() is record.episode:  # the garbage collector may close the plan in another context
+            current_episode.set(record.outer_episode)
 
-    def _sample(self, do: Callable[[Episode, int], None], record: NodeRecord) -> None:
+    def _sample(self, step: Callable[[Episode, int], None], record: NodeRecord) -> None:
         try:
-            do(record.episode, record.sequence)
-        except Exception as error:  # noqa: BLE001  a fault of ours never reaches a plan
+            step(record.episode, record.sequence)
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("StateSampled", error)
 
     def _declare(self, declared: DeclaredType) -> None:
         kind = type(declared.declaration)
         self._emitter.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
 
-    # --- the world's port ---------------------------------------------------------------------------------------
+    # --- the port of the world ---------------------------------------------------------------------------------------
 
     def world_entered(self, world: BulletWorld) -> None:
-        episode = self._open_here()
-        if episode is None or self._emitter.over:
+        episode = self._open_episode()
+        if episode is None or self._emitter.is_closed:
             return
         try:
             self._enter(episode, world)
-        except Exception as error:  # noqa: BLE001  a fault of ours never keeps a world from being entered
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not prevent entering a world
             self._emitter.note_fault("entering a world", error)
 
     def world_left(self, world: BulletWorld) -> None:
-        episode = self._open_here()
+        episode = self._open_episode()
         if episode is not None:
             episode.leave_world(world, emptied=True)
 
@@ -318,38 +341,38 @@ def _sampler_of(emitter: Emitter) -> Sampler | None:
     return Sampler(emitter, interval_ms=settings.sample_interval_ms, change_min=settings.sample_change_min)
 
 
-class _ThoughtRecord:
-    """What the memory keeps at a thought.
+class _SimulationRecord:
+    """The hooks' record of a running simulation.
 
     Attributes:
-        thinker: the node in which it is thought; None where nothing was recorded around it.
-        before: the current episode of the context when it began.
-        episode: its own; None if it could not begin.
+        node: the node that runs the simulation; None outside any recorded episode.
+        outer_episode: the current episode of the context before the simulation began.
+        episode: the simulation's own episode; None if it could not start.
     """
 
-    def __init__(self, thinker: NodeReference | None, before: Episode | None) -> None:
-        self.thinker = thinker
-        self.before = before
+    def __init__(self, node: NodeReference | None, outer_episode: Episode | None) -> None:
+        self.node = node
+        self.outer_episode = outer_episode
         self.episode: Episode | None = None
 
 
-def _thinker(thought: Thought | None) -> NodeReference | None:
-    record = thought.record if thought is not None else None
-    return record.thinker if isinstance(record, _ThoughtRecord) else None
+def _simulating_node(simulation: Thought | None) -> NodeReference | None:
+    record = simulation.record if simulation is not None else None
+    return record.node if isinstance(record, _SimulationRecord) else None
 
 
 def _description_of(thought: Thought) -> str:
     if thought.description is not None:
         return thought.description[:EPISODE_TEXT_MAX]
     if thought.by is not None and thought.by.designator is not None:
-        return f"thinking in {thought.by.designator.dtype}"
-    return "thinking"
+        return f"simulation in {thought.by.designator.dtype}"
+    return "simulation"
 
 
 def _check_arguments(*, description: object, plan: object, seed: object, strict: bool) -> None:
-    """What an episode is opened with must fit its columns. Raises `CallerError` naming the argument.
+    """Check that an episode's arguments fit its columns. Raises `CallerError` naming the argument.
 
-    A text that is too long is cut, and in strict mode refused.
+    In strict mode a text that is too long is refused; otherwise it is cut later.
     """
     for name, text in (("plan", plan), ("description", description)):
         if text is not None and not (isinstance(text, str) and (len(text) <= EPISODE_TEXT_MAX or not strict)):

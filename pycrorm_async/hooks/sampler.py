@@ -1,13 +1,20 @@
-"""Samples the robot's state while its motions run, in a thread of its own: a plan that never suspends starves a task.
+"""The `Sampler` records the robot's state while motions run.
 
-Of each motion a sample is taken when it starts, every interval while it runs, and when it ends. The first and the last
-hold all channels that differ from what was written before, those between only what changed by more than the margin;
-a sample that would hold nothing is not written. So the last values before a moment are the state at that moment, up to
-the margin, and the state a motion ended in is exact.
+Theory of operation. The sampler takes a sample of each motion when it starts, every `interval_ms` while it runs, and
+when it ends. The first and the last sample hold all channels that differ from the values written before; a sample in
+between holds the channels that changed by more than `change_min`; an empty sample is not written. So the last values
+before a moment are the state at that moment, up to `change_min`, and the state at the end of a motion is exact.
 
-Sampling reads values that the world keeps in Python and never Bullet, which belongs to the plan's thread. It waits for
-nothing: where the spool has no ordinary room a sample is left out and counted, and the next one holds what changed
-since the last that was written.
+Periodic samples are taken by a thread, because a plan that never suspends would starve a task. The thread starts with
+the first motion, sleeps while no motion runs, and ends at `close`. The first and the last sample are taken in the
+plan's thread, by `begin` and `end`. The thread reads only values that the world keeps in Python, never Bullet, which
+belongs to the plan's thread. It never waits for room: if the spool has none without its reserve, the sample is counted
+in `omitted`, and the next one holds all changes since the last written sample.
+
+One condition variable guards the running motions. All samples are taken while it is held, so no sample follows the end
+of its motion, and `renumbering` keeps samples out while an episode moves to a follow-up. Its lock is reentrant, because
+the garbage collector may close a dropped plan, and so call `end`, in a thread that holds the lock. Therefore `_sample`
+checks `is_over` again after it has read the channels.
 """
 
 from __future__ import annotations
@@ -26,7 +33,11 @@ __all__ = ["Sampler"]
 
 
 class _Motion:
-    """One that runs: its node, and what was written of its robot since it started, or before."""
+    """A running motion: its node, and the values last written of its robot's channels.
+
+    `is_full` is set once a sample reached the episode's `continue_at`; then only the last sample of the motion is
+    still taken, to save sequences until the episode continues in a follow-up.
+    """
 
     def __init__(self, episode: Episode, node: int) -> None:
         self.episode = episode
@@ -34,33 +45,30 @@ class _Motion:
         self.robot: Object | None = None
         self.written: dict[str, float] = {}
         self.is_full = False
-        """Whether its episode is to be continued first: samples between its first and its last are left out."""
-        self.over = False
+        self.is_over = False
 
 
 class Sampler:
-    """The sampler of one memory. Its thread starts with the first motion, sleeps while none runs, ends at `close`.
-
-    `begin` and `end` are called in the thread of the plan. No sample of a motion is written after its `end`.
+    """Samples the robot's state for one memory.
 
     Attributes:
-        left_out: how many samples the spool, or the episode, had no room for.
+        omitted: number of samples not written because the spool or the episode had no room.
     """
 
     def __init__(self, emitter: Emitter, *, interval_ms: int, change_min: float) -> None:
         self._emitter = emitter
         self._interval_s = interval_ms / 1000
         self._change_min = change_min
-        # The collector may close a dropped plan while this thread holds the lock, so it must be one it can take again.
+        # The garbage collector may call `end` in a thread that holds the lock; a plain lock would deadlock there.
         self._changed = threading.Condition(threading.RLock())
         self._running: dict[tuple[Episode, int], _Motion] = {}
         self._thread: threading.Thread | None = None
         self._asleep = False
         self._closed = False
-        self.left_out = 0
+        self.omitted = 0
 
     def begin(self, episode: Episode, node: int) -> None:
-        """The motion of that node has started; nothing is done for one without a robot."""
+        """Start sampling the motion of this node; do nothing without a robot."""
         if episode.world is None or episode.world.world.robot is None:
             return
         with self._changed:
@@ -76,24 +84,24 @@ class Sampler:
                 self._changed.notify()
 
     def end(self, episode: Episode, node: int) -> None:
-        """It is over, and its end not yet written."""
+        """Take the last sample of the motion. The caller writes the node's end afterwards."""
         with self._changed:
             motion = self._running.pop((episode, node), None)
             if motion is not None:
                 self._sample(motion, margin=0.0)
-                motion.over = True
+                motion.is_over = True
 
-    def drop(self, episode: Episode) -> None:
-        """The episode is over, and motions that outlive it are out of its sight."""
+    def stop_episode(self, episode: Episode) -> None:
+        """Stop sampling all motions of an episode, before the episode ends."""
         with self._changed:
             for key in [key for key in self._running if key[0] is episode]:
-                self._running.pop(key).over = True
+                self._running.pop(key).is_over = True
 
     @contextmanager
     def renumbering(self, episode: Episode) -> Iterator[Callable[[Mapping[int, int]], None]]:
-        """Take no sample while the episode is continued; give a function that takes the new sequences of its nodes.
+        """Take no sample while the episode moves to a follow-up; yield a function for the new sequences of its nodes.
 
-        The first sample afterwards holds all channels, because samples are told by what their own episode holds.
+        The next sample of each motion holds all channels, because the follow-up must not depend on the former episode.
         """
         with self._changed:
             yield lambda renumbered: self._renumber(episode, renumbered)
@@ -103,13 +111,13 @@ class Sampler:
             motion = self._running.pop(key)
             node = renumbered.get(motion.node)
             if node is None:
-                motion.over = True
+                motion.is_over = True
                 continue
             motion.node, motion.robot, motion.is_full = node, None, False
             self._running[episode, node] = motion
 
     def close(self) -> None:
-        """No sample is taken any more; waits for the thread."""
+        """Stop sampling, and wait until the thread has ended."""
         with self._changed:
             self._closed = True
             self._running.clear()
@@ -130,42 +138,42 @@ class Sampler:
                 self._changed.wait(self._interval_s)
                 for motion in tuple(self._running.values()):
                     if motion.is_full:
-                        self.left_out += 1
+                        self.omitted += 1
                         continue
                     try:
                         self._sample(motion, margin=self._change_min)
-                    except Exception as error:  # noqa: BLE001  the next sample may be taken all the same
+                    except Exception as error:  # noqa: BLE001  one failed sample must not end the thread
                         self._emitter.note_fault("StateSampled", error)
 
     def _sample(self, motion: _Motion, *, margin: float) -> None:
-        seen = motion.episode.world
-        robot = seen.world.robot if seen is not None else None
-        reference = seen.reference(robot) if seen is not None and robot is not None else None
-        if seen is None or robot is None or reference is None:
+        recorded_world = motion.episode.world
+        robot = recorded_world.world.robot if recorded_world is not None else None
+        reference = recorded_world.reference(robot) if recorded_world is not None and robot is not None else None
+        if recorded_world is None or robot is None or reference is None:
             return
         if robot is not motion.robot:
-            motion.robot, motion.written = robot, dict(seen.sampled.get(robot, {}))
-        before = motion.written
+            motion.robot, motion.written = robot, dict(recorded_world.sampled.get(robot, {}))
+        written = motion.written
         changed = {
             channel: value
             for channel, value in _channels(robot).items()
-            if channel not in before or abs(value - before[channel]) > margin
+            if channel not in written or abs(value - written[channel]) > margin
         }
-        # The collector may have ended the motion just now, in this very thread.
-        if not changed or motion.over or self._emitter.over:
+        # The garbage collector may have ended the motion in this thread since the channels were read.
+        if not changed or motion.is_over or self._emitter.is_closed:
             return
         try:
             sequence = self._emitter.offer(motion.episode.id, StateSampled(reference, changed, motion.node))
         except (SpoolFull, SpoolStuck):
-            self.left_out += 1
+            self.omitted += 1
             return
         motion.is_full = sequence >= motion.episode.continue_at
-        before.update(changed)
-        seen.sampled.setdefault(robot, {}).update(changed)
+        written.update(changed)
+        recorded_world.sampled.setdefault(robot, {}).update(changed)
 
 
 def _channels(robot: Object) -> dict[str, float]:
-    """Base pose and joints as they were set last. Each is read at once, also while another thread sets it."""
+    """Read base pose and joints as last set. Each read is atomic, even while another thread sets the value."""
     pose = robot.pose
     x, y, z = pose.position
     qx, qy, qz, qw = pose.orientation

@@ -1,7 +1,18 @@
-"""Turns the changes of one world into events of one episode, and knows which row of each object is in force.
+"""The `WorldRecorder` turns changes of one world into events of one episode and keeps each object's current row.
 
-An object's identity is the sequence of its `ObjectAdded`; its row in force that of its latest `ObjectAdded` or
-`ObjectMoved`. Nothing here raises: the world's setters never fail because of a memory.
+Theory of operation. The world calls its observer synchronously from its setters, in the thread of the plan. Each call
+builds one event and puts it into the queue at once, so the values are those of that moment and the events have the
+order of the changes. The sequence of an object's `ObjectAdded` identifies the object; the sequence of its latest
+`ObjectAdded` or `ObjectMoved` is its current row. `_references` holds both for every object of the world.
+
+A setter must not fail because of a memory, so `_put` catches and counts every exception; the object then keeps its
+former row. An object whose `ObjectAdded` failed has no row, and its later changes are not recorded, because an event
+that names an object without a row would be damage.
+
+The recorder starts with `ObjectAdded` and `ObjectAttached` for the present state of the world. `continue_at` is out of
+reach meanwhile, and while `empty` removes the objects, because a follow-up episode would start with the state of a
+world that is incomplete. Otherwise a change whose sequence reaches `continue_at` calls `continue_` after it has been
+recorded; that replaces this recorder by one for the follow-up.
 """
 
 from __future__ import annotations
@@ -37,12 +48,14 @@ __all__ = ["WorldRecorder"]
 
 
 class WorldRecorder:
-    """The observer of one world for one episode; begins with `ObjectAdded` for all that is there.
+    """Observes one world for one episode; the constructor records the present state of the world.
 
     Attributes:
-        sampled: by robot, what the episode's samples of its state said last, channel by channel.
-        last: the sequence of what it recorded last.
-        continue_at: a change that gets this sequence, or a later one, calls `continue_`.
+        world: the observed world.
+        sampled: for each robot, the last sampled value of each channel in this episode.
+        last: sequence of the last event it recorded; 0 before the first.
+        continue_at: the first sequence at which a change calls `continue_`.
+        continue_: moves the episode to a follow-up.
     """
 
     def __init__(
@@ -50,7 +63,7 @@ class WorldRecorder:
     ) -> None:
         self.world = world
         self.last = 0
-        self.continue_at = sys.maxsize  # not before all that is there was recorded
+        self.continue_at = sys.maxsize  # no follow-up before the present state is recorded
         self.continue_ = continue_
         self.sampled: dict[Object, dict[str, float]] = {}
         self._emitter = emitter
@@ -65,25 +78,25 @@ class WorldRecorder:
         world.observe(self)
 
     def empty(self) -> None:
-        """The world is gone, and so is all that was in it."""
-        self.continue_at = sys.maxsize  # a follow-up would begin with what is being removed
+        """Record that all objects were removed, because the world was closed."""
+        self.continue_at = sys.maxsize  # a follow-up would start with objects that are being removed
         for each in tuple(self._references):
             self.object_removed(each)
 
     def stop(self) -> None:
-        """Look no longer; references stay readable."""
+        """Stop observing the world; `reference` still works."""
         self.world.unobserve(self)
 
     def reference(self, world_object: Object) -> ObjectReference | None:
-        """The row in force of this object, or of what stands for it in this world; None if there is nothing."""
-        found = self._references.get(world_object)
-        if found is None and world_object.world is not self.world and related(world_object.world, self.world):
-            here = counterpart(world_object, self.world)
-            found = self._references.get(here) if here is not None else None
-        return found
+        """Return the current row of this object, or of its counterpart if it is in a copy of this world; else None."""
+        row = self._references.get(world_object)
+        if row is None and world_object.world is not self.world and related(world_object.world, self.world):
+            local_object = counterpart(world_object, self.world)
+            row = self._references.get(local_object) if local_object is not None else None
+        return row
 
     def robot(self) -> RobotValue | None:
-        """Base pose and torso height of the robot now; None without a robot."""
+        """Return the robot's current base pose and torso height; None without a robot."""
         robot = self.world.robot
         if robot is None:
             return None
@@ -150,31 +163,33 @@ class WorldRecorder:
         return (first, second) if first is not None and second is not None else None
 
     def _node(self) -> int | None:
-        """The node that caused the change: the innermost recorded one of this context, if it is of this episode."""
+        """Return the node that caused a change: the context's innermost recorded node, if this episode recorded it."""
         node = current_node.get()
         while node is not None and node.record is None:
             node = node.parent
-        if node is not None and node.record.part == self._episode:
+        if node is not None and node.record.episode_id == self._episode:
             sequence: int = node.record.sequence
             return sequence
         return None
 
-    def _put(self, made: Callable[[], Happening], *, row_of: Object | None = None, identity: int | None = None) -> None:
-        """Make the event and record it; a fault is counted, and the world's setter goes on.
+    def _put(
+        self, build: Callable[[], Happening], *, row_of: Object | None = None, identity: int | None = None
+    ) -> None:
+        """Build and record an event. Exceptions are counted, so that the world's setter succeeds.
 
-        The event is the row in force of the object `row_of`, whose identity is this one, or the event itself.
+        The event becomes the current row of the object `row_of`, and its identity too if `identity` is None.
         """
-        if self._emitter.over:
+        if self._emitter.is_closed:
             return
         try:
-            event = made()
+            event = build()
             try:
                 sequence = self._emitter.put(self._episode, event)
             except NotEncodable as unencodable:
                 self._emitter.missing.note(type(event).__name__, "value", str(unencodable))
                 sequence = self._emitter.put(self._episode, clean_texts(event))
             self.last = sequence
-        except Exception as error:  # noqa: BLE001  a world's setter never fails because of a memory
+        except Exception as error:  # noqa: BLE001  a setter of the world must not fail because of a memory
             self._emitter.note_fault("a change of the world", error)
             return
         if row_of is not None:

@@ -138,7 +138,7 @@ async def test_a_node_that_was_open_is_started_again_under_its_parent_and_names_
     assert no_faults(rig)
     first, second = parts_of(rig.sink)
     # The 88th event starts a note. What is open is cut, innermost first, and begins again, outermost first.
-    why = f"the episode goes on in episode {episode_text(list(rig.sink.sequences)[1])}"
+    why = f"the episode continues in episode {episode_text(list(rig.sink.sequences)[1])}"
     assert [sequence for sequence, _ in first][-5:] == [88, 89, 90, 91, 92]
     assert [event.node for _, event in first[-4:] if isinstance(event, NodeEnded)] == [88, 3, 2]
     assert {event.failure.message for _, event in first[-4:] if isinstance(event, NodeEnded) and event.failure} == {why}

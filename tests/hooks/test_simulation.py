@@ -89,7 +89,7 @@ async def test_a_thought_is_an_episode_that_names_the_node_that_thinks() -> None
     ]
     beginning = started(rig, thought)
     assert beginning.thought_by == NodeReference(episode_text(real.id), 3)
-    assert beginning.description == "thinking in ThinkAction"
+    assert beginning.description == "simulation in ThinkAction"
     assert [each.parameters.get("text") for each in only(rig.sink.of(thought), NodeStarted)] == [None, "thought"]
     assert only(rig.sink.of(thought), EpisodeEnded)[0].status == "SUCCEEDED"
 
@@ -104,7 +104,7 @@ async def test_a_thought_outside_any_node_is_thought_by_the_root_and_without_an_
     first, second = thoughts(rig)
     assert started(rig, first).thought_by == NodeReference(episode_text(real.id), 2)
     assert started(rig, first).description == "what if"
-    assert (started(rig, second).thought_by, started(rig, second).description) == (None, "thinking")
+    assert (started(rig, second).thought_by, started(rig, second).description) == (None, "simulation")
     assert len(rig.sink.sequences) == 3
 
 

@@ -183,7 +183,7 @@ async def test_a_thought_whose_process_is_killed_is_lost_with_the_episode_around
         found = await reading.episodes(simulated=True)
         assert [(each.description, each.status, each.simulated) for each in found] == [
             ("killed", "LOST", False),
-            ("thinking", "LOST", True),
+            ("simulation", "LOST", True),
         ]
         assert await texts(reading) == ["real"]
 
