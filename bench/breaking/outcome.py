@@ -81,3 +81,9 @@ class Outcome:
             last[episode] = sequence
         if (self.lost, self.duplicated, self.misordered, self.changed) != before:
             self.rounds_failed.append(self.rounds)
+
+    def note_changed(self, count: int) -> None:
+        """Add to `changed` of the round that was compared last, which failed if this is not 0."""
+        self.changed += count
+        if count and self.rounds not in self.rounds_failed:
+            self.rounds_failed.append(self.rounds)

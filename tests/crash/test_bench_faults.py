@@ -5,23 +5,28 @@ And it can tell: where the product is broken by hand, the counts rise.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import random
 import re
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from bench.breaking import databases, files
+from bench.breaking import databases, files, restores
 from bench.breaking.outcome import Outcome, Step
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.operations.destination import LogAndTables
+from pycrorm_async.projections.verify.verify import Verified, verify
 from pycrorm_async.queue import RecorderQueue, RecoveredQueue
 from pycrorm_async.store.log import EventLog
+from tests.backups import Backup
 
 ROOT = Path(__file__).parents[2]
 FAULTS = [
@@ -196,3 +201,42 @@ def test_a_log_that_says_it_has_what_it_has_not_is_seen(tmp_path: Path, monkeypa
     monkeypatch.setattr(EventLog, "append", forgetful)
     outcome = databases.locked_files(2, random.Random(1), tmp_path, lambda: None)
     assert (outcome.events, outcome.lost) == (800, 1)
+
+
+IN_AN_EPISODE = 0
+"""The seed of a round in which the database goes back in the middle of an episode."""
+
+
+@pytest.fixture
+def only_flushes_fold(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(restores, "_SETTINGS", replace(restores._SETTINGS, idle_ms=60_000))
+
+
+@pytest.mark.usefixtures("only_flushes_fold")
+def test_a_round_is_verified_while_none_of_its_events_is_on_its_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def verify_later(log: EventLog) -> Verified:
+        await asyncio.sleep(0.3)  # six times what an event needs to be stored
+        return await verify(log)
+
+    monkeypatch.setattr(restores, "verify", verify_later)
+    outcome = restores.restored_servers(1, random.Random(IN_AN_EPISODE), tmp_path, lambda: None)
+    assert (outcome.rounds, outcome.changed, outcome.rounds_failed) == (1, 0, [])
+
+
+@pytest.mark.usefixtures("only_flushes_fold")
+def test_a_flush_that_folds_nothing_after_a_restore_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    restore = Backup.restore
+
+    async def fold_nothing(_: LogAndTables) -> int:
+        return 0
+
+    def restore_and_break(backup: Backup) -> None:
+        restore(backup)
+        monkeypatch.setattr(LogAndTables, "fold", fold_nothing)
+
+    monkeypatch.setattr(Backup, "restore", restore_and_break)
+    outcome = restores.restored_servers(1, random.Random(IN_AN_EPISODE), tmp_path, lambda: None)
+    assert outcome.changed > 0
+    assert outcome.rounds_failed == [1]
