@@ -31,7 +31,7 @@ from sqlalchemy import func, select
 from bench.material.spooled import spool_rollouts
 from bench.reporting.figures import console, spread
 from pycrorm_async import Memory, Reading, UserView
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Object, PickUpAction, PickUpWithContextView, Pose, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.query.experience import PickUpExperience

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pycrorm_async.errors import PycrormError
     from pycrorm_async.memory import Memory, MemoryStatus
-    from pycrorm_async.operations.destination import recover
+    from pycrorm_async.operations.recovery import recover
     from pycrorm_async.projections.custom.projection import Projection
     from pycrorm_async.projections.schema.user_views import UserView
     from pycrorm_async.query.reading import Reading
@@ -35,7 +35,7 @@ _HOMES = {
     "Reading": "query.reading",
     "Settings": "settings",
     "UserView": "projections.schema.user_views",
-    "recover": "operations.destination",
+    "recover": "operations.recovery",
 }
 
 

@@ -41,7 +41,8 @@ from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.memory_parts import Parts
 from pycrorm_async.memory_status import MemoryStatus
-from pycrorm_async.operations.destination import dead_queues, expected_log, open_destination
+from pycrorm_async.operations.destination import expected_log, open_destination
+from pycrorm_async.operations.recovery import dead_queues
 from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.projections.custom.discovery import checked
 from pycrorm_async.projections.custom.projection import Projection

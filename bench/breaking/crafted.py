@@ -12,7 +12,7 @@ from pathlib import Path
 from bench.breaking.files import ROOMY, events_of
 from bench.breaking.outcome import Outcome, Step
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from pycrorm_async.queue.maintenance.repair import repair_folder

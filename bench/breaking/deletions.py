@@ -20,7 +20,7 @@ from typing import Final
 from bench.breaking.outcome import Event, Outcome, Step
 from bench.breaking.robots import Walked, walk
 from bench.breaking.speaking import Speaker
-from pycrorm_async.operations.destination import rebind, recover
+from pycrorm_async.operations.recovery import rebind, recover
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask

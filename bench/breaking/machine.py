@@ -22,7 +22,7 @@ from bench.breaking.images import NOT_MADE, DiskImage
 from bench.breaking.outcome import Outcome, Step
 from bench.breaking.robots import Walked, compare_steps, walk
 from bench.breaking.speaking import Speaker
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 
 __all__ = ["power_cuts"]
 

@@ -20,7 +20,7 @@ from bench.breaking.outcome import Event, Outcome, Step
 from bench.breaking.speaking import Speaker
 from pycrorm_async import Memory
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.settings import Writer
 from tests.crash.step_robot import SETTINGS, StepActionPerformable, say
 from tests.databases import Server, ask

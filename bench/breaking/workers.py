@@ -19,8 +19,8 @@ from bench.breaking.outcome import Outcome, Step
 from bench.breaking.robots import Walked, compare_steps, walk
 from bench.breaking.speaking import Speaker
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.destination import recover
 from pycrorm_async.operations.fold_workers import DaemonNote
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pycrorm_async.cli.output import note
-from pycrorm_async.operations.destination import pending_recorders
+from pycrorm_async.operations.recovery import pending_recorders
 from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["note_what_waits"]

@@ -22,8 +22,8 @@ from pycrorm_async.cli.options import (
 from pycrorm_async.cli.output import moment, note, print_facts, print_json, print_table, problem, stdout
 from pycrorm_async.cli.writer import store_once
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.operations import destination
-from pycrorm_async.operations.destination import Rebinding
+from pycrorm_async.operations import recovery
+from pycrorm_async.operations.recovery import Rebinding
 from pycrorm_async.projections.custom.discovery import named
 from pycrorm_async.queue.files.names import REFUSED
 from pycrorm_async.queue.files.recorder_folder import fault_in
@@ -114,7 +114,7 @@ def rebind(
     --once`.
     """
     projections, settings = named(projection or ()), Settings(file_access=file_access)
-    done = asyncio.run(destination.rebind(url, spool=spool, settings=settings, say=_say_rebinding))
+    done = asyncio.run(recovery.rebind(url, spool=spool, settings=settings, say=_say_rebinding))
     beside = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
     return store_once(url, spool, projections, settings, as_json=as_json, beside=beside)
 

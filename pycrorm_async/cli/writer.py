@@ -26,9 +26,9 @@ from pycrorm_async.cli.options import (
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
 from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.destination import RecoveryReport, recover
 from pycrorm_async.operations.fold_process import FoldProcess, forked
 from pycrorm_async.operations.fold_workers import WORKERS
+from pycrorm_async.operations.recovery import RecoveryReport, recover
 from pycrorm_async.projections.custom.discovery import named
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.settings import Settings

@@ -22,7 +22,7 @@ from pycrorm_async.learning.rollouts.recorded_rollouts import tally_of
 from pycrorm_async.learning.rollouts.rollout_pool import AT_ONCE, Job, Place, Workers
 from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.world.enums import Arms, Grasp
 

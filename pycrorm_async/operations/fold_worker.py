@@ -136,7 +136,7 @@ class _Fold:
             self._log = await self._same_log()
         if self._projector is None:
             ours = self._assignment.projections
-            projector = Projector(self._log, projections=ours, found=installed_besides(ours))
+            projector = Projector(self._log, projections=ours, installed=installed_besides(ours))
             await projector.open()
             self._projector = projector
         return self._projector

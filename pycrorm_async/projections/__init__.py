@@ -1,11 +1,12 @@
-"""What it means: the log's events folded into tables that people ask.
+"""Fold the log's events into the tables that queries read.
 
     log ──▶ fold ──▶ rows ──▶ projector ──▶ tables of a generation ──▶ public views ──▶ orm, query
 
-`tables` lists the tables, `layout` what designator types add to them, `public` the views in front of them, `views`
-those that users register. `fold` is pure: events in, rows out. `generations` makes the tables, `projector` fills them:
-rows and progress in one transaction. Everything here can be thrown away and made again from the log.
+`schema` defines tables, columns and views and creates them; `fold` turns events into rows and is pure; `run` writes
+the rows of a batch together with its checkpoints, in one transaction; `projector` keeps the visible tables up to date;
+`rebuild` and `verify` fold the log again, to replace the tables or to compare them; `custom` does all of this for
+projections that users write. Every table here can be dropped and rebuilt from the log.
 
-A table `pose` is stored as `pose__1`, in generation 1; `pose` itself is a view. A rebuild fills `pose__2` beside it and
-then only the views change.
+The table `pose` is stored as `pose__1`, in generation 1, and `pose` itself is a view. A rebuild fills `pose__2` next to
+it and then replaces the views.
 """

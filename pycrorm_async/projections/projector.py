@@ -1,4 +1,4 @@
-"""Keeps the tables that people see up to date with the log.
+"""Keep the visible tables up to date with the log.
 
 projector = Projector(log)
 await projector.open()
@@ -44,10 +44,10 @@ class Projector:
 
     Args:
         log: open for writing.
-        views: users' views to make beside the tables.
-        projections: of one's own, to be kept up to date too.
-        found: the same, but a fault in one of them is told and not raised.
-        batch_events: how many events one transaction takes at most.
+        views: users' views to create beside the tables.
+        projections: custom projections to fold too.
+        installed: custom projections of installed packages; a name conflict in one is logged and not raised.
+        batch_events: the most events in one transaction.
     """
 
     def __init__(
@@ -56,19 +56,19 @@ class Projector:
         *,
         views: Sequence[UserView] = (),
         projections: Sequence[Projection] = (),
-        found: Sequence[Projection] = (),
+        installed: Sequence[Projection] = (),
         batch_events: int = 10_000,
     ) -> None:
         self._log = log
         self._views = views
         self._batch_events = batch_events
-        self._own = CustomTables(log, projections, found, batch_events=batch_events)
+        self._custom = CustomTables(log, projections, installed, batch_events=batch_events)
         self._has_news = True
         self._folding: Folding | None = None
         self._last_number = 0
 
     async def open(self) -> None:
-        """Makes tables and views that are missing: those of every memory, of the mapped classes, of the users.
+        """Create missing tables and views: those of every memory, of the mapped classes and of the users.
 
         Raises `DatabaseForeign` for tables of another version, `CallerError` for a view or a projection whose name
         is taken.
@@ -76,57 +76,58 @@ class Projector:
         with self._log.translated():
             async with self._log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
-                found = await current_generation(connection, hold="change")
-                if found is None and (await connection.execute(_ANYTHING_FOLDED)).first() is not None:
-                    raise DatabaseForeign(f"{self._log.address}: the tables are gone: run `pycrorm rebuild`")
-                generation = found or await make_generation(connection, 1)
+                current = await current_generation(connection, hold="change")
+                if current is None and (await connection.execute(_ANYTHING_FOLDED)).first() is not None:
+                    raise DatabaseForeign(f"{self._log.address}: the tables are missing: run `pycrorm rebuild`")
+                generation = current or await make_generation(connection, 1)
                 layout = generation.layout.with_leaves(mapped_leaves())
                 layout = with_user_views(layout, self._views, connection.dialect)
-                changed = await self._own.set_up(connection, layout)
-                if found is None or layout != generation.layout or changed:
+                changed = await self._custom.set_up(connection, layout)
+                if current is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
                 generation = await release_parked(connection, _LiveTarget(), generation)
             self._folding = Folding(self._log, _LiveTarget(), generation)
             await self._sweep()
 
     async def catch_up(self) -> int:
-        """Shows in the tables what the log holds; the number of events folded.
+        """Fold everything in the log; return the number of events folded.
 
-        An event that cannot be folded parks its episode with the reason, what came before it is shown, and the others
-        go on. Raises `DatabaseUnavailable`; what was folded stays, and the call may be made again.
+        An event that cannot be folded parks its episode with the reason: the events before it are visible, and the
+        other episodes continue. Raises `DatabaseUnavailable`; folded events stay, and the call may be repeated.
         """
         count = 0
         with self._log.translated():
-            while (some := await self._fold_next()) is not None:
-                count += some
+            while (folded := await self._fold_next()) is not None:
+                count += folded
             while await self._refresh():
                 pass
-            while await self._own.fold_next_batch(now=True):
+            while await self._custom.fold_next_batch(now=True):
                 pass
         return count
 
     async def fold_next_batch(self) -> bool:
-        """One batch of the same, or some of the views that are kept; False if nothing was behind."""
+        """Fold one batch, or do one step of `fold_rest`; return False if nothing was behind the log."""
         with self._log.translated():
             self._has_news = await self._fold_next() is not None or await self.fold_rest(now=self._has_news)
         return self._has_news
 
     async def fold_rest(self, *, now: bool) -> bool:
-        """Some of the views that are kept, or of the projections of one's own; False if nothing was behind.
+        """Refresh some rows of the materialised views or fold custom projections; return False if none was behind.
 
-        Of a projection few events are left for later unless it is to be `now`.
+        Unless `now` is true, custom projections are checked at intervals only, because a check costs a scan of all
+        episodes.
         """
         with self._log.translated():
-            return await self._refresh() or await self._own.fold_next_batch(now=now)
+            return await self._refresh() or await self._custom.fold_next_batch(now=now)
 
     async def prepare(self, spans: Sequence[Span]) -> Prepared:
-        """Reads and folds these, and writes nothing. Raises `DatabaseUnavailable`."""
+        """Read and fold the events of these spans, and write nothing. Raises `DatabaseUnavailable`."""
         assert self._folding is not None, "opened before anything is folded"
         with self._log.translated():
             return await self._folding.prepare(spans, await self._log.spans(spans))
 
     async def write(self, batch: Prepared) -> int:
-        """How many events of it are in the tables now: none if they are not where they were taken to be."""
+        """Write a prepared batch; return the number of its events written, 0 if the tables changed since `prepare`."""
         assert self._folding is not None, "opened before anything is folded"
         before = self._folding.generation.revision
         with self._log.translated():
@@ -136,8 +137,8 @@ class Projector:
         return count
 
     async def _fold_next(self) -> int | None:
-        """Folds a batch; how many events, None if nothing is behind."""
-        # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
+        """Fold a batch; return the number of events, None if no episode is behind."""
+        # Start behind the last batch's episode, so that an episode that always grows does not starve the others.
         spans = await self._log.unfolded(self._batch_events, after=self._last_number)
         if not spans:
             return None
@@ -159,7 +160,7 @@ class Projector:
 
 
 class _LiveTarget:
-    """What people see, and `episode.folded`. Implements `Goal`."""
+    """The visible generation, with `episode.folded` as its checkpoint. Implements `FoldTarget`."""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
         generation = await current_generation(connection, hold=hold)

@@ -15,7 +15,7 @@ from bench.baseline.storing import Statements, engine_of, store
 from bench.baseline.tables import BaselineBase
 from bench.material.rollouts import THESIS_NODES, Node, Place, Thing, Tree, tree, tree_of
 from bench.material.spooled import spool_tree
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 from tests.databases import ask
 
 ROOT_ROWS = 2

@@ -122,7 +122,7 @@ def folder(tmp_path: Path) -> Path:
         (["run", "plans.py:sync"], 2, "plans.py:sync is not an async function: write `async def sync()`"),
         (["run", "plans.py:greedy"], 2, "plans.py:greedy takes memory, world: a plan takes the memory, or nothing"),
         (["run", "turtle.py"], 2, "turtle.py has the name of a module of Python's own or one in use"),
-        (["writer", "--once", "--url", "sqlite://"], 2, "sqlite:// is gone with its process"),
+        (["writer", "--once", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["run", "plans.py", "--spool", "plans.py"], 3, "plans.py"),
     ],
 )

@@ -79,7 +79,7 @@ def test_the_memory_to_copy_can_be_said_by_the_environment(folder: Path) -> None
     ("arguments", "code", "reason"),
     [
         (["--to", "sqlite:///a.db"], 2, "sqlite:///a.db and sqlite:///a.db are the same memory"),
-        (["--to", "sqlite://"], 2, "sqlite:// is gone with its process"),
+        (["--to", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["--to", "mysql://lab/b"], 2, "mysql:// is not a database we know"),
         (["--to", "sqlite:///b.db", "--episode", "3"], 2, "there is no episode '3'"),
         (["--to", "sqlite:///b.db", "--from", "sqlite:///none.db"], 3, "sqlite:///none.db does not exist"),

@@ -105,7 +105,7 @@ async def test_of_a_damaged_log_what_comes_before_the_damage_is_printed(tmp_path
         (["9" * 5000], 2, "there is no episode"),
         (["1", "--type", "nodestarted"], 2, "there is no event 'nodestarted'; there are DesignatorTypeDeclared, "),
         (["1", "--url", "sqlite:///none.db"], 3, "does not exist"),
-        (["1", "--url", "sqlite://"], 2, "sqlite:// is gone with its process"),
+        (["1", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["1", "--url", "oracle://lab/memory"], 2, "oracle:// is not a database we know"),
         (["1", "--url", "postgresql://ada:s3cr@127.0.0.1:1/memory"], 3, "cannot be reached: Connection refused"),
     ],

@@ -40,4 +40,4 @@ def test_verify_and_rebuild_name_the_events_that_wait_in_the_spool(tmp_path: Pat
 def test_a_private_database_is_refused_in_one_line(tmp_path: Path, verb: str) -> None:
     done = pycrorm(verb, "--url", "sqlite://", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "pycrorm: sqlite:// is gone with its process: no other can write it or recover anything\n"
+    assert done.stderr == "pycrorm: sqlite:// exists only in its own process, no other can open it: name a file\n"

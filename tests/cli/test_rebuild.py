@@ -66,7 +66,7 @@ def test_an_episode_that_cannot_be_folded_is_told_and_is_a_problem(tmp_path: Pat
     ("arguments", "code", "line"),
     [
         (["--url", "sqlite:///none.db"], 3, "none.db does not exist"),
-        (["--url", "sqlite://"], 2, "sqlite:// is gone with its process"),
+        (["--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["--url", "sqlite:///text.db"], 3, "is not a database"),
     ],
 )

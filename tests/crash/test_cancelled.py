@@ -19,7 +19,8 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.operations.daemon import _Folders, _Living
-from pycrorm_async.operations.destination import LogAndTables, open_destination, recover
+from pycrorm_async.operations.destination import LogAndTables, open_destination
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import Spool
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress

@@ -193,7 +193,7 @@ async def test_a_parked_episode_is_told_once(tmp_path: Path) -> None:
 async def test_a_table_of_the_users_own_in_the_way_is_named_and_parks_that_type_until_it_is_renamed(
     tmp_path: Path,
 ) -> None:
-    in_the_way = r"note_action already exists: rename yours, then open the memory again"
+    in_the_way = r"note_action already exists: rename your table or view, then open the memory again"
     async with Memory.open(url_of(tmp_path)) as memory:
         with sqlite3.connect(tmp_path / "memory.db") as plain:
             plain.execute("CREATE TABLE note_action (mine TEXT)")

@@ -13,7 +13,7 @@ from pathlib import Path
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import (
     Action,
     Attachment,

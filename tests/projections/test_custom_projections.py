@@ -279,7 +279,7 @@ async def test_a_name_that_is_taken_is_refused_with_both(log: EventLog, projecti
     await folded(log, [], GraspRate())
     with pytest.raises(CallerError, match=reason):
         await Projector(log, projections=[projection]).open()
-    await Projector(log, found=[projection]).open()  # of a package that is installed it is only told
+    await Projector(log, installed=[projection]).open()  # of a package that is installed it is only told
 
 
 async def test_a_type_that_is_declared_later_has_its_table_all_the_same(
@@ -293,7 +293,7 @@ async def test_a_type_that_is_declared_later_has_its_table_all_the_same(
     await log.append([*declarations(trying), *script.records])
     await projector.catch_up()
     assert await ask(log, "SELECT id, text FROM grasp_try") == [(row(node, number=2), "again")]
-    assert "the projection grasp_rate is not shown: the memory itself has grasp_try" in caplog.text
+    assert "the projection grasp_rate has no views: the names grasp_try belong to the memory" in caplog.text
     assert await ask(log, "SELECT count(*) FROM episode WHERE parked IS NOT NULL") == [(0,)]
 
 
@@ -315,13 +315,13 @@ class Wrong(Projection):
         ([("wrong_rows", row(1), {})], "wrong has no table 'wrong_rows'"),
         ([("wrong_row", row(1), {"m": 1})], "wrong_row has no column 'm' to fill"),
         ([("wrong_row", row(1), {"process_metadata_id": 7})], "wrong_row has no column 'process_metadata_id' to fill"),
-        ([("wrong_row", row(1), {"n": "one"})], "wrong_row.n: 'one' stands where integer is declared"),
-        ([("wrong_row", row(1), {"n": True})], "wrong_row.n: True stands where integer is declared"),
-        ([("wrong_row", row(1), {"n": 2**63})], "wrong_row.n: 9223372036854775808 stands where integer is declared"),
+        ([("wrong_row", row(1), {"n": "one"})], "wrong_row.n: 'one' is not of the declared type integer"),
+        ([("wrong_row", row(1), {"n": True})], "wrong_row.n: True is not of the declared type integer"),
+        ([("wrong_row", row(1), {"n": 2**63})], "wrong_row.n: 9223372036854775808 is not of the declared type integer"),
         ([("wrong_row", row(1), {"x": float("nan")})], "wrong_row.x: nan is not a finite number"),
-        ([("wrong_row", row(1), {"said": 1})], "wrong_row.said: 1 stands where text is declared"),
+        ([("wrong_row", row(1), {"said": 1})], "wrong_row.said: 1 is not of the declared type text"),
         ([("wrong_row", row(1), {"said": "a\x00"})], "wrong_row.said: the text holds U\\+0000"),
-        ([("wrong_row", row(1), {"is_it": 1})], "wrong_row.is_it: 1 stands where boolean is declared"),
+        ([("wrong_row", row(1), {"is_it": 1})], "wrong_row.is_it: 1 is not of the declared type boolean"),
         ([("wrong_row", row(1), {"order": object()})], "wrong_row.order: .*unsupported"),
         ([("wrong_row", row(1, number=2), {})], "wrong_row: 4294967328 is no row of this episode"),
         ([("wrong_row", row(1), {}), ("wrong_row", row(1), {})], "wrong_row has a row 2147483680 already"),

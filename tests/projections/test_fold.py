@@ -351,16 +351,16 @@ def test_nodes_of_the_language_have_their_table_too() -> None:
         (NodeStarted("action", None, "0" * 32), "the designator type " + "0" * 32 + " was never declared"),
         (
             NodeStarted("action", None, name_of(SAYING), {"text": 5}),
-            "text: 5 stands where text is declared",
+            "text: 5 is not of the declared type text",
         ),
         (
             NodeStarted("action", None, name_of(NAVIGATE), {"target_location": {"position": [1, 2]}}),
-            "target_location: no pose: Expected `array` of length 3, got 2 - at `$.position`",
+            "target_location: not a pose: Expected `array` of length 3, got 2 - at `$.position`",
         ),
         (NodeEnded(2**26, "SUCCEEDED"), "no row can have the sequence 67108864 and the slot 0"),
         (
             LocationResolved("CostmapLocation", (), taken=0),
-            "candidate 0 was taken of 0",
+            "candidate 0 was taken, but only 0 were offered",
         ),
         (
             ObjectDetected(

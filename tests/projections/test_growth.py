@@ -171,7 +171,7 @@ HOSTILE: list[tuple[DesignatorTypeDeclared | bytes, str]] = [
     (crafted(aliases=("a b",)), "its dtype 'a b' is not a name"),
     (b"no JSON at all", "this version cannot read the declaration of its type"),
     (b'{"kind":"action","dtype":"Evil\\u0000Action","table":"evil_action"}', "is not a name"),
-    (b'{"kind":"action","dtype":"EvilAction","table":"pick_up_action"}', "which is that of PickUpAction"),
+    (b'{"kind":"action","dtype":"EvilAction","table":"pick_up_action"}', "which belongs to PickUpAction"),
 ]
 
 
@@ -212,8 +212,8 @@ async def test_the_columns_and_the_types_of_a_memory_have_a_bound_that_parks(
     wide = [with_fields("WideAction", "real", *(f"f{n}" for n in range(20 * k, 20 * k + 20))) for k in range(3)]
     records = [each for number, type_ in enumerate(wide, 1) for each in performing(number, type_, f0=1.0)]
     projector = await stored_and_folded(log, [*declarations(*wide), *records])
-    assert await told(log) == [(3, "event 3: WideAction would have 60 columns, 50 are the most")]
-    assert (await clean(log)).unmade == {"WideAction": "WideAction would have 60 columns, 50 are the most"}
+    assert await told(log) == [(3, "event 3: WideAction would have 60 columns, 50 are allowed")]
+    assert (await clean(log)).unmade == {"WideAction": "WideAction would have 60 columns, 50 are allowed"}
     [(leaves,)] = [(len(projector._folding.generation.layout.leaves),)] if projector._folding else []
     monkeypatch.setattr(layout, "LEAVES_MAX", leaves)
     await log.append([*declarations(SAYING), *performing(4, SAYING, text="too many")])
@@ -244,8 +244,8 @@ async def test_a_table_in_the_way_parks_that_type_alone_until_it_is_renamed(log:
     await projector.catch_up()
     [(number, reason)] = await told(log)
     assert number == 6
-    assert reason.startswith("event 3: the database makes no tables for Kind5Action: ")
-    assert reason.endswith("already exists: rename yours, then open the memory again")
+    assert reason.startswith("event 3: the database refuses the tables of Kind5Action: ")
+    assert reason.endswith("already exists: rename your table or view, then open the memory again")
     for n in (0, 1, 2, 3, 4, 6):
         assert await ask(log, f"SELECT size FROM kind{n}_action") == [(float(n),)]
     assert [*(await clean(log)).unmade] == ["Kind5Action"]

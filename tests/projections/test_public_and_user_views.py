@@ -212,7 +212,7 @@ async def test_a_view_of_a_user_stays_when_another_process_opens_the_memory_with
     ["pose", "Action", "event", "pycrorm_x", "pg_x", "pose__1", "x__12", "park_arms_action", "pickupWithContextView"],
 )
 async def test_a_view_cannot_take_a_name_that_is_taken(log: EventLog, name: str) -> None:
-    with pytest.raises(CallerError, match=f"a view cannot be called '{name}'"):
+    with pytest.raises(CallerError, match=f"the view name '{name}' is taken"):
         await Projector(log, views=[UserView(name, select(ParkArmsAction.arm))]).open()
 
 

@@ -20,8 +20,8 @@ from pycrorm_async.events.codec import Decoder
 from pycrorm_async.events.types import EVENT_TYPES, ObjectAdded
 from pycrorm_async.events.upcasters import Upcaster
 from pycrorm_async.operations.copy import copy_episodes
-from pycrorm_async.operations.destination import recover
 from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Action
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.fold import fold

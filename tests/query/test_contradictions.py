@@ -23,7 +23,7 @@ WAVE_IN_WORDS = declared("Wave", "wave", field("times", "text", 2))
 SAYING_TWIN = declared("Saying_Action", "saying_action", field("times", "integer", 2))
 OTHER_KIND = "Wave is declared as {} and as {}"
 OF_US = "Wave: its table would be 'pose', which the memory itself uses (set another dtype)"
-OF_ANOTHER = "Saying_Action asks for the table saying_action, which is that of SayingAction (set another dtype)"
+OF_ANOTHER = "Saying_Action needs the table saying_action, which belongs to SayingAction (set another dtype)"
 OTHER_TYPE = (
     "Wave.times is declared as {} and as {} (types that share a name must agree: rename one field or set another dtype)"
 )

@@ -16,8 +16,8 @@ from sqlalchemy import text
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import PycrormError, TablesUntrusted
-from pycrorm_async.operations.destination import recover
 from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.query.reading import Reading

@@ -12,7 +12,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.operations.destination import recover
+from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress

@@ -13,7 +13,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import EpisodeParked, PycrormError, SpoolFull, SpoolStuck
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
-from pycrorm_async.operations.destination import dead_queues
+from pycrorm_async.operations.recovery import dead_queues
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.queue.sources.dead_source import open_dead

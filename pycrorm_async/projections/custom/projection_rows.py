@@ -133,7 +133,7 @@ def _value(place: str, storage: Storage, value: Any) -> Any:
         case _:
             fits = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _INTEGER_MAX
     if not fits:
-        raise CannotFold(f"{place}: {repr(value)[:80]} stands where {storage} is declared")
+        raise CannotFold(f"{place}: {repr(value)[:80]} is not of the declared type {storage}")
     if storage == "real":
         value = float(value)
     fault = unwritable(value)

@@ -1,1 +1,1 @@
-"""The fold: from events to rows."""
+"""Turn events into rows, without reading a table."""

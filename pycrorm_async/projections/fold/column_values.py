@@ -1,6 +1,6 @@
-"""From a recorded value to the columns that hold it, by the type its field was declared with.
+"""Convert recorded values into column values, by the declared type of their field.
 
-What stands where another type was declared, or names what cannot be, raises `CannotFold`.
+A value of another type, or one that refers to an impossible row, raises `CannotFold`.
 """
 
 from __future__ import annotations
@@ -42,57 +42,57 @@ _SCALARS: dict[str, tuple[type, ...]] = {
 }
 
 AS_IT_IS: Mapping[str, type] = {kind: types[0] for kind, types in _SCALARS.items()}
-"""By a field's type, the Python type whose values its column holds just as they are."""
+"""By field type, the Python type whose values are stored unchanged."""
 
 
 class CannotFold(ValueError):
-    """An event that no row can be made of; the message says why."""
+    """The fold cannot make rows of an event; the message gives the reason."""
 
 
 def row(number: int, sequence: int, slot: int = 0) -> int:
-    """The row's id. Raises `CannotFold` for a sequence or slot that no row can have."""
+    """Return the id of a row. Raises `CannotFold` for a sequence or slot out of range."""
     if 0 < sequence <= SEQUENCE_MAX and 0 <= slot <= SLOT_MAX:
-        return number * _ROWS_OF_EPISODE + sequence * _ROWS_OF_EVENT + slot  # as `row_id`, whose checks were made
+        return number * _ROWS_OF_EPISODE + sequence * _ROWS_OF_EVENT + slot  # `row_id` without its repeated checks
     raise CannotFold(f"no row can have the sequence {sequence} and the slot {slot}")
 
 
 def in_slot(own: int, slot: int) -> int:
-    """The id of another row of the event whose own row that is. Raises `CannotFold` for a slot that no row can have."""
+    """Return the id of another row of the event that made row `own`. Raises `CannotFold` for a slot out of range."""
     if 0 <= slot <= SLOT_MAX:
         return own + slot
     raise CannotFold(f"no row can have the sequence {row_key(own).sequence} and the slot {slot}")
 
 
 def microseconds(nanoseconds: int) -> int:
-    """Time in a column."""
+    """Convert a time to the unit of the columns."""
     return nanoseconds // 1000
 
 
 def pose_columns(pose: PoseValue) -> tuple[float, float, float, float, float, float, float, str]:
-    """x to qw and the frame."""
+    """Return the columns x to qw and frame."""
     return (*pose.position, *pose.orientation, pose.frame)
 
 
 def pose_row(own: int, number: int, pose: PoseValue) -> Row:
-    """The row of `pose` with this id, in the episode of this number."""
+    """Return the row of `pose` with the id `own`, in the episode `number`."""
     x, y, z = pose.position
     qx, qy, qz, qw = pose.orientation
     return own, number, x, y, z, qx, qy, qz, qw, pose.frame, pose.time_ns // 1000
 
 
 def is_missing(value: Any) -> bool:
-    """Whether a `MissingValue` stands here."""
+    """Return whether this value is a recorded `MissingValue`."""
     if not isinstance(value, dict) or "missing" not in value:
         return False
     return isinstance(value["missing"], str) and value.keys() <= {"missing", "repr"}
 
 
 def scalar(field: FieldDeclared, kind: str, value: Any) -> Any:
-    """What a column of this type holds."""
+    """Convert a value for a column of type `kind`. Raises `CannotFold` for a value of another type."""
     if kind == "datetime":
-        return _moment(field, value)
+        return _datetime_us(field, value)
     if not isinstance(value, _SCALARS[kind]) or (isinstance(value, bool) and kind != "boolean"):
-        raise CannotFold(f"{field.name}: {_shown(value)} stands where {kind} is declared")
+        raise CannotFold(f"{field.name}: {_shortened(value)} is not of the declared type {kind}")
     return float(value) if isinstance(value, int) and kind == "real" else value
 
 
@@ -100,7 +100,7 @@ def pose_of(field: FieldDeclared, value: Any) -> PoseValue:
     try:
         return msgspec.convert(value, PoseValue)
     except msgspec.ValidationError as error:
-        raise CannotFold(f"{field.name}: no pose: {error}") from None
+        raise CannotFold(f"{field.name}: not a pose: {error}") from None
 
 
 def object_of(field: FieldDeclared, value: Any) -> ObjectReference | ObjectValue:
@@ -109,21 +109,21 @@ def object_of(field: FieldDeclared, value: Any) -> ObjectReference | ObjectValue
             return msgspec.convert(value, ObjectReference)
         return msgspec.convert(value, ObjectValue)
     except msgspec.ValidationError as error:
-        raise CannotFold(f"{field.name}: no object: {error}") from None
+        raise CannotFold(f"{field.name}: not an object: {error}") from None
 
 
 def json_text(value: Any) -> str:
-    """JSON as it is kept in a column."""
+    """Encode a value as the JSON text of a column."""
     return msgspec.json.encode(value).decode()
 
 
-def _moment(field: FieldDeclared, value: Any) -> int:
+def _datetime_us(field: FieldDeclared, value: Any) -> int:
     try:
         moment = datetime.fromisoformat(value)
         return (moment - _EPOCH) // _MICROSECOND
     except (TypeError, ValueError):
-        raise CannotFold(f"{field.name}: {_shown(value)} stands where datetime is declared") from None
+        raise CannotFold(f"{field.name}: {_shortened(value)} is not of the declared type datetime") from None
 
 
-def _shown(value: Any) -> str:
+def _shortened(value: Any) -> str:
     return repr(value)[:80]

@@ -1,7 +1,7 @@
-"""The fold: one event in, rows out. Pure: no clock, no lookup, no state but the rows of the batch.
+"""Fold one event into rows. The fold is pure: it reads no clock and no table, and its only state is the batch's rows.
 
-The same events give the same rows, live or rebuilt, in one batch or one by one. An event whose rows cannot be made
-raises `CannotFold` before it has left any, so that its episode can be parked there and the others go on.
+The same events give the same rows, live or rebuilt, in one batch or one by one. An event that cannot be folded raises
+`CannotFold` before it has added any row, so that its episode can be parked at this event and the others continue.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from pycrorm_async.projections.fold.column_values import (
     pose_row,
     row,
 )
-from pycrorm_async.projections.fold.parameters import Designators, Made
+from pycrorm_async.projections.fold.parameters import Designators, ParameterRows
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, Row, Rows
 from pycrorm_async.store.stored import StoredEvent
 
@@ -48,22 +48,22 @@ _NO_OUTCOME: Row = (None, None, None, None)
 
 
 class Undecodable(CannotFold):
-    """The payload is none of its type and version: nobody has written it like that."""
+    """The payload does not decode as its own type and version, so the log is damaged."""
 
 
 def fold(event: StoredEvent, designators: Designators, rows: Rows) -> None:
-    """Adds what this event means to `rows`. Raises `CannotFold`, and then has added nothing."""
+    """Add the rows of this event to `rows`. Raises `CannotFold`, and then has added none."""
     happening = happening_of(event)
     _FOLDS[event.type](event, happening, designators, rows)
 
 
 def fold_happening(event: StoredEvent, happening: Happening, designators: Designators, rows: Rows) -> None:
-    """The same for whoever has read already what happened."""
+    """Add the rows of an event whose payload is decoded already; as `fold`."""
     _FOLDS[event.type](event, happening, designators, rows)
 
 
 def happening_of(event: StoredEvent) -> Happening:
-    """What happened, of an event of an episode: for every fold there is. Raises `CannotFold`, `Undecodable`."""
+    """Decode the payload of an episode's event; custom projections use this too. Raises `CannotFold`, `Undecodable`."""
     _, _, type_, version, _, _, payload = event
     if type_ not in _FOLDS:
         raise CannotFold(f"{type_} is not an event this version knows")
@@ -126,18 +126,18 @@ def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Design
 def _node_started(event: StoredEvent, started: NodeStarted, designators: Designators, rows: Rows) -> None:
     number, sequence, _, _, wall_ns, monotonic_ns, _ = event
     node = row(number, sequence)
-    made: Made = []
+    parameter_rows: ParameterRows = []
     designator = designators.of(started)
-    leaf = designator.rows(event, node, started.parameters, made) if designator is not None else ()
+    leaf = designator.rows(event, node, started.parameters, parameter_rows) if designator is not None else ()
     parent = row(number, started.parent) if started.parent is not None else None
     robot = started.robot
     robot_object = row(number, robot.object.row) if robot is not None and robot.object is not None else None
-    # Nothing raises from here on: an event leaves all of its rows or none.
+    # Nothing below raises, so that an event adds all of its rows or none.
     if robot is not None:
         rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
     if designator is not None:
         rows.leaves.setdefault(designator.leaf, []).append(leaf)
-        for table, each in made:
+        for table, each in parameter_rows:
             rows.inserts[table].append(each)
     rows.nodes[node] = [
         node,
@@ -166,14 +166,14 @@ def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators,
     number, _, _, _, wall_ns, monotonic_ns, _ = event
     node, status = row(number, ended.node), ended.status
     outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else _NO_OUTCOME
-    if status == "LOST":  # nobody saw when it ended
+    if status == "LOST":  # recovery computed this end; the true end time was never recorded
         rows.end_node(node, status, None, None, outcome)
     else:
         rows.end_node(node, status, wall_ns // 1000, monotonic_ns, outcome)
 
 
 def _outcome(ended: NodeEnded) -> Row:
-    """A node's columns reason to result."""
+    """Return a node's columns from reason to result."""
     failure = ended.failure
     return (
         failure.type.rpartition(".")[2] if failure else None,
@@ -241,7 +241,7 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
     own, number = _own(event)
     offered, taken = resolved.offered, resolved.taken
     if taken is not None and not 0 <= taken < len(offered):
-        raise CannotFold(f"candidate {taken} was taken of {len(offered)}")
+        raise CannotFold(f"candidate {taken} was taken, but only {len(offered)} were offered")
     node, time = _node(event, resolved.node), microseconds(event.wall_ns)
     pose_id = own if taken is not None else None
     if taken is not None:
@@ -260,13 +260,13 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
 
 def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators: Designators, rows: Rows) -> None:
     own, number = _own(event)
-    asked = (number, _node(event, detected.node), detected.source, detected.object_type)
+    request = (number, _node(event, detected.node), detected.source, detected.object_type)
     time = microseconds(event.wall_ns)
-    made = [  # a list, for `row` may raise
+    detections = [  # complete before any row is added, because `row` may raise
         (
             own,
             rank,
-            *asked,
+            *request,
             row(number, each.object.row) if each.object is not None else None,
             each.name,
             each.object_type,
@@ -276,7 +276,7 @@ def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators:
         )
         for rank, each in enumerate(detected.seen)
     ]
-    rows.inserts["detection"].extend(made)
+    rows.inserts["detection"].extend(detections)
 
 
 def _state_sampled(event: StoredEvent, sampled: StateSampled, _designators: Designators, rows: Rows) -> None:

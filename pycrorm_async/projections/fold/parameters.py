@@ -1,6 +1,4 @@
-"""A node's parameters as rows: one in the leaf table of its designator, and those of the poses, objects and entries of
-lists and dicts that it names.
-"""
+"""Fold a node's parameters: one row in its leaf table, and rows for poses, objects and list entries."""
 
 from __future__ import annotations
 
@@ -30,17 +28,17 @@ from pycrorm_async.projections.fold.column_values import (
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["Designators", "DesignatorFold", "Made"]
+__all__ = ["Designators", "DesignatorFold", "ParameterRows"]
 
 _NO_POSE = (None,) * 8
 _ITEM_SCALARS = {"integer": 0, "real": 1, "text": 2, "enum": 2, "boolean": 3, "datetime": 4}
 
-Made: TypeAlias = list[tuple[str, Row]]
-"""Rows of other tables than the leaf table, each with its table."""
+ParameterRows: TypeAlias = list[tuple[str, Row]]
+"""Rows of tables other than the leaf table, each with its table."""
 
 
 class DesignatorFold:
-    """How the parameters of one declaration become rows.
+    """Folds the parameters of the nodes of one declaration.
 
     Attributes:
         leaf: the leaf table and its columns.
@@ -53,28 +51,28 @@ class DesignatorFold:
         self._columned = [(f.name, AS_IT_IS.get(f.type), _CONVERTED.get(f.type, _scalar), f) for f in columned]
         self._listed = [each for each in declared.fields if each.type in ("list", "dict")]
 
-    def rows(self, event: StoredEvent, node: int, given: Mapping[str, Any], made: Made) -> Row:
-        """The node's row in the leaf table; those of other tables are added to `made`. Raises `CannotFold`."""
+    def rows(self, event: StoredEvent, node: int, parameters: Mapping[str, Any], others: ParameterRows) -> Row:
+        """Return the node's row in the leaf table and add rows of other tables to `others`. Raises `CannotFold`."""
         leaf: list[Any] = [node]
         for name, as_it_is, converted, field in self._columned:
-            value = given.get(name)
+            value = parameters.get(name)
             if value is None or type(value) is as_it_is:
                 leaf.append(value)
             elif is_missing(value):
                 leaf.append(None)
             else:
-                leaf.append(converted(event, node, field, value, made))
+                leaf.append(converted(event, node, field, value, others))
         for field in self._listed:
-            value = given.get(field.name)
+            value = parameters.get(field.name)
             if value is not None and not is_missing(value):
-                made.extend(("parameter_item", each) for each in _entries(event, node, field, value))
+                others.extend(("parameter_item", each) for each in _entries(event, node, field, value))
         return tuple(leaf)
 
 
 class Designators:
-    """How to fold the nodes of every declared type, by the fingerprint of its declaration.
+    """The folds of all declared designator types, by the fingerprint of their declaration.
 
-    `refused` says why declarations cannot share the tables: their nodes cannot be folded.
+    `refused` maps the declarations whose nodes cannot be folded to the reason.
     """
 
     def __init__(
@@ -87,7 +85,7 @@ class Designators:
         self._folds = {name: DesignatorFold(each) for name, each in accepted.items()}
 
     def of(self, started: NodeStarted) -> DesignatorFold | None:
-        """That of this node; None for a root. Raises `CannotFold`."""
+        """Return the fold of this node's type; None for a root. Raises `CannotFold`."""
         name = started.designator
         if name is None:
             return None
@@ -97,54 +95,54 @@ class Designators:
         return fold
 
 
-def _scalar(_event: StoredEvent, _node: int, field: FieldDeclared, value: Any, _made: Made) -> Any:
+def _scalar(_event: StoredEvent, _node: int, field: FieldDeclared, value: Any, _others: ParameterRows) -> Any:
     return scalar(field, field.type, value)
 
 
-def _pose(event: StoredEvent, node: int, field: FieldDeclared, value: Any, made: Made) -> int:
+def _pose(event: StoredEvent, node: int, field: FieldDeclared, value: Any, others: ParameterRows) -> int:
     pose = pose_of(field, value)
     own = in_slot(node, field.slot)
-    made.append(("pose", pose_row(own, event.number, pose)))
+    others.append(("pose", pose_row(own, event.number, pose)))
     return own
 
 
-def _object(event: StoredEvent, node: int, field: FieldDeclared, given: Any, made: Made) -> int:
-    """The row in force of an object of the world; for another a row of its own, in the field's slot."""
-    value = object_of(field, given)
+def _object(event: StoredEvent, node: int, field: FieldDeclared, recorded: Any, others: ParameterRows) -> int:
+    """Return the current row of a world object; add a row in the field's slot for an object outside the world."""
+    value = object_of(field, recorded)
     if isinstance(value, ObjectReference):
         return row(event.number, value.row)
     own = in_slot(node, field.slot)
     if value.pose is not None:
-        made.append(("pose", pose_row(own, event.number, value.pose)))
+        others.append(("pose", pose_row(own, event.number, value.pose)))
     pose_id = own if value.pose is not None else None
     part_of = row(event.number, value.part_of.row) if value.part_of is not None else None
     number, time = event.number, microseconds(event.wall_ns)
     columns = own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node, None
-    made.append(("object", columns))
+    others.append(("object", columns))
     return own
 
 
-_CONVERTED: Mapping[str, Callable[[StoredEvent, int, FieldDeclared, Any, Made], Any]] = {
+_CONVERTED: Mapping[str, Callable[[StoredEvent, int, FieldDeclared, Any, ParameterRows], Any]] = {
     "pose": _pose,
     "object": _object,
 }
-"""How a field's value becomes that of its column; of all other types it is `_scalar`."""
+"""The conversion of a field's value to that of its column; all other types use `_scalar`."""
 
 
 def _entries(event: StoredEvent, node: int, field: FieldDeclared, value: Any) -> Iterator[Row]:
-    """The rows of a list's or dict's entries."""
+    """Yield one row for each entry of a list or dict."""
     if field.type == "dict" and isinstance(value, dict):
         pairs: list[tuple[str | None, Any]] = list(value.items())
     elif field.type == "list" and isinstance(value, list):
         pairs = [(None, each) for each in value]
     else:
-        raise CannotFold(f"{field.name}: {repr(value)[:80]} stands where {field.type} is declared")
+        raise CannotFold(f"{field.name}: {repr(value)[:80]} is not of the declared type {field.type}")
     for position, (key, entry) in enumerate(pairs):
         yield (node, field.name, position, event.number, key, *_entry(event, field, entry))
 
 
 def _entry(event: StoredEvent, field: FieldDeclared, value: Any) -> Row:
-    """The columns integer to obj_type of `parameter_item`."""
+    """Return the columns integer to obj_type of `parameter_item`."""
     item = field.item or "text"
     scalars: list[Any] = [None] * 5
     if value is None or is_missing(value):

@@ -1,7 +1,7 @@
-"""What a batch of events makes: rows to insert, and changes of rows that are in the tables already.
+"""Collect the rows of one batch of events: those to insert, and changes to rows that the tables contain already.
 
-A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`; of
-nodes and episodes they are lists until the batch is over.
+A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`; rows
+of nodes and episodes stay lists until the batch is complete, because later events change them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _EPISODE = COLUMNS["process_metadata"]
 
 
 class NodeEnd(NamedTuple):
-    """What the end of a node changes in its row."""
+    """The columns that the end of a node sets in its row."""
 
     id: int
     status: str
@@ -33,7 +33,7 @@ class NodeEnd(NamedTuple):
 
 
 class EpisodeEnd(NamedTuple):
-    """What the end of an episode changes in its row."""
+    """The columns that the end of an episode sets in its row."""
 
     id: int
     status: str
@@ -54,11 +54,11 @@ class Rows:
     """The rows of one batch.
 
     Attributes:
-        nodes, episodes: to insert, by id.
-        inserts: to insert into the other core tables, by table.
-        leaves: to insert into leaf tables, by (table, columns).
-        node_ends, episode_ends: to update, of rows that came with an earlier batch.
-        lost: episodes whose nodes that are still running in the tables are lost.
+        nodes, episodes: rows to insert, by id.
+        inserts: rows to insert into the other core tables, by table.
+        leaves: rows to insert into leaf tables, by (table, columns).
+        node_ends, episode_ends: updates of rows that an earlier batch inserted.
+        lost: numbers of the episodes whose nodes that are RUNNING in the tables become LOST.
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ class Rows:
         self.lost: list[int] = []
 
     def end_node(self, node: int, status: str, end_time: int | None, end_ns: int | None, outcome: Row) -> None:
-        """The node's row has an end, here or in the tables. `outcome` is the columns reason to result."""
+        """Set the end of a node's row, in this batch or in the tables. `outcome`: the columns reason to result."""
         row = self.nodes.get(node)
         if row is None:
             self.node_ends.append(make(NodeEnd, (node, status, end_time, end_ns, *outcome)))
@@ -82,7 +82,7 @@ class Rows:
         row[_OUTCOME] = outcome
 
     def end_episode(self, end: EpisodeEnd) -> None:
-        """The episode's row has an end, here or in the tables."""
+        """Set the end of an episode's row, in this batch or in the tables."""
         row = self.episodes.get(end.id)
         if row is None:
             self.episode_ends.append(end)
@@ -99,7 +99,7 @@ class Rows:
                 row[_STATUS] = "LOST"
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
-        """All rows to insert, by (table, columns)."""
+        """Return all rows to insert, by (table, columns)."""
         self.inserts["task_tree_node"] = list(map(tuple, self.nodes.values()))
         self.inserts["process_metadata"] = list(map(tuple, self.episodes.values()))
         core = {(table, COLUMNS[table]): rows for table, rows in self.inserts.items()}

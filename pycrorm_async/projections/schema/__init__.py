@@ -1,1 +1,1 @@
-"""Tables and views of a generation."""
+"""Define the tables and views of a generation, and create them."""

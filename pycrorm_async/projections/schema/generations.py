@@ -1,10 +1,23 @@
-"""The tables of a generation and the views in front of them: made when missing, grown when types are declared.
+"""Create, extend and switch generations: complete sets of tables, with views in front of the visible one.
 
-`pycrorm_generation` notes which generation people see (`tables`) and which one is being made beside it
-(`tables/making`) or waits to be dropped (`tables/gone/6`), and the same of each projection of somebody's own
-(`projection/NAME`, `projection/NAME/making`): its number, its layout, and a revision that counts the
-changes. Who folds has read the note before, and holds it in its own transaction: nobody shows another generation
-meanwhile. Everything here runs in the caller's transaction, tables and views too.
+Theory of operation. A generation is one set of physical tables whose names end in its number (`pose__7`). Public views
+(`pose`) select from the tables of one generation, so replacing the views replaces all tables at once. Each generation
+has a row in `pycrorm_generation` with its number, its layout, the SQL of its views, the version of the fold that made
+it, and a revision. The key of the row is the state. For the built-in tables: `tables` is visible, `tables/making` is
+being filled by a rebuild, `tables/gone/6` is replaced and waits to be dropped. A custom projection has the same states
+under `projection/NAME`, `projection/NAME/making` and `projection/NAME/gone/6`.
+
+Three activities meet here: a fold writes rows, a fold or an opening process extends the tables when new designator
+types are declared, and a rebuild switches to another generation. A fold computes the rows of a batch without a lock,
+for the generation it read last, and then writes them in one transaction in which it reads the row again with a shared
+lock (`hold="share"`). If number or revision have changed, it rolls back and folds the batch again. Extending and
+switching lock the row exclusively (`hold="change"`) and raise the revision. So a switch waits for batches that are
+being written, and every batch that was folded before the switch is folded again for the new generation; no row reaches
+a table that is no longer visible. On SQLite the row needs no lock, because a write transaction excludes all others.
+
+Every function runs in the caller's transaction, including the DDL, which both databases roll back. A process that is
+killed therefore leaves either the old or the new state. A row under `making` is all that the next rebuild needs to
+resume, and a row under `gone` all that it needs to drop the tables.
 """
 
 from __future__ import annotations
@@ -58,7 +71,7 @@ __all__ = [
 ]
 
 PROJECTION_VERSION = 4
-"""Counts what the fold means: tables of an older version must be rebuilt."""
+"""The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"
 MAKING = "tables/making"
@@ -68,7 +81,7 @@ PROJECTION = "projection/"
 _log = logging.getLogger("pycrorm_async.projections")
 
 Hold: TypeAlias = Literal["share", "change"]
-"""Until the transaction ends nobody else changes the note; with `change`, nobody else holds it either."""
+"""Lock the generation's row until the transaction ends: `share` against changes, `change` against sharers too."""
 
 _NOTES = "pycrorm_generation"
 _CREATE = f"""
@@ -97,7 +110,7 @@ _notes = table(
 
 @dataclass(frozen=True)
 class Generation:
-    """Number, how often it changed, what it holds, the SQL of every view by name, and which fold made it."""
+    """One row of `pycrorm_generation`: number, revision, layout, SQL of every view by name, version of the fold."""
 
     number: int
     revision: int
@@ -106,60 +119,62 @@ class Generation:
     version: int = PROJECTION_VERSION
 
     def without_unmade(self) -> Generation:
-        """The generation before the database refused to make some of its tables."""
+        """Return the generation without its record of refused tables, so that they can be tried again."""
         return replace(self, layout=msgspec.structs.replace(self.layout, unmade={}))
 
 
 async def current_generation(connection: AsyncConnection, *, hold: Hold | None = None) -> Generation | None:
-    """What people see now; None in a memory without tables. Raises `DatabaseForeign` for another version's.
+    """Read the visible generation; None in a memory without tables.
 
-    `TablesOutdated` if it is an older one's, which `pycrorm rebuild` makes anew.
+    Raises `DatabaseForeign` if a newer version made its tables, `TablesOutdated` if an older one did.
     """
-    found = await noted(connection, SHOWN, hold=hold)
-    if found is not None and found.version != PROJECTION_VERSION:
-        made = f"the tables were made by version {found.version} of the fold, this is version {PROJECTION_VERSION}"
-        if found.version > PROJECTION_VERSION:
-            raise DatabaseForeign(f"{made}: use a newer pycrorm")
-        raise TablesOutdated(f"{made}: run `pycrorm rebuild`")
-    return found
+    generation = await noted(connection, SHOWN, hold=hold)
+    if generation is not None and generation.version != PROJECTION_VERSION:
+        versions = (
+            f"the tables were made by version {generation.version} of the fold, this is version {PROJECTION_VERSION}"
+        )
+        if generation.version > PROJECTION_VERSION:
+            raise DatabaseForeign(f"{versions}: use a newer pycrorm")
+        raise TablesOutdated(f"{versions}: run `pycrorm rebuild`")
+    return generation
 
 
 async def noted(connection: AsyncConnection, name: str, *, hold: Hold | None = None) -> Generation | None:
-    """The generation under that name, of whatever version."""
+    """Read the generation under this key, of any version."""
     if not await dialect_of(connection).has_table(connection, _NOTES):
         return None
-    asked = select(_notes).where(_notes.c.projection == name)
-    if hold is not None:  # SQLite has no row locks, and needs none: who writes there is alone
-        asked = asked.with_for_update(read=hold == "share")
-    found = (await connection.execute(asked)).first()
-    return None if found is None else _generation(found)
+    query = select(_notes).where(_notes.c.projection == name)
+    if hold is not None:  # SQLite has no row locks and needs none: its write transaction excludes all others
+        query = query.with_for_update(read=hold == "share")
+    row = (await connection.execute(query)).first()
+    return None if row is None else _generation(row)
 
 
 async def all_noted(connection: AsyncConnection) -> dict[str, Generation]:
-    """Every generation there is, by the name it is noted under."""
+    """Read all generations, by key."""
     if not await dialect_of(connection).has_table(connection, _NOTES):
         return {}
     rows = await connection.execute(select(_notes).order_by(_notes.c.projection))
     return {row.projection: _generation(row) for row in rows}
 
 
-def projections_in(there: Mapping[str, Generation]) -> dict[str, Generation]:
-    """Of all that is noted, what people see of each projection, by its name."""
-    named = {key.removeprefix(PROJECTION): each for key, each in there.items() if key.startswith(PROJECTION)}
+def projections_in(generations: Mapping[str, Generation]) -> dict[str, Generation]:
+    """Select the visible generation of each custom projection, by the projection's name."""
+    named = {key.removeprefix(PROJECTION): each for key, each in generations.items() if key.startswith(PROJECTION)}
     return {name: each for name, each in named.items() if "/" not in name}
 
 
 def _generation(row: Any) -> Generation:
     try:
         layout = msgspec.json.decode(row.layout, type=Layout)
-    except msgspec.DecodeError:  # another version's, of which the number is enough
+    except msgspec.DecodeError:  # of another version; the caller needs no more than its number
         layout = Layout()
     views = msgspec.json.decode(row.views, type=dict[str, str])
     return Generation(row.generation, row.revision, layout, views, row.version)
 
 
 async def note(connection: AsyncConnection, name: str, generation: Generation) -> None:
-    """Notes it under that name, in place of what was noted there."""
+    """Write the generation under this key, replacing the row that has it."""
     values = {
         "projection": name,
         "version": generation.version,
@@ -172,12 +187,12 @@ async def note(connection: AsyncConnection, name: str, generation: Generation) -
 
 
 async def forget(connection: AsyncConnection, name: str) -> None:
-    """Nothing is noted under that name afterwards."""
+    """Delete the row under this key."""
     await connection.execute(delete(_notes).where(_notes.c.projection == name))
 
 
 async def make_generation(connection: AsyncConnection, number: int) -> Generation:
-    """Makes the tables every memory has, in a generation of this number. Nobody sees them before `show`."""
+    """Create the tables that every memory has, in a generation of this number. `show` makes them visible."""
     await dialect_of(connection).make_place(connection)
     await connection.exec_driver_sql(_CREATE)
     await make_empty(connection, CORE, number)
@@ -185,21 +200,21 @@ async def make_generation(connection: AsyncConnection, number: int) -> Generatio
 
 
 async def grow_tables(connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-    """Makes what this layout has more than the generation; its views stay as they are."""
+    """Create the tables and columns of this layout that the generation lacks; its views stay as they are."""
     present = generation.layout.leaves
     new = {name: {"id": "key", **columns} for name, columns in layout.leaves.items() if name not in present}
     await make_empty(connection, new, generation.number)
     for name in layout.leaves.keys() & present.keys():
         await _add_columns(connection, name, layout.leaves[name], present[name], generation.number)
-    there = kept_tables(generation.layout)
+    existing = kept_tables(generation.layout)
     for kept in layout.kept.values():
-        if kept.table not in there:
+        if kept.table not in existing:
             await make_kept(connection, kept, generation.number)
     return replace(generation, revision=generation.revision + 1, layout=layout)
 
 
 async def show(connection: AsyncConnection, generation: Generation) -> Generation:
-    """Puts views in front of its tables, in place of those of whatever was shown before."""
+    """Make this generation visible: replace the views in front of the tables that were visible before."""
     before = await noted(connection, SHOWN, hold="change")
     views = view_texts_of(connection, generation, projections_in(await all_noted(connection)))
     await dialect_of(connection).replace_views(connection, before.views if before else {}, views)
@@ -215,39 +230,39 @@ def view_texts_of(
     *,
     simulated: bool = False,
 ) -> dict[str, str]:
-    """Name and SQL of every view in front of these tables; one stands on those before it.
+    """Return name and SQL of every view in front of these tables; a view may select from those before it.
 
-    With `simulated` nothing is left out. A projection that has a name of ours, which a designator type may have got
-    later, is not shown.
+    With `simulated` the views include simulations. A custom projection is left out if one of its names has become
+    that of a designator type since.
     """
     layout, number = generation.layout, generation.number
     stored = dialect_of(connection).stored_column
-    meanings = public_views(layout, number, stored, simulated=simulated)
+    selects = public_views(layout, number, stored, simulated=simulated)
     texts = dict(layout.user_views) if simulated else shown_texts(layout, number, stored)
-    users = {
-        name: each for name, each in texts.items() if name not in meanings
-    }  # one of ours may have been noted there
-    taken = {name.lower() for name in (*meanings, *users)}
+    # A name registered for a user's view may have become built-in since; the built-in definition wins.
+    users = {name: each for name, each in texts.items() if name not in selects}
+    taken = {name.lower() for name in (*selects, *users)}
     own: dict[str, str] = {}
     for name, each in projections.items():
         names = {view.removeprefix(OWN).lower() for view in (*each.layout.leaves, *each.layout.user_views)}
         if names & taken:
-            _log.warning("the projection %s is not shown: the memory itself has %s", name, ", ".join(names & taken))
+            names_taken = ", ".join(names & taken)
+            _log.warning("the projection %s has no views: the names %s belong to the memory", name, names_taken)
             continue
         taken |= names
-        meanings |= own_views(each.layout, each.number, number, stored, simulated=simulated)
+        selects |= own_views(each.layout, each.number, number, stored, simulated=simulated)
         own |= each.layout.user_views
-    return {name: view_text(meaning, connection.dialect) for name, meaning in meanings.items()} | users | own
+    return {name: view_text(each, connection.dialect) for name, each in selects.items()} | users | own
 
 
 async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[str, Storage]], generation: int) -> None:
-    """Makes these tables of a generation, by name and columns, and their indexes."""
+    """Create these tables of a generation, given by name and columns, with their indexes."""
     statements: list[str] = []
     for name, columns in tables.items():
         table = make_table(name, dict(columns), generation, dialect_of(connection).stored_column)
         indexes = sorted(table.indexes, key=lambda each: str(each.name))
-        made: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
-        statements += [str(each.compile(dialect=connection.dialect)) for each in made]
+        definitions: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
+        statements += [str(each.compile(dialect=connection.dialect)) for each in definitions]
     if statements:
         await dialect_of(connection).execute_all(connection, statements)
         await dialect_of(connection).expect(

@@ -1,19 +1,18 @@
-"""Grow the tables of a generation by what was declared, type by type where the database refuses some of it.
+"""Create the tables of newly declared designator types, leaving out the types that the database refuses.
 
-## Theory of operation
+Theory of operation. Growing runs in its caller's transaction, which excludes all other writers of the memory. The
+tables of all declarations that the generation lacks are created at once, inside a savepoint. If the database refuses a
+definition, the savepoint is rolled back and each half is tried separately, down to the single declaration that it
+refuses. The generation's layout records that one as `unmade` with the reason, so that every process refuses it from
+then on, and its nodes park their own episodes.
 
-A growth runs in its caller's transaction, alone in the memory. All declarations that the generation has no tables for
-are made at once, inside a savepoint. If the database refuses their definition, the savepoint is rolled back and each
-half is tried on its own, and so on down to the one declaration that it refuses. The generation's layout notes that
-one as `unmade` with the reason, so that every process refuses it from then on, and its nodes park their own episodes.
+Only a refusal of the definition counts (`Dialect.refusal`). A lock timeout, a full disk or an unavailable server aborts
+the whole transaction, and growing is tried again with the next batch. A user's view that cannot be created any more is
+not blamed on a declaration either: recording the declaration as unmade creates the same views, fails too, and raises
+that error.
 
-Only a refusal of the definition counts (`Dialect.refusal`). A lock that was not given in time, a full disk or a server
-that is away ends the whole transaction, and the growth is tried again with the next batch. Nor is a declaration at
-fault for a view of a user that cannot be made any more: then noting the declaration as unmade, which makes the same
-views, fails too, and that error is raised.
-
-One transaction makes the tables of `_SLICE` declarations at most, because a server keeps a lock for each of them until
-COMMIT. A caller that finds the generation smaller than what it folded for commits, and comes again.
+One transaction creates the tables of at most `_SLICE` declarations, because a server keeps a lock for each of them
+until COMMIT. A caller whose generation is still smaller than the layout it folded for commits and calls again.
 """
 
 from __future__ import annotations
@@ -33,32 +32,33 @@ from pycrorm_async.store.dialects import dialect_of
 __all__ = ["Growing", "grow"]
 
 _SLICE = 1_000
-"""Tables that one transaction makes at most: a server as it is installed has room for some 7,000 locks, and a table
-with its index, the table of its long texts and the view before it takes up to five."""
+"""Bounds the tables created in one transaction: a default PostgreSQL has room for some 7,000 locks, and a table with
+its index, its TOAST table and its view takes up to five."""
 
 _log = logging.getLogger("pycrorm_async.projections")
 
 
 class Growing(Protocol):
-    """Where a generation is noted."""
+    """The owner of a generation's row in `pycrorm_generation`."""
 
     async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-        """Makes what this layout has more, and notes it."""
+        """Create the tables and columns that only this layout has, and store the layout."""
         ...
 
 
 async def grow(
-    connection: AsyncConnection, goal: Growing, generation: Generation, payloads: Sequence[bytes]
+    connection: AsyncConnection, target: Growing, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
-    """The generation with the tables of these declarations, as far as the database makes them and one slice holds them.
+    """Create the tables of these declarations, up to one slice and without those that the database refuses.
 
-    Raises what is no refusal of a declaration; then the caller's transaction must be rolled back.
+    Returns the grown generation. Raises every database error that is not such a refusal; then the caller must roll its
+    transaction back.
     """
-    return await _grow(connection, goal, generation, _slice(generation.layout, payloads))
+    return await _grow(connection, target, generation, _slice(generation.layout, payloads))
 
 
 def _slice(layout: Layout, payloads: Sequence[bytes]) -> Sequence[bytes]:
-    """The first of these declarations that together bring as many new tables as one transaction makes."""
+    """Return the longest prefix of these declarations that needs at most `_SLICE` new tables."""
     accepted = unite(layout, payloads).accepted
     new: set[str] = set()
     for place, payload in enumerate(payloads):
@@ -71,15 +71,15 @@ def _slice(layout: Layout, payloads: Sequence[bytes]) -> Sequence[bytes]:
 
 
 async def _grow(
-    connection: AsyncConnection, goal: Growing, generation: Generation, payloads: Sequence[bytes]
+    connection: AsyncConnection, target: Growing, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
     united = unite(generation.layout, payloads)
     if united.layout == generation.layout:
         return generation
     try:
         async with connection.begin_nested():
-            return await goal.grow(connection, generation, united.layout)
-    except (ArgumentError, CompileError, IdentifierError) as error:  # its statement could not even be written
+            return await target.grow(connection, generation, united.layout)
+    except (ArgumentError, CompileError, IdentifierError) as error:  # SQLAlchemy cannot express the definition
         reason = str(error)
     except dialect_of(connection).faults as error:
         refusal = dialect_of(connection).refusal(error)
@@ -88,14 +88,14 @@ async def _grow(
         reason = refusal
     if len(payloads) > 1:
         middle = len(payloads) // 2
-        generation = await _grow(connection, goal, generation, payloads[:middle])
-        return await _grow(connection, goal, generation, payloads[middle:])
+        generation = await _grow(connection, target, generation, payloads[:middle])
+        return await _grow(connection, target, generation, payloads[middle:])
     name = fingerprint(payloads[0])
-    if name not in united.accepted:  # not its tables: a view that stands before all of them
-        return await goal.grow(connection, generation, united.layout)
+    if name not in united.accepted:  # the declaration has no tables, so a view is at fault: raise its error
+        return await target.grow(connection, generation, united.layout)
     dtype = united.accepted[name].dtype
-    remedy = ": rename yours, then open the memory again" if "already exists" in reason else ""
-    reason = f"the database makes no tables for {dtype}: {' '.join(reason.split())}{remedy}"
-    grown = await goal.grow(connection, generation, generation.layout.with_unmade(name, reason))
-    _log.warning("%s; its episodes are parked, all others go on", reason)
+    remedy = ": rename your table or view, then open the memory again" if "already exists" in reason else ""
+    reason = f"the database refuses the tables of {dtype}: {' '.join(reason.split())}{remedy}"
+    grown = await target.grow(connection, generation, generation.layout.with_unmade(name, reason))
+    _log.warning("%s; episodes that use this type are parked, all others continue", reason)
     return grown

@@ -1,11 +1,11 @@
-"""What designator types add to the tables: a leaf table each, which views show it, which class its rows become.
+"""Compute the leaf tables, columns and views that declared designator types need.
 
-A layout only grows. Declarations unite in the order they came: a new field is a new column; a column that would need
-two types is refused with both named, and so is the declaration that brought it. A type's view shows the rows of all
-tables of that type and of the types that descend from it, so `pick_up_action` has every careful pick-up too.
+A layout only grows. Declarations are united in the order in which they were stored: a new field is a new column. A
+declaration that gives a column a second type is refused, with both types named. A type's view shows the rows of all
+tables of that type and of its descendants, so `pick_up_action` also shows every careful pick-up.
 
-A type that was renamed is one type: the declaration with its new name says the old ones (`aliases`), the tables of all
-of them are its tables, and each of their views shows all of it, whichever declaration came first.
+A renamed type is one type: the declaration with its new name lists the old ones (`aliases`), the tables of all these
+names are its tables, and each of their views shows all its rows, whichever declaration was stored first.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ STORED_AS: dict[FieldType, Storage] = {
     "pose": "pose",
     "object": "object",
 }
-"""A field's column; lists and dicts have none."""
+"""The storage of a field's column, by field type; lists and dicts have no column."""
 
 COLUMNS_MAX = 1_000
-"""Columns of one type, over all its declarations: a table of SQLite has 2,000 at most, one of PostgreSQL 1,600."""
+"""Bounds the columns of one type over all its declarations: SQLite allows 2,000 a table, PostgreSQL 1,600."""
 LEAVES_MAX = 2_000
-"""Leaf tables of one memory. Whoever reads the view of a type on PostgreSQL locks the tables of all its descendants,
-with an index each, and a server as it is installed has room for some 7,000 locks."""
+"""Bounds the leaf tables of one memory: a query of a type's view on PostgreSQL locks the tables of all its descendants
+with an index each, and a default server has room for some 7,000 locks."""
 
 _BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Language"}
 
 
 class Contradictory(ValueError):
-    """A declaration that cannot share the tables with what is there."""
+    """A declaration contradicts the layout, so it cannot share its tables."""
 
 
 class Leaf(NamedTuple):
-    """A leaf table as one class or declaration has it."""
+    """A leaf table as one class or one declaration defines it."""
 
     table: str
     columns: dict[str, Storage]
@@ -57,7 +57,7 @@ class Leaf(NamedTuple):
 
 
 class DesignatorType(msgspec.Struct, frozen=True):
-    """What is known of a dtype: its kind, its tables (the first one first), the recorded types it descends from."""
+    """A dtype's kind, its tables (the oldest first) and the recorded types it descends from."""
 
     kind: str
     tables: tuple[str, ...]
@@ -65,7 +65,7 @@ class DesignatorType(msgspec.Struct, frozen=True):
 
 
 class Kept(msgspec.Struct, frozen=True):
-    """The tables of a user's view that is kept: its columns, its rows, and how far it is with each episode."""
+    """The tables of a materialised view: `table` contains its rows, `progress` its checkpoint for each episode."""
 
     columns: dict[str, Storage]
     table: str
@@ -75,9 +75,13 @@ class Kept(msgspec.Struct, frozen=True):
 class Layout(msgspec.Struct, frozen=True):
     """Leaf tables by name, designator types by dtype, and users' views of one memory.
 
-    Of views the meaning as SQL, by name; the tables of those that are kept; and tables of kept views whose meaning was
-    changed. `renamed` gives the present name of types by those they had before; `unmade`, by fingerprint, why the
-    database refused to make the tables of a declaration; `unreadable` are declarations that no view may read as JSON.
+    Attributes:
+        user_views: SQL of every user's view, by name.
+        kept: tables of the materialised ones, by name.
+        outdated: tables of materialised views whose SQL was changed.
+        renamed: present names of types, by former name.
+        unmade: by fingerprint, the database's reason for refusing the tables of a declaration.
+        unreadable: fingerprints of declarations that are not JSON a database can read.
     """
 
     leaves: dict[str, dict[str, Storage]] = {}
@@ -90,7 +94,7 @@ class Layout(msgspec.Struct, frozen=True):
     unreadable: tuple[str, ...] = ()
 
     def with_leaves(self, leaves: Iterable[Leaf]) -> Self:
-        """With the tables of these mapped classes; what is declared already wins."""
+        """Return the layout with the tables of these mapped classes; a declared column or type takes precedence."""
         tables, types = dict(self.leaves), dict(self.types)
         for leaf in leaves:
             tables[leaf.table] = leaf.columns | tables.get(leaf.table, {})
@@ -99,25 +103,25 @@ class Layout(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(self, leaves=tables, types=types)
 
     def with_unmade(self, declaration: str, reason: str) -> Self:
-        """Without tables for the declaration of this fingerprint, and why."""
+        """Return the layout with the reason why the declaration of this fingerprint has no tables."""
         return msgspec.structs.replace(self, unmade=self.unmade | {declaration: reason})
 
     def with_unreadable(self, declarations: Iterable[str]) -> Self:
-        """Remembering the fingerprints of declarations that are not JSON a database can read."""
+        """Return the layout with the fingerprints of declarations that are not JSON a database can read."""
         every = dict.fromkeys((*self.unreadable, *declarations))
         return msgspec.structs.replace(self, unreadable=tuple(every))
 
     def with_views(self, views: Mapping[str, str], kept: Mapping[str, Kept]) -> Self:
-        """With these users' views, in place of those of the same names."""
-        now = {name: each for name, each in self.kept.items() if name not in views} | dict(kept)
+        """Return the layout with these users' views, which replace those of the same names."""
+        present = {name: each for name, each in self.kept.items() if name not in views} | dict(kept)
         old = {table for each in self.kept.values() for table in (each.table, each.progress)}
-        old -= {table for each in now.values() for table in (each.table, each.progress)}
+        old -= {table for each in present.values() for table in (each.table, each.progress)}
         return msgspec.structs.replace(
-            self, user_views=self.user_views | dict(views), kept=now, outdated=(*self.outdated, *sorted(old))
+            self, user_views=self.user_views | dict(views), kept=present, outdated=(*self.outdated, *sorted(old))
         )
 
     def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
-        """With the table of this type. Raises `Contradictory` and says why."""
+        """Return the layout with the table of this type. Raises `Contradictory` with the reason."""
         fault = fault_in_declaration(declared)
         if fault is not None:
             raise Contradictory(f"{declared.dtype[:80]}: {fault}")
@@ -126,24 +130,26 @@ class Layout(msgspec.Struct, frozen=True):
         former = tuple(each for each in declared.aliases if each != dtype and self.present_name(each) != dtype)
         for each in former:
             if self.renamed.get(each, each) not in declared.aliases:
-                raise Contradictory(f"{each} became {self.renamed[each]}, and {dtype} was {each} too: drop that alias")
-        known = self.types.get(dtype) or DesignatorType(declared.kind, ())
-        one = [known, *(self.types[each] for each in former if each in self.types)]
-        for type_ in one:
+                raise Contradictory(
+                    f"{each} was renamed to {self.renamed[each]}, so {dtype} cannot have the alias {each}: remove it"
+                )
+        present = self.types.get(dtype) or DesignatorType(declared.kind, ())
+        same_type = [present, *(self.types[each] for each in former if each in self.types)]
+        for type_ in same_type:
             if declared.kind != type_.kind:
                 raise Contradictory(f"{declared.dtype} is declared as {type_.kind} and as {declared.kind}")
-        others = (table for type_ in one for table in type_.tables)
-        tables = tuple(dict.fromkeys((*known.tables, declared.table, *others)))
+        others = (table for type_ in same_type for table in type_.tables)
+        tables = tuple(dict.fromkeys((*present.tables, declared.table, *others)))
         self._refuse_taken(declared, {dtype, *former})
-        # All tables of a type agree, also in columns that an author's class brought: else an earlier declaration of the
-        # type, accepted before, would be refused the next time.
+        # All tables of a type must agree, also in columns that come from an author's class. Otherwise an earlier
+        # declaration of the type, accepted already, would be refused the next time it is united.
         whole = self.leaves.get(declared.table, {}) | columns
         agreed = whole
         for table in tables:
             _refuse_different(declared.dtype, self.leaves.get(table, {}), agreed)
             agreed = agreed | self.leaves.get(table, {})
         if len(agreed) > COLUMNS_MAX:
-            raise Contradictory(f"{dtype} would have {len(agreed):,} columns, {COLUMNS_MAX:,} are the most")
+            raise Contradictory(f"{dtype} would have {len(agreed):,} columns, {COLUMNS_MAX:,} are allowed")
         if declared.table not in self.leaves and len(self.leaves) >= LEAVES_MAX:
             raise Contradictory(
                 f"{dtype} would be type {len(self.leaves) + 1:,}, a memory has tables for {LEAVES_MAX:,}"
@@ -153,28 +159,28 @@ class Layout(msgspec.Struct, frozen=True):
         return msgspec.structs.replace(
             self,
             leaves=self.leaves | {declared.table: whole},
-            types=types | {dtype: DesignatorType(declared.kind, tables, declared.bases or known.bases)},
+            types=types | {dtype: DesignatorType(declared.kind, tables, declared.bases or present.bases)},
             renamed=renamed | dict.fromkeys(former, dtype),
         )
 
     def present_name(self, dtype: str) -> str:
-        """What the type of this name is called now."""
+        """Return the present name of the type that has or had this name."""
         return self.renamed.get(dtype, dtype)
 
     def _refuse_taken(self, declared: DesignatorTypeDeclared, own: Collection[str]) -> None:
         if any(dtype in self.types and declared.table in self.types[dtype].tables for dtype in own):
-            return  # it was accepted before
-        asks = f"{declared.dtype} asks for the table {declared.table}"
+            return  # accepted by an earlier declaration
+        request = f"{declared.dtype} needs the table {declared.table}"
         for dtype, each in self.types.items():
             if declared.table in each.tables and dtype not in own:
-                raise Contradictory(f"{asks}, which is that of {dtype} (set another dtype)")
-        # Databases take names that differ in case alone for the same.
+                raise Contradictory(f"{request}, which belongs to {dtype} (set another dtype)")
+        # Databases treat names that differ only in case as equal.
         for name in (*self.user_views, *(each for each in self.leaves if each != declared.table)):
             if name.lower() == declared.table.lower():
-                raise Contradictory(f"{asks}, and {name} is there already (set another dtype)")
+                raise Contradictory(f"{request}, but {name} exists already (set another dtype)")
 
     def members(self, table: str) -> tuple[str, ...]:
-        """The leaf tables whose rows the view of `table` shows: its own, then those of its types' and descendants'."""
+        """Return the leaf tables whose rows the view of `table` shows: its own, those of its types and descendants."""
         own = {dtype for dtype, each in self.types.items() if table in each.tables}
         shown = [
             member
@@ -185,13 +191,13 @@ class Layout(msgspec.Struct, frozen=True):
         return tuple(dict.fromkeys((table, *shown)))
 
     def dtypes(self, table: str) -> tuple[str, ...]:
-        """What the nodes whose rows the view of `table` shows may be called, former names included."""
+        """Return the dtypes of the nodes whose rows the view of `table` shows, former names included."""
         shown = set(self.members(table))
         present = [dtype for dtype, each in self.types.items() if shown.intersection(each.tables)]
         return (*present, *(old for old, new in self.renamed.items() if new in present))
 
     def columns(self, table: str) -> dict[str, Storage]:
-        """The columns of the view of `table`: its own, and those of its type's other tables."""
+        """Return the columns of the view of `table`: its own, and those of its type's other tables."""
         tables = [table, *(other for each in self.types.values() if table in each.tables for other in each.tables)]
         named: dict[str, tuple[str, Storage]] = {}
         for each in tables:
@@ -200,20 +206,20 @@ class Layout(msgspec.Struct, frozen=True):
         return dict(named.values())
 
     def lineage(self, dtype: str) -> str:
-        """The names a row of this type answers to, nearest first, the last one a class that always exists."""
+        """Return the names under which a row of this type may be mapped, nearest first; the last always has a class."""
         present = self.present_name(dtype)
-        known = self.types[present]
-        names = self._names(present, known.tables)
-        for base in self._bases(known):
+        type_ = self.types[present]
+        names = self._names(present, type_.tables)
+        for base in self._bases(type_):
             names += self._names(base, self.types[base].tables if base in self.types else ())
-        return " ".join([*names, _BASE_OF_KIND[known.kind]])
+        return " ".join([*names, _BASE_OF_KIND[type_.kind]])
 
     def _names(self, dtype: str, tables: tuple[str, ...]) -> list[str]:
         former = [old for old, present in self.renamed.items() if present == dtype]
         return [dtype, *(table for table in reversed(tables) if table != table_name(dtype)), *former]
 
     def _bases(self, each: DesignatorType) -> list[str]:
-        """Without those of another kind: a motion is never among the actions, whatever its class descends from."""
+        """Return the bases of the same kind: a motion is never an action, even if its class derives from one."""
         bases = [self.present_name(base) for base in each.bases]
         return [base for base in bases if base not in self.types or self.types[base].kind == each.kind]
 
@@ -221,9 +227,9 @@ class Layout(msgspec.Struct, frozen=True):
 def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mapping[str, Storage]) -> None:
     lowered = {name.lower(): name for name in present}
     for column, storage in columns.items():
-        known = lowered.get(column.lower(), column)
-        if known != column:
-            raise Contradictory(f"{dtype} is declared with the column {known} and with {column}: rename one")
+        existing = lowered.get(column.lower(), column)
+        if existing != column:
+            raise Contradictory(f"{dtype} is declared with the column {existing} and with {column}: rename one")
         if present.get(column, storage) != storage:
             raise Contradictory(
                 f"{dtype}.{column} is declared as {present[column]} and as {storage}"
@@ -232,7 +238,7 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
 
 
 class Union(NamedTuple):
-    """The layout with all that was accepted; by fingerprint, what was accepted and why the others were refused."""
+    """The layout with the accepted declarations; by fingerprint, those declarations and the reasons of refusals."""
 
     layout: Layout
     accepted: dict[str, DesignatorTypeDeclared]
@@ -240,7 +246,7 @@ class Union(NamedTuple):
 
 
 def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
-    """The layout with these declarations, as far as they can share the tables."""
+    """Add to the layout those of these declarations that can share its tables."""
     accepted: dict[str, DesignatorTypeDeclared] = {}
     refused: dict[str, str] = {}
     for payload in payloads:
@@ -254,14 +260,14 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
             accepted[name] = declared
         except Contradictory as reason:
             refused[name] = str(reason)
-        except (UnknownShape, msgspec.DecodeError) as error:  # a newer version's, or damaged
+        except (UnknownShape, msgspec.DecodeError) as error:  # from a newer version, or damaged
             refused[name] = f"this version cannot read the declaration of its type: {error}"
     unreadable = [fingerprint(each) for each in payloads if not _is_readable(each)]
     return Union(layout.with_unreadable(unreadable) if unreadable else layout, accepted, refused)
 
 
 def _is_readable(payload: bytes) -> bool:
-    """Whether a database can take a member out of it: it is JSON without U+0000, which PostgreSQL has in no text."""
+    """Return whether both databases can extract a member: PostgreSQL refuses JSON that contains U+0000."""
     if b"\\u0000" in payload:
         return False
     try:

@@ -1,7 +1,7 @@
-"""The leaf tables that mapped classes stand on, so that a fresh memory answers all of them with nothing.
+"""List the leaf tables of the mapped classes, so that a query of any class on a new memory returns no rows.
 
-The built-in classes name their dtype themselves. A class somebody else declared (`class ORMSaying(Action)`) only has a
-table until a designator says which dtype is kept there. Classes of one memory alone come from its declarations.
+A built-in class has the dtype of its name. A class that a user declared (`class ORMSaying(Action)`) has only a table
+until a designator is declared for it. Classes that exist in one memory only are derived from its declarations.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _ROOTS = (Designator, *_KINDS)
 
 
 def mapped_leaves() -> list[Leaf]:
-    """Those of all classes below `Designator` that every memory of this process shares."""
+    """Return the tables of all classes below `Designator` that every memory of this process shares."""
     return list(_leaves(Designator.__mapper__))
 
 
@@ -51,7 +51,7 @@ def _storage(column: Column[object]) -> Storage:
 
 
 def storage_of(type_: TypeEngine[Any]) -> Storage:
-    """How a value of this type is stored."""
+    """Return the storage of a SQLAlchemy type."""
     kinds: tuple[tuple[type, Storage], ...] = (
         (Moment, "time"),
         (Boolean, "boolean"),

@@ -1,8 +1,8 @@
-"""Users' views that are kept as tables: an episode that has changed has its rows deleted and inserted again.
+"""Keep materialised views up to date: delete and insert again the rows of each episode that has changed.
 
-So such a view is exact if each of its rows comes from one episode alone, which its column `process_metadata_id` names.
-A table beside it notes how much of each episode was folded when its rows were made. Whoever folds keeps it up to date,
-also a process that does not know the view: what it means is noted as SQL.
+The result is exact because each row comes from one episode only, which its column `process_metadata_id` names. A
+second table stores how much of each episode was folded when its rows were computed. Every process that folds refreshes
+all materialised views, because their SQL is stored in the database.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ __all__ = ["EPISODE", "make_kept", "refresh_some", "shown_texts", "kept_tables"]
 
 EPISODE = "process_metadata_id"
 _EPISODES = 200
-"""So many episodes are made anew in one transaction."""
+"""Bounds the episodes refreshed in one transaction, and so the time for which it locks out other writers."""
 _PROGRESS: dict[str, Storage] = {"id": "key", "folded": "integer"}
 
 
 async def make_kept(connection: AsyncConnection, kept: Kept, generation: int) -> None:
-    """Makes its two tables, empty."""
+    """Create the two tables of a materialised view, empty."""
     stored = dialect_of(connection).stored_column
     rows = make_table(kept.table, kept.columns, generation, stored)
     await connection.execute(CreateTable(rows))
@@ -36,13 +36,13 @@ async def make_kept(connection: AsyncConnection, kept: Kept, generation: int) ->
 
 
 def kept_tables(layout: Layout) -> list[str]:
-    """All tables of kept views, also of those whose meaning was changed since."""
-    now = [name for kept in layout.kept.values() for name in (kept.table, kept.progress)]
-    return [*now, *layout.outdated]
+    """Return all tables of materialised views, including those of views whose SQL was changed since."""
+    present = [name for kept in layout.kept.values() for name in (kept.table, kept.progress)]
+    return [*present, *layout.outdated]
 
 
 def shown_texts(layout: Layout, generation: int, stored: Callable[[str], str]) -> dict[str, str]:
-    """Name and SQL of every user's view, as people see it."""
+    """Return name and public SQL of every user's view; that of a materialised view selects from its table."""
     texts = dict(layout.user_views)
     for name, kept in layout.kept.items():
         renamed = any(stored(each) != each for each in kept.columns)
@@ -54,17 +54,17 @@ def shown_texts(layout: Layout, generation: int, stored: Callable[[str], str]) -
 async def refresh_some(
     connection: AsyncConnection, layout: Layout, generation: int, *, folded: str = "SELECT number, folded FROM episode"
 ) -> bool:
-    """Makes the rows of some changed episodes anew, as the connection's views show them; False if none has changed.
+    """Refresh the rows of some changed episodes from the connection's views; return False if none has changed.
 
     Args:
-        connection: everything happens in its transaction; nobody else refreshes meanwhile.
+        connection: in a transaction that excludes other refreshes.
         layout, generation: of the tables behind the views.
-        folded: what tells, for each episode, how much of it they show.
+        folded: SQL that selects, for each episode, the last sequence in those tables.
     """
     done = False
     for name, kept in layout.kept.items():
         table, progress = physical_name(kept.table, generation), physical_name(kept.progress, generation)
-        found = await connection.execute(
+        episodes = await connection.execute(
             text(
                 f"SELECT source.number, source.folded FROM ({folded}) AS source"  # noqa: S608
                 f" LEFT JOIN {progress} AS progress ON progress.id = source.number"
@@ -72,21 +72,21 @@ async def refresh_some(
             ),
             {"limit": _EPISODES},
         )
-        behind = [tuple(row) for row in found]
+        behind = [tuple(row) for row in episodes]
         if not behind:
             continue
         done = True
         numbers = ", ".join(str(int(number)) for number, _ in behind)
         columns = ", ".join(f'"{each}"' for each in kept.columns)
         stored = ", ".join(f'"{dialect_of(connection).stored_column(each)}"' for each in kept.columns)
-        meaning = layout.user_views[name]
-        some = f"{EPISODE} IN ({numbers})"
+        query = layout.user_views[name]
+        changed = f"{EPISODE} IN ({numbers})"
         for statement in (
-            f"DELETE FROM {table} WHERE {some}",  # noqa: S608
-            f"INSERT INTO {table} ({stored}) SELECT {columns} FROM ({meaning}) AS meaning WHERE {some}",  # noqa: S608
+            f"DELETE FROM {table} WHERE {changed}",  # noqa: S608
+            f"INSERT INTO {table} ({stored}) SELECT {columns} FROM ({query}) AS meaning WHERE {changed}",  # noqa: S608
             f"DELETE FROM {progress} WHERE id IN ({numbers})",  # noqa: S608
         ):
-            await connection.exec_driver_sql(statement)  # a meaning may hold what looks like a parameter
+            await connection.exec_driver_sql(statement)  # unlike `text()` it leaves a ':name' alone
         dialect = dialect_of(connection)
         await dialect.insert(connection, await dialect.insertion({(progress, tuple(_PROGRESS)): behind}))
     return done

@@ -1,10 +1,10 @@
-"""The views in front of a generation's tables: what people and the mapped classes read under a table's own name.
+"""Define the public views: the selects over a generation's tables that queries and mapped classes read.
 
-Most show their table as it is. `designator`, `action`, `motion`, `language` and `robot_state` are cut from
+Most views select their table unchanged. `designator`, `action`, `motion`, `language` and `robot_state` select from
 `task_tree_node`, `position` and `quaternion` from `pose`; a leaf's view unites the tables of its descendants.
 
-They show what really happened, whoever reads them and with whatever; what was only thought through is left out. Who
-asks for that too (`query.thoughts`) gets views of the same names that leave out nothing, for one connection.
+The views exclude simulations, so that every reader sees only what really happened. `session_views` replaces them, for
+one connection, by views of the same names that include simulations.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ View: TypeAlias = Select[Any] | CompoundSelect[Any]
 _Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
 
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
-"""So many bits of a row's id are below the episode's number."""
+"""The bits of a row's id below the episode's number."""
 
 _UNITED_MAX = 400
-"""Selects in one UNION: SQLite takes 500. More are united in groups, which both databases read as one UNION."""
+"""Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
 
 _PICKED = "pick_up_action"
 
@@ -58,7 +58,7 @@ _declaration = table("pycrorm_declaration", column("fingerprint"), column("paylo
 
 
 class _Member(FunctionElement[str]):
-    """A member of a JSON object that is kept as text, as text itself; an object or a list as JSON."""
+    """A member of a JSON object stored as text: a string as text, an object or a list as JSON."""
 
     name = "json_member"
     type = Text()
@@ -82,12 +82,11 @@ def _member(document: ColumnElement[Any], name: str) -> ColumnElement[str]:
 
 
 class _Absent(ColumnElement[bool]):
-    """Whether a number is not among those of a table that is nothing but a key: one look into it for each row.
+    """The condition that a number is not in a table of keys, evaluated by one index lookup for each row.
 
-    Measured beside 20,000 thoughts, a question for one episode takes as long as without them, and all pick-ups are read
-    no slower. To list the thoughts first, which is what PostgreSQL makes of NOT IN, takes it 10 to 80 ms; it is no
-    better off with NOT EXISTS, which is one join more for every view a question stands on. SQLite looks into the key by
-    itself, and is slower with any other form.
+    With 20,000 simulations in the table, a query for one episode and a query for all pick-ups take as long as without
+    any. PostgreSQL evaluates NOT IN by listing all simulations first, which takes 10 to 80 ms, and NOT EXISTS by one
+    more join for each view in a query. SQLite uses the index for NOT IN and is slower with any other form.
     """
 
     inherit_cache = False
@@ -114,18 +113,18 @@ def _is_null(element: _Absent, compiler: Any, **options: Any) -> str:
 def public_views(
     layout: Layout, generation: int, stored: Callable[[str], str], *, simulated: bool = False
 ) -> dict[str, View]:
-    """Name and meaning of every view in front of this generation; users' views not among them.
+    """Return name and select of every view in front of this generation, except users' views.
 
     Args:
-        layout, generation: of the tables behind them.
-        stored: gives the names of the tables' columns in this database.
-        simulated: they also show what was only thought through.
+        layout, generation: of the tables behind the views.
+        stored: maps a column to its name in this database.
+        simulated: the views include simulations.
     """
     core = {name: make_table(name, columns, generation, stored) for name, columns in CORE.items()}
-    thoughts = core.pop("simulated_episode")
+    simulations = core.pop("simulated_episode")
 
     def shown(view: Select[Any], rows: Table) -> Select[Any]:
-        return view if simulated else view.where(_happened(rows, thoughts))
+        return view if simulated else view.where(_happened(rows, simulations))
 
     views: dict[str, View] = {name: shown(select(each), each) for name, each in core.items()}
     views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
@@ -134,9 +133,9 @@ def public_views(
     }
     views |= {name: _leaf(name, layout, leaves, shown) for name in layout.leaves}
     if _PICKED in layout.leaves:
-        node, thing, pose = (core[name] for name in ("task_tree_node", "object", "pose"))
+        node, object_, pose = (core[name] for name in ("task_tree_node", "object", "pose"))
         picked = _leaf(_PICKED, layout, leaves, lambda view, _: view).subquery("picked")
-        view = pick_ups_with_context(picked, node, thing, pose, layout.dtypes(_PICKED))
+        view = pick_ups_with_context(picked, node, object_, pose, layout.dtypes(_PICKED))
         views["PickUpWithContextView"] = shown(view, node)
     views["designator_type"] = _designator_type(layout)
     return views
@@ -145,22 +144,25 @@ def public_views(
 def own_views(
     layout: Layout, number: int, generation: int, stored: Callable[[str], str], *, simulated: bool = False
 ) -> dict[str, View]:
-    """The same for the tables of a projection of its generation `number`; `generation` is that of our tables."""
-    thoughts = make_table("simulated_episode", CORE["simulated_episode"], generation, stored)
+    """Return the views of a custom projection.
+
+    `number` is the generation of its own tables, `generation` that of the built-in tables.
+    """
+    simulations = make_table("simulated_episode", CORE["simulated_episode"], generation, stored)
     views: dict[str, View] = {}
     for name, columns in layout.leaves.items():
         rows = make_table(name, {"id": "key", **columns}, number, stored)
-        view = select(*map(_shown, rows.c))
-        views[name.removeprefix(OWN)] = view if simulated else view.where(_happened(rows, thoughts))
+        view = select(*map(_labelled, rows.c))
+        views[name.removeprefix(OWN)] = view if simulated else view.where(_happened(rows, simulations))
     return views
 
 
-def _happened(rows: Table, thoughts: Table) -> ColumnElement[bool]:
-    """Whether a row is not of an episode that was only thought through."""
+def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
+    """Return the condition that a row does not belong to a simulation."""
     if "simulated" in rows.c:
         return ~rows.c.simulated
     number = rows.c.process_metadata_id if "process_metadata_id" in rows.c else rows.c.id.bitwise_rshift(_NUMBER_BITS)
-    return _Absent(number, thoughts.c.id)
+    return _Absent(number, simulations.c.id)
 
 
 def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
@@ -172,14 +174,14 @@ def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
 
 
 def _designator_type(layout: Layout) -> View:
-    """Without what cannot be read as JSON, whichever part of it is asked for."""
-    declared: ColumnElement[Any] = _declaration.c.payload
+    """Return the view of declarations. It never parses one that is not JSON, whichever column a query reads."""
+    payload: ColumnElement[Any] = _declaration.c.payload
     if layout.unreadable:
         unreadable = _declaration.c.fingerprint.in_(layout.unreadable)
-        declared = case((unreadable, "{}"), else_=declared)
+        payload = case((unreadable, "{}"), else_=payload)
 
     def member(name: str) -> ColumnElement[Any]:
-        return _member(declared, name)
+        return _member(payload, name)
 
     view = select(
         _declaration.c.fingerprint,
@@ -219,15 +221,15 @@ def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
 
 
 def _lineage(nodes: Table, layout: Layout) -> ColumnElement[str]:
-    """Only types that descend from recorded ones, or have a table of another name, need an entry of their own."""
+    """Return the lineage of a node's type. Only types with bases or with another table name need their own case."""
     kind = case({"action": " Action", "motion": " Motion", "language": " Language"}, value=nodes.c.kind)
     ordinary: ColumnElement[str] = nodes.c.dtype.concat(kind)
-    special = {
+    exceptions = {
         dtype: layout.lineage(dtype)
         for dtype, each in layout.types.items()
         if each.bases or each.tables != (table_name(dtype),)
     } | {dtype: layout.lineage(dtype) for dtype in layout.renamed}
-    return case(special, value=nodes.c.dtype, else_=ordinary) if special else ordinary
+    return case(exceptions, value=nodes.c.dtype, else_=ordinary) if exceptions else ordinary
 
 
 def _of_kind(kind: str) -> _Cut:
@@ -277,7 +279,7 @@ _CUT: dict[str, tuple[str, _Cut]] = {
     "position": ("pose", _position),
     "quaternion": ("pose", _quaternion),
 }
-"""Name, the table its rows are from, and how they are cut."""
+"""Views that differ from their table: by name, the table their rows come from and the function that selects them."""
 
 
 def _leaf(
@@ -286,27 +288,27 @@ def _leaf(
     leaves: Mapping[str, Table],
     shown: Callable[[Select[Any], Table], Select[Any]],
 ) -> View:
-    """The rows of a leaf table and of its members, with the columns of its type; what a member lacks is null."""
+    """Return the rows of a leaf table and of its members; a column that a member lacks is null."""
     parts = []
-    together = layout.columns(name)
+    united_columns = layout.columns(name)
     for member in layout.members(name):
         rows = leaves[member]
         columns: list[ColumnElement[Any]] = [rows.c.id]
-        for each, storage in together.items():
+        for each, storage in united_columns.items():
             same = layout.leaves[member].get(each) == storage
-            columns.append(_shown(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
+            columns.append(_labelled(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
         parts.append(shown(select(*columns), rows))
     return _united(parts)
 
 
 def _united(parts: Sequence[Select[Any]]) -> View:
-    """All rows of these, which have the same columns."""
+    """Return the union of these selects, which have the same columns."""
     while len(parts) > _UNITED_MAX:
         groups = [parts[first : first + _UNITED_MAX] for first in range(0, len(parts), _UNITED_MAX)]
         parts = [select(union_all(*each).subquery()) for each in groups]
     return parts[0] if len(parts) == 1 else union_all(*parts)
 
 
-def _shown(column: Column[Any]) -> ColumnElement[Any]:
-    """A column under the name it has in the view."""
+def _labelled(column: Column[Any]) -> ColumnElement[Any]:
+    """Return the column under its name in the view."""
     return column if column.name == column.key else column.label(column.key)

@@ -1,4 +1,4 @@
-"""A connection that sees other views than everybody: its own, temporary ones, which a database looks for first."""
+"""Open a connection whose temporary views hide the public views of the same names."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ __all__ = ["with_views", "all_views"]
 
 @asynccontextmanager
 async def with_views(engine: AsyncEngine, views: Mapping[str, str]) -> AsyncIterator[AsyncConnection]:
-    """A connection that sees these views in place of everybody's of the same names. No transaction is begun in it.
+    """Open a connection on which these views replace the public views of the same names, outside a transaction.
 
-    A view may stand on those before it. The connection is closed with all of them when it is given back.
+    A view may select from those before it. The connection is closed at the end and never returns to the pool.
     """
     async with engine.connect() as connection:
         await dialect_of(connection).shadow_views(connection, views)
@@ -25,10 +25,10 @@ async def with_views(engine: AsyncEngine, views: Mapping[str, str]) -> AsyncIter
         try:
             yield connection
         finally:
-            await connection.invalidate()  # it never goes back to the pool
+            await connection.invalidate()  # in the pool it would keep its temporary views
 
 
 async def all_views(connection: AsyncConnection, generation: Generation) -> dict[str, str]:
-    """Name and SQL of every view there is, as it is without anything left out; a view stands on those before it."""
+    """Return name and SQL of every view including simulations; a view may select from those before it."""
     projections = projections_in(await all_noted(connection))
     return view_texts_of(connection, generation, projections, simulated=True)

@@ -1,8 +1,8 @@
-"""The tables every memory has, column by column; what designator types add is in `layout`.
+"""Define the tables that every memory has, column by column; `layout` adds those of designator types.
 
-Every row knows its episode (`process_metadata_id`). Row ids are made of (episode number, sequence, slot), see
-`pycrorm_async.events.ids`: a node, its designator and its leaf row have one id; an object's row and its pose too. No
-foreign key is enforced here, that would cost a third of the rate; `verify` is the integrity check.
+Every row names its episode (`process_metadata_id`). Row ids are computed from (episode number, sequence, slot), see
+`pycrorm_async.events.ids`: a node, its designator and its leaf row have one id, and so have an object's row and its
+pose. Foreign keys are not enforced, because that would cost a third of the write rate; `verify` checks integrity.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ __all__ = [
 ]
 
 Storage: TypeAlias = Literal["key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json"]
-"""How a column is stored: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON."""
+"""The storage of a column: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON."""
 
 OWN = "pycrorm_own_"
-"""What the names of tables of people's projections begin with, so that no designator's table is ever in their way."""
+"""The prefix of the tables of custom projections, so that they never collide with the table of a designator."""
 
 _POSE: dict[str, Storage] = {
     "x": "real",
@@ -193,10 +193,10 @@ CORE: dict[str, dict[str, Storage]] = {
         "ns": "integer",
     },
 }
-"""Table by table, column by column, in the order a fold gives the values.
+"""The columns of each table, in the order in which the fold writes their values.
 
-`simulated_episode` has no view. It repeats which episodes were only thought through, so that the others' rows are told
-from theirs by a look into a table that is small and nothing but a key.
+`simulated_episode` has no view. It repeats the ids of simulations, so that every view can exclude their rows by a
+lookup in a small table that consists of its key only.
 """
 
 COLUMNS = {table: tuple(columns) for table, columns in CORE.items()}
@@ -217,12 +217,12 @@ _INDEXED = {
     "state_sample": ("process_metadata_id", "node_id"),
 }
 
-_GOES_ON = {("task_tree_node", "dtype"): ("status",)}
-"""What an index has after its first column: how the nodes of a type ended is what people learn from."""
+_SECOND_COLUMNS = {("task_tree_node", "dtype"): ("status",)}
+"""Further key columns of an index, after its first: learning queries filter the nodes of a type by status."""
 
 _INCLUDES = {("task_tree_node", "dtype"): ("id", "robot_pose_id", "torso_height", "simulated")}
-"""What PostgreSQL's index holds beside, so that where the robot was when the nodes of a type ended is known without a
-look at each of them in a page of its own: the learning query over 50,000 pick-ups takes some 70 ms instead of 100."""
+"""Columns stored in PostgreSQL's index without being part of its key. An index-only scan saves reading a page for each
+node, so the learning query over 50,000 pick-ups takes some 70 ms instead of 100."""
 
 _EXPECTED = {"process_metadata": 1_000, "simulated_episode": 100}
 _EXPECTED_CORE, _EXPECTED_LEAF = 1_000_000, 50_000
@@ -234,24 +234,24 @@ _ALIKE = {
     "obj_type": [10_000],
 }
 _ALIKE_OTHERS = [10]
-"""Of a memory of a thousand episodes: rows of each table, and rows that have the same value in the first column of an
-index, in the first two."""
+"""Estimates for a memory of a thousand episodes, given to SQLite's planner: the rows of each table, and the rows that
+have the same value in an index's first column and in its first two."""
 
 
 _NAME_LENGTH_MAX = 63
-"""So many bytes of a name PostgreSQL keeps."""
+"""The longest name in bytes; PostgreSQL truncates longer ones."""
 
 
 def physical_name(table: str, generation: int) -> str:
-    """Where the rows are: `pose__1`."""
+    """Return the name of the table that contains the rows, such as `pose__1`."""
     number = f"__{generation}"
     return f"{bounded(table, _NAME_LENGTH_MAX - len(number))}{number}"
 
 
 def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> Table:
-    """The table and its indexes, in one generation.
+    """Return the table with its indexes, in one generation.
 
-    `stored` gives the names of columns in this database; the keys of the table's columns are those of the layout.
+    `stored` maps a column of the layout to its name in this database; the table's column keys are those of the layout.
     """
     table = Table(
         physical_name(name, generation),
@@ -270,21 +270,21 @@ def make_table(name: str, columns: dict[str, Storage], generation: int, stored: 
     for column in indexed(name, columns):
         Index(
             index_name(name, column, generation),
-            *(table.c[each] for each in (column, *_GOES_ON.get((name, column), ()))),
+            *(table.c[each] for each in (column, *_SECOND_COLUMNS.get((name, column), ()))),
             postgresql_include=_INCLUDES.get((name, column), ()),
         )
     return table
 
 
 def indexed(name: str, columns: dict[str, Storage]) -> tuple[str, ...]:
-    """The columns that people filter and join by. Of a designator's own table: the objects it names."""
+    """Return the indexed columns: of a core table those that queries filter and join by, of a leaf its objects."""
     if name in CORE:
         return _INDEXED.get(name, ())
     return tuple(column for column, storage in columns.items() if storage == "object")
 
 
 def expected(name: str, columns: dict[str, Storage], generation: int) -> Expected:
-    """How a planner that counts nothing by itself is to take this table: the proportions matter, not the sizes."""
+    """Return the estimates for a planner without statistics of its own; the proportions matter, not the sizes."""
     rows = _EXPECTED.get(name, _EXPECTED_CORE if name in CORE else _EXPECTED_LEAF)
     alike = {
         index_name(name, column, generation): _ALIKE.get(column, _ALIKE_OTHERS) for column in indexed(name, columns)
@@ -293,11 +293,12 @@ def expected(name: str, columns: dict[str, Storage], generation: int) -> Expecte
 
 
 def index_name(name: str, column: str, generation: int) -> str:
+    """Return the name of the index on this column."""
     return bounded(f"{physical_name(name, generation)}_by_{column}", _NAME_LENGTH_MAX)
 
 
 def column_type(storage: Storage) -> TypeEngine[Any]:
-    """The column type; on SQLite a key must be called INTEGER to be the row's own place in the table."""
+    """Return the column type. On SQLite only a key declared INTEGER becomes the rowid."""
     match storage:
         case "key":
             return BigInteger().with_variant(Integer(), "sqlite")

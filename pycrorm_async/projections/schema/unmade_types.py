@@ -1,4 +1,4 @@
-"""The designator types of a memory that have no tables, and why; each stops the episodes that perform it."""
+"""List the designator types of a memory that have no tables, with the reasons; episodes that use one are parked."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from pycrorm_async.store.log import EventLog
 __all__ = ["unmade_types"]
 
 
-class _Named(msgspec.Struct):
+class _DtypeOnly(msgspec.Struct):
     dtype: str = ""
 
 
 async def unmade_types(log: EventLog) -> dict[str, str]:
-    """By dtype, or by fingerprint where a declaration has no dtype that can be read."""
+    """Return the reasons by dtype, or by fingerprint where the declaration's dtype cannot be read."""
     async with log.snapshot() as connection:
         generation = await noted(connection, SHOWN)
         payloads = await dialect_of(connection).declarations(connection)
@@ -29,6 +29,6 @@ async def unmade_types(log: EventLog) -> dict[str, str]:
 
 def _dtype(payload: bytes) -> str:
     try:
-        return msgspec.json.decode(payload, type=_Named).dtype
+        return msgspec.json.decode(payload, type=_DtypeOnly).dtype
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return ""

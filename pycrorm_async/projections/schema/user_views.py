@@ -1,4 +1,4 @@
-"""Views that users register: a name and a `select`, made beside the tables and made again with them.
+"""Define views that users register: a name and a `select`, created and rebuilt together with the tables.
 
 >>> successes = UserView("successful_grasps", select(PickUpWithContextView.grasp, PickUpWithContextView.status))
 >>> select(successes.table).where(successes.table.c.grasp == Grasp.TOP)
@@ -25,13 +25,13 @@ __all__ = ["UserView", "with_user_views", "view_texts", "view_text"]
 
 @dataclass(frozen=True)
 class UserView:
-    """A question with a name.
+    """A named query.
 
     Attributes:
-        name: of the view in the database; not that of a table of the memory.
-        meaning: a select over the mapped classes, or over anything else in this database.
-        materialised: its rows are kept, for questions that cost much. Each row must come from one episode alone, which
-            a column `process_metadata_id` names: an episode that has changed has its rows made anew, at every flush.
+        name: of the view in the database; a table of the memory must not have it.
+        meaning: a select over the mapped classes, or over any other table in this database.
+        materialised: the rows are stored, for expensive queries. Each row must come from one episode only, which a
+            column `process_metadata_id` names: the rows of a changed episode are computed again at every flush.
     """
 
     name: str
@@ -40,38 +40,38 @@ class UserView:
 
     @cached_property
     def table(self) -> TableClause:
-        """What to select from; `table.c` has its columns with their types."""
+        """The view as a table to select from; `table.c` has its columns with their types."""
         return table(self.name, *(column(name, each.type) for name, each in self.meaning.subquery().c.items()))
 
 
 def view_text(meaning: Any, dialect: Dialect) -> str:
-    """The SQL of a select, its parameters written in."""
+    """Return the SQL of a select, with its parameters as literals."""
     return str(meaning.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
 
 
 def with_user_views(layout: Layout, views: Sequence[UserView], dialect: Dialect) -> Layout:
-    """The layout with these views. Raises `CallerError` for a name that is taken, or rows that name no episode."""
+    """Return the layout with these views. Raises `CallerError` for a taken name, or a missing episode column."""
     texts = view_texts(views, layout, dialect)
     return layout.with_views(texts, {each.name: _kept(each, texts[each.name]) for each in views if each.materialised})
 
 
-def _kept(view: UserView, meaning: str) -> Kept:
+def _kept(view: UserView, sql: str) -> Kept:
     columns = {name: storage_of(each.type) for name, each in view.meaning.subquery().c.items()}
     if EPISODE not in columns:
         raise CallerError(f"the view {view.name} cannot be materialised: its rows name no episode (select {EPISODE})")
-    # Of another meaning it is another table: what there was cannot be shown under the new one.
-    digest = hashlib.blake2b(f"{view.name}{meaning}{columns}".encode(), digest_size=6).hexdigest()
+    # The digest gives a changed query another table, so that it never shows rows of the query before.
+    digest = hashlib.blake2b(f"{view.name}{sql}{columns}".encode(), digest_size=6).hexdigest()
     return Kept(columns, f"pycrorm_view_{digest}", f"pycrorm_view_{digest}_progress")
 
 
 def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> dict[str, str]:
-    """Name and SQL of these views. Raises `CallerError` for a name that is taken."""
+    """Return name and SQL of these views. Raises `CallerError` for a name that is taken."""
     taken = {name.lower() for name in layout.leaves}
     texts: dict[str, str] = {}
     for view in views:
         lowered = view.name.lower()
         if lowered in taken or is_reserved(view.name):
-            raise CallerError(f"a view cannot be called {view.name!r}: the name is taken (choose another)")
+            raise CallerError(f"the view name {view.name!r} is taken: choose another")
         taken.add(lowered)
         texts[view.name] = view_text(view.meaning, dialect)
     return texts
