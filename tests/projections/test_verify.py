@@ -16,9 +16,9 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.types import EpisodeEnded, NodeStarted
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.verify import verify as verifying
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.projections.verify.verify import verify
-from pycrorm_async.projections.verify.verify import verify as verifying
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
 from tests.projections.event_script import Script

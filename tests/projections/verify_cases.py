@@ -35,8 +35,8 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.verify import verify as verifying
 from pycrorm_async.projections.verify.verify import Verified, verify
-from pycrorm_async.projections.verify.verify import verify as verifying
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
