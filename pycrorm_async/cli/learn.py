@@ -20,12 +20,12 @@ from pycrorm_async.cli.output import note, print_facts, print_json, print_table
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
 from pycrorm_async.learning.evaluation import Study, study
-from pycrorm_async.learning.experiment import Experiment, Learned, Phase
+from pycrorm_async.learning.experiment import Experiment, ExperimentResult, Phase
 from pycrorm_async.learning.policies.default_policy import default_policy
 from pycrorm_async.learning.policies.policy_file import name_of, save_policy
 from pycrorm_async.learning.policies.policy_plot import draw_policies
-from pycrorm_async.learning.rollouts.kitchen_trial import KITCHEN, InKitchen, pick_up_in_kitchen
-from pycrorm_async.learning.rollouts.rollout_pool import Place
+from pycrorm_async.learning.rollouts.kitchen_trial import KITCHEN, KitchenResult, pick_up_in_kitchen
+from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
 from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
 from pycrorm_async.progress_bar import watched
@@ -97,7 +97,7 @@ def learn(
         episode_each=episode_each,
         resume=resume,
     )
-    place = Place(url, spool)
+    place = MemoryLocation(url, spool)
     with watched("rollouts", unit="rollouts") as bar:
 
         def watch(name: str, done: int, total: int, tally: Tally) -> None:
@@ -147,8 +147,8 @@ def _can_be_written(path: Path) -> bool:
 
 
 async def _learned(
-    experiment: Experiment, place: Place, study_rollouts: int, watch: Callable[..., None]
-) -> tuple[Learned, InKitchen, Study | None]:
+    experiment: Experiment, place: MemoryLocation, study_rollouts: int, watch: Callable[..., None]
+) -> tuple[ExperimentResult, KitchenResult, Study | None]:
     with Interrupting(patience=1).heeded():
         learned = await experiments.run(experiment, place, watch)
         studied = None
@@ -161,7 +161,7 @@ async def _learned(
 # --- telling it -----------------------------------------------------------------------------------------------
 
 
-def _print(learned: Learned, in_kitchen: InKitchen, studied: Study | None) -> None:
+def _print(learned: ExperimentResult, in_kitchen: KitchenResult, studied: Study | None) -> None:
     print_table(
         "Rollouts, as they are remembered",
         ("", "rollouts", "succeeded", "95 % interval", "a second", "failed at"),
@@ -204,7 +204,7 @@ def _print_study(studied: Study) -> None:
         ("scene", "default policy", "learned policy", "95 % interval"),
         [
             (str(each.scene), _percent(each.default), _percent(each.learned), _interval(each.learned))
-            for each in studied.elsewhere
+            for each in studied.scenes
         ],
     )
     print_table(
@@ -217,7 +217,7 @@ def _print_study(studied: Study) -> None:
     )
 
 
-def _kitchen(found: InKitchen) -> str:
+def _kitchen(found: KitchenResult) -> str:
     if found.done is None:
         return f"not picked up in {found.tries} tries: {found.failure}"
     x, y, _ = found.done.standing_position.position
@@ -225,7 +225,7 @@ def _kitchen(found: InKitchen) -> str:
     return f"picked up at try {found.tries}, {how}"
 
 
-def _coverage(learned: Learned) -> str:
+def _coverage(learned: ExperimentResult) -> str:
     if learned.coverage is None:
         return "unknown: none of the held-out rollouts succeeded; see with a larger --held-out and --resume"
     return f"{learned.coverage:.1%} of the held-out successes are possible under the learned policy"
@@ -256,7 +256,12 @@ def _stages(phase: Phase) -> str:
 
 
 def _document(
-    experiment: Experiment, learned: Learned, in_kitchen: InKitchen, studied: Study | None, policy: Path, figure: Path
+    experiment: Experiment,
+    learned: ExperimentResult,
+    in_kitchen: KitchenResult,
+    studied: Study | None,
+    policy: Path,
+    figure: Path,
 ) -> dict[str, Any]:
     done = in_kitchen.done
     return {
@@ -303,7 +308,7 @@ def _study_document(studied: Study) -> dict[str, Any]:
         ],
         "elsewhere": [
             {"scene": str(each.scene), "default": _counts(each.default), "learned": _counts(each.learned)}
-            for each in studied.elsewhere
+            for each in studied.scenes
         ],
         "costs": [
             {

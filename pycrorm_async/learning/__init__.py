@@ -1,4 +1,4 @@
-"""Getting better from what is remembered (thesis 5.2): policies over pick-ups, learned from those that went well.
+"""Learn policies for pick-ups from the recorded pick-ups that succeeded (thesis 5.2).
 
 >>> policy = learn(await memory.dataframe(MoveAndPickUp.query_for_database()))
 >>> await Retry(MoveAndPickUp(milk, policy=policy), max_tries=20).perform()

@@ -1,7 +1,8 @@
-"""What a learned policy is worth besides its success where it was learned. Nothing of this is remembered.
+"""Evaluate a learned policy outside the scene in which it was learned. None of these rollouts is recorded.
 
-How much experience it takes, how it does with the object elsewhere, turned, higher or lower, or with another one, what
-it is worth if the arm must not be in anything, and what remembering costs.
+The evaluation measures how success grows with experience; how the policy performs with the object at another place,
+turned, higher or lower, or with another object; how it performs when an arm in collision is a failure; and how much
+recording slows the rollouts down.
 """
 
 from __future__ import annotations
@@ -13,12 +14,19 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from pycrorm_async.errors import InternalError, NotEnoughExperience
-from pycrorm_async.learning.experiment import Experiment, Learned, Phase, Watch, coverage_of, known
+from pycrorm_async.learning.experiment import (
+    Experiment,
+    ExperimentResult,
+    Phase,
+    ReportProgress,
+    coverage_of,
+    read_rollouts,
+)
 from pycrorm_async.learning.policies.default_policy import default_policy
 from pycrorm_async.learning.policies.policy import Policy
 from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.learning.rollouts import recorded_rollouts
-from pycrorm_async.learning.rollouts.rollout_pool import AT_ONCE, Job, Place, Workers
+from pycrorm_async.learning.rollouts.rollout_pool import ROLLOUTS_PER_RUN, Job, MemoryLocation, Workers
 from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
 from pycrorm_async.query.reading import Reading
@@ -27,16 +35,24 @@ from pycrorm_async.world.enums import ObjectType
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Study", "CurvePoint", "Elsewhere", "Cost", "study", "CURVE", "elsewhere"]
+__all__ = ["Study", "CurvePoint", "SceneComparison", "Cost", "study", "CURVE", "scene_variants"]
 
 CURVE = (500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
-"""So many remembered default rollouts a policy is learned from, as far as there are so many."""
+"""Numbers of default rollouts to learn from, one point of the learning curve each; those above the recorded number
+are skipped. 50,000 is the number of the thesis."""
 _STUDY_SEED = 2_000_003
+"""Added to the experiment's seed, so that the evaluation does not repeat the rollouts it learned from."""
 
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """What is learned from the first default rollouts."""
+    """A policy learned from the first `rollouts` default rollouts.
+
+    Attributes:
+        successes: those among them that succeeded; the policy is learned from these.
+        tally: how the policy performed.
+        coverage: see `coverage_of`.
+    """
 
     rollouts: int
     successes: int
@@ -45,8 +61,8 @@ class CurvePoint:
 
 
 @dataclass(frozen=True)
-class Elsewhere:
-    """Both policies in another scene."""
+class SceneComparison:
+    """The results of the default and the learned policy in one scene."""
 
     scene: Scene
     default: Tally
@@ -55,7 +71,7 @@ class Elsewhere:
 
 @dataclass(frozen=True)
 class Cost:
-    """The same rollouts with and without being remembered: per second, in as many processes."""
+    """Rollouts per second with and without recording: the same rollouts, in the same number of processes."""
 
     name: str
     rollouts: int
@@ -64,19 +80,21 @@ class Cost:
 
     @property
     def share(self) -> float:
-        """Of the time, what remembering takes."""
+        """The share of the time that recording takes, 0 to 1."""
         return 1 - self.with_memory / self.without
 
 
 @dataclass(frozen=True)
 class Study:
+    """The results of `study`: the learning curve, the scenes (the first is that of the experiment), the costs."""
+
     curve: tuple[CurvePoint, ...]
-    elsewhere: tuple[Elsewhere, ...]
+    scenes: tuple[SceneComparison, ...]
     costs: tuple[Cost, ...]
 
 
-def elsewhere(scene: Scene) -> tuple[Scene, ...]:
-    """The scenes a policy is tried in that was learned in this one; the first is this one itself."""
+def scene_variants(scene: Scene) -> tuple[Scene, ...]:
+    """Return the scenes in which to evaluate a policy that was learned in `scene`, which comes first."""
     x, y, z = scene.position
     raised = replace(scene, torso_height=0.3)
     return (
@@ -92,33 +110,38 @@ def elsewhere(scene: Scene) -> tuple[Scene, ...]:
     )
 
 
-async def study(experiment: Experiment, learned: Learned, place: Place, *, rollouts: int, watch: Watch) -> Study:
-    """Tries each so often. Raises `WorkerLost`, and `InternalError` if remembering changed what happened."""
+async def study(
+    experiment: Experiment, learned: ExperimentResult, place: MemoryLocation, *, rollouts: int, watch: ReportProgress
+) -> Study:
+    """Evaluate the learned policy, `rollouts` rollouts per point and scene.
+
+    Raises `WorkerLost`, and `InternalError` if the same rollouts ended differently without recording.
+    """
     async with Reading.open(place.url) as reading:
         default, evaluation, held_out = [
-            await known(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
+            await read_rollouts(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
             for phase in (learned.default, learned.evaluation, learned.held_out)
         ]
     async with Workers(experiment.workers, None) as workers:
-        trying = _Trying(experiment, workers, rollouts, watch)
+        evaluator = _Evaluator(experiment, workers, rollouts, watch)
         return Study(
-            tuple([each async for each in trying.curve(default, held_out)]),
-            tuple([await trying.elsewhere(scene, learned.policy) for scene in elsewhere(experiment.scene)]),
+            tuple([each async for each in evaluator.curve(default, held_out)]),
+            tuple([await evaluator.compare(scene, learned.policy) for scene in scene_variants(experiment.scene)]),
             tuple(
                 cost
                 for cost in (
-                    await trying.cost(learned.default, default_policy(), default),
-                    await trying.cost(learned.evaluation, learned.policy, evaluation),
+                    await evaluator.cost(learned.default, default_policy(), default),
+                    await evaluator.cost(learned.evaluation, learned.policy, evaluation),
                 )
                 if cost is not None
             ),
         )
 
 
-class _Trying:
-    """Workers that remember nothing."""
+class _Evaluator:
+    """Run the evaluation's rollouts in workers that record nothing."""
 
-    def __init__(self, experiment: Experiment, workers: Workers, rollouts: int, watch: Watch) -> None:
+    def __init__(self, experiment: Experiment, workers: Workers, rollouts: int, watch: ReportProgress) -> None:
         self._experiment = experiment
         self._workers = workers
         self._rollouts = rollouts
@@ -134,29 +157,34 @@ class _Trying:
                 policy = learn(successes, min_samples_leaf=self._experiment.min_samples_leaf)
             except NotEnoughExperience:
                 continue
-            tally = await self._tried(f"learned from {size:,} rollouts", self._experiment.scene, policy)
+            tally = await self._tally(f"learned from {size:,} rollouts", self._experiment.scene, policy)
             yield CurvePoint(size, len(successes), tally, coverage_of(held_out, policy))
 
-    async def elsewhere(self, scene: Scene, policy: Policy) -> Elsewhere:
-        default = await self._tried(f"default policy: {scene}", scene, default_policy())
-        return Elsewhere(scene, default, await self._tried(f"learned policy: {scene}", scene, policy))
+    async def compare(self, scene: Scene, policy: Policy) -> SceneComparison:
+        default = await self._tally(f"default policy: {scene}", scene, default_policy())
+        return SceneComparison(scene, default, await self._tally(f"learned policy: {scene}", scene, policy))
 
     async def cost(self, phase: Phase, policy: Policy, frame: pd.DataFrame) -> Cost | None:
-        """None if the phase was not done in this run. Raises `InternalError` if the same rollouts ended otherwise."""
+        """Repeat rollouts of the phase without recording them; None if this run did not perform the phase.
+
+        Raises `InternalError` if the same rollouts ended differently.
+        """
         if phase.rate is None:
             return None
         count = min(len(frame), 4 * self._rollouts)
         began = time.monotonic()
-        tally = await self._tried(f"{phase.name}, not remembered", self._experiment.scene, policy, phase.seed, count)
+        tally = await self._tally(f"{phase.name}, not recorded", self._experiment.scene, policy, phase.seed, count)
         seconds = time.monotonic() - began
         if tally != recorded_rollouts.tally_of(frame[frame["index"] < count]):
-            raise InternalError(f"{phase.name}: rollouts ended otherwise when they were not remembered")
+            raise InternalError(f"{phase.name}: the same rollouts ended differently without recording")
         return Cost(phase.name, count, phase.rate, count / seconds)
 
-    async def _tried(
+    async def _tally(
         self, name: str, scene: Scene, policy: Policy, seed: int | None = None, count: int | None = None
     ) -> Tally:
         count = self._rollouts if count is None else count
-        job = Job(scene, policy, self._seed if seed is None else seed, remembered=False)
-        runs = recorded_rollouts.missing((), count, at_once=min(AT_ONCE, -(-count // self._experiment.workers)))
+        job = Job(scene, policy, self._seed if seed is None else seed, recorded=False)
+        runs = recorded_rollouts.missing_runs(
+            (), count, length_max=min(ROLLOUTS_PER_RUN, -(-count // self._experiment.workers))
+        )
         return await self._workers.roll_out(job, runs, lambda tally: self._watch(name, tally.rollouts, count, tally))

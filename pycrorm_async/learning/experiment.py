@@ -1,7 +1,7 @@
-"""The learning experiment of the thesis (5.2): try at random, remember, learn from what went well, try again.
+"""Run the learning experiment of the thesis (5.2): perform random pick-ups, learn from the successes, try again.
 
-Everything that is learned from or told comes out of the memory, by questions; what the workers counted is held
-against it. An interrupted experiment goes on with the rollouts that are not remembered yet.
+Every result is queried from the memory and compared with the workers' own counts. An interrupted experiment can be
+resumed: only the rollouts that are not recorded yet are performed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pycrorm_async.learning.policies.policy_file import name_of
 from pycrorm_async.learning.policies.tree import check_leaf, learn
 from pycrorm_async.learning.rollouts import recorded_rollouts
 from pycrorm_async.learning.rollouts.recorded_rollouts import tally_of
-from pycrorm_async.learning.rollouts.rollout_pool import AT_ONCE, Job, Place, Workers
+from pycrorm_async.learning.rollouts.rollout_pool import ROLLOUTS_PER_RUN, Job, MemoryLocation, Workers
 from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
 from pycrorm_async.operations.recovery import recover
@@ -29,29 +29,39 @@ from pycrorm_async.world.enums import Arms, Grasp
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Experiment", "Phase", "Learned", "Watch", "run", "known", "coverage_of", "HELD_OUT_SEED"]
+__all__ = [
+    "Experiment",
+    "Phase",
+    "ExperimentResult",
+    "ReportProgress",
+    "run",
+    "read_rollouts",
+    "coverage_of",
+    "HELD_OUT_SEED",
+]
 
 HELD_OUT_SEED = 1_000_003
-"""Added to the experiment's seed for the default rollouts that nothing is learned from."""
+"""Added to the experiment's seed for the held-out default rollouts, so that their seed is not used for learning."""
 
-Watch = Callable[[str, int, int, Tally], None]
-"""Is told what is done, how much of it, of how much, and how it went so far."""
+ReportProgress = Callable[[str, int, int, Tally], None]
+"""Callback for progress: the phase's name, rollouts done, rollouts in total, results so far."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is to be tried.
+    """The parameters of an experiment.
 
     Attributes:
-        rollouts: in each round: the first under the default policy, the next ones under what was learned so far.
-        rounds: after each a policy is learned from the successes of all.
-        evaluate: rollouts under the last policy, to see what it is worth.
-        held_out: default rollouts that are not learned from, to see how much of what works it still does.
-        min_samples_leaf: of the tree.
-        scene: where.
-        workers: processes.
-        episode_each: each rollout is an episode of its own; otherwise some hundred are one.
-        resume: goes on with what is remembered of the same experiment; otherwise there must be nothing of it.
+        rollouts: rollouts per round: the first round uses the default policy, each later one the policy learned so
+            far.
+        rounds: number of rounds; after each, a policy is learned from the successes of all rounds.
+        evaluate: rollouts under the last policy, to measure its success rate.
+        held_out: default rollouts that are not learned from, to measure the coverage of the last policy.
+        min_samples_leaf: minimum number of samples in a leaf of the tree.
+        scene: the scene of every rollout.
+        workers: number of worker processes.
+        episode_each: record each rollout as an episode of its own; otherwise a few hundred share one.
+        resume: continue from the recorded rollouts of the same experiment; otherwise none may be recorded.
     """
 
     rollouts: int = 50_000
@@ -68,24 +78,24 @@ class Experiment:
     def __post_init__(self) -> None:
         for name in ("rollouts", "rounds", "evaluate", "held_out", "workers"):
             if getattr(self, name) < 1:
-                raise CallerError(f"an experiment has at least one of {name.replace('_', '-')}")
+                raise CallerError(f"an experiment needs {name.replace('_', '-')} >= 1, got {getattr(self, name)}")
         check_leaf(self.min_samples_leaf)
         if not 0 <= self.seed < 2**62:
-            raise CallerError("a seed is a whole number from 0 on, below 2**62")
+            raise CallerError(f"seed must be >= 0 and < 2**62, got {self.seed}")
 
 
 @dataclass(frozen=True)
 class Phase:
-    """Rollouts under one policy, as the memory has them.
+    """The recorded rollouts under one policy.
 
     Attributes:
-        name: in words.
-        policy: its name.
-        tally: how they ended.
-        stages: at which goal of the hand how many failed.
-        arms, grasps: how the pick-ups with each ended.
-        done_now: how many were done in this run, while the others were remembered.
-        seconds: what that took, until all were in the tables.
+        name: the phase in words.
+        policy: the policy's name, see `name_of`.
+        tally: how the rollouts ended.
+        stages: number of failures by stage of the pick-up, see `STAGES`.
+        arms, grasps: how the pick-ups with each arm and each grasp ended.
+        done_now: rollouts performed by this run; the others were recorded before.
+        seconds: duration of those, until all their rows were visible, s.
     """
 
     name: str
@@ -100,19 +110,19 @@ class Phase:
 
     @property
     def rate(self) -> float | None:
-        """Rollouts per second of this run; None if none was done."""
+        """Rollouts per second of this run; None if this run performed none."""
         return self.done_now / self.seconds if self.done_now else None
 
 
 @dataclass(frozen=True)
-class Learned:
-    """What came out.
+class ExperimentResult:
+    """The result of an experiment.
 
     Attributes:
-        phases: default rollouts, further rounds, evaluation, held out.
-        policy: the last one; `leaves` of its tree.
-        successes: the choices it was learned from.
-        coverage: the share of the held-out successes that it could have made; None if there is none.
+        phases: in this order: default rollouts, further rounds, evaluation, held-out rollouts.
+        policy: the policy of the last round.
+        successes: the choices from which it was learned.
+        coverage: the share of the held-out successes that the policy could have chosen; None if none succeeded.
     """
 
     phases: tuple[Phase, ...]
@@ -133,10 +143,10 @@ class Learned:
         return self.phases[-1]
 
 
-class _Rolling:
-    """Workers, and a memory to look into."""
+class _PhaseRunner:
+    """Run the phases of one experiment with workers, and query each phase's results from the memory."""
 
-    def __init__(self, experiment: Experiment, workers: Workers, reading: Reading, watch: Watch) -> None:
+    def __init__(self, experiment: Experiment, workers: Workers, reading: Reading, watch: ReportProgress) -> None:
         self._experiment = experiment
         self._workers = workers
         self._reading = reading
@@ -144,28 +154,30 @@ class _Rolling:
         self.phases: list[Phase] = []
 
     async def phase(self, name: str, policy: Policy, seed: int, count: int) -> pd.DataFrame:
-        """The rollouts 0 to `count` under this policy; those that are not remembered are done first."""
+        """Return the rollouts with index 0 to `count` - 1 under this policy; perform those not recorded yet first."""
         experiment = self._experiment
-        before = await known(self._reading, experiment.scene, name_of(policy), seed, count)
-        if len(before) and not experiment.resume:
+        recorded = await read_rollouts(self._reading, experiment.scene, name_of(policy), seed, count)
+        if len(recorded) and not experiment.resume:
             raise CallerError(
-                f"{len(before):,} rollouts of this experiment are remembered already (seed {experiment.seed},"
-                f" {experiment.scene}): go on with --resume, or take another --seed or --url"
+                f"{len(recorded):,} rollouts of this experiment are recorded already (seed {experiment.seed},"
+                f" {experiment.scene}): continue with --resume, or choose another --seed or --url"
             )
-        began, already, counted = time.monotonic(), recorded_rollouts.tally_of(before), Tally()
-        frame = before
-        if len(before) < count:
+        began, recorded_tally, counted = time.monotonic(), recorded_rollouts.tally_of(recorded), Tally()
+        frame = recorded
+        if len(recorded) < count:
             job = Job(experiment.scene, policy, seed, episode_each=experiment.episode_each)
-            runs = recorded_rollouts.missing(before["index"], count, at_once=AT_ONCE)
+            runs = recorded_rollouts.missing_runs(recorded["index"], count, length_max=ROLLOUTS_PER_RUN)
             counted = await self._workers.roll_out(
-                job, runs, lambda tally: self._watch(name, len(before) + tally.rollouts, count, already + tally)
+                job,
+                runs,
+                lambda tally: self._watch(name, len(recorded) + tally.rollouts, count, recorded_tally + tally),
             )
         seconds = time.monotonic() - began
         if counted.rollouts:
-            frame = await known(self._reading, experiment.scene, name_of(policy), seed, count)
+            frame = await read_rollouts(self._reading, experiment.scene, name_of(policy), seed, count)
         tally = tally_of(frame)
-        if tally != already + counted or tally.rollouts != count:
-            raise InternalError(f"{name}: {already + counted} was counted, {tally} is remembered")
+        if tally != recorded_tally + counted or tally.rollouts != count:
+            raise InternalError(f"{name}: the workers counted {recorded_tally + counted}, the memory holds {tally}")
         self.phases.append(
             Phase(
                 name,
@@ -185,27 +197,29 @@ class _Rolling:
         return frame
 
 
-async def run(experiment: Experiment, place: Place, watch: Watch = lambda *_: None) -> Learned:
-    """Does the experiment, or what is left of it.
+async def run(
+    experiment: Experiment, place: MemoryLocation, watch: ReportProgress = lambda *_: None
+) -> ExperimentResult:
+    """Run the experiment; with `resume`, only its missing rollouts.
 
     Raises:
-        CallerError: it is remembered already, and not to be resumed.
-        NotEnoughExperience: too few rollouts went well to learn from them; all are remembered.
-        WorkerLost: a worker died; what was done is remembered.
-        InternalError: the memory does not hold what was counted.
+        CallerError: rollouts of this experiment are recorded already and `resume` is False.
+        NotEnoughExperience: too few rollouts succeeded to learn from; all are recorded.
+        WorkerLost: a worker process died; its finished rollouts are recorded.
+        InternalError: the memory and the workers' counts differ.
     """
-    async with _rolling(experiment, place, watch) as rolling:
+    async with _open_runner(experiment, place, watch) as runner:
         policy, frames = default_policy(), []
         for number in range(experiment.rounds):
             name = "default policy" if number == 0 else f"learned policy, round {number + 1}"
-            frame = await rolling.phase(name, policy, experiment.seed + number, experiment.rollouts)
+            frame = await runner.phase(name, policy, experiment.seed + number, experiment.rollouts)
             frames.append(recorded_rollouts.successes(frame))
-            policy = _learned(frames, experiment)
-        await rolling.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
+            policy = _learn_from(frames, experiment)
+        await runner.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
         held_out_seed = experiment.seed + HELD_OUT_SEED
-        held_out = await rolling.phase("default policy, held out", default_policy(), held_out_seed, experiment.held_out)
-        return Learned(
-            tuple(rolling.phases),
+        held_out = await runner.phase("default policy, held out", default_policy(), held_out_seed, experiment.held_out)
+        return ExperimentResult(
+            tuple(runner.phases),
             policy,
             tuple(choice for frame in frames for choice in choices_of(frame)),
             coverage_of(held_out, policy),
@@ -213,33 +227,36 @@ async def run(experiment: Experiment, place: Place, watch: Watch = lambda *_: No
 
 
 @asynccontextmanager
-async def _rolling(experiment: Experiment, place: Place, watch: Watch) -> AsyncIterator[_Rolling]:
-    await recover(place.url, spool=place.spool)  # what killed workers had not handed over; it makes the tables too
+async def _open_runner(
+    experiment: Experiment, place: MemoryLocation, watch: ReportProgress
+) -> AsyncIterator[_PhaseRunner]:
+    # Killed workers may have left records in the spool; `recover` stores them and creates the tables.
+    await recover(place.url, spool=place.spool)
     async with Workers(experiment.workers, place) as workers, Reading.open(place.url) as reading:
-        yield _Rolling(experiment, workers, reading, watch)
+        yield _PhaseRunner(experiment, workers, reading, watch)
 
 
-def _learned(frames: Sequence[pd.DataFrame], experiment: Experiment) -> Policy:
+def _learn_from(frames: Sequence[pd.DataFrame], experiment: Experiment) -> Policy:
     import pandas as pd
 
     return learn(pd.concat(frames), min_samples_leaf=experiment.min_samples_leaf)
 
 
-async def known(reading: Reading, scene: Scene, policy: str, seed: int, count: int) -> pd.DataFrame:
-    """Those of the rollouts 0 to `count` that are remembered, each once."""
+async def read_rollouts(reading: Reading, scene: Scene, policy: str, seed: int, count: int) -> pd.DataFrame:
+    """Return the recorded rollouts with an index below `count`, each index once."""
     question = recorded_rollouts.rollouts_question(scene=str(scene), seed=seed, policy=policy)
-    frame = recorded_rollouts.once(await reading.dataframe(question))
+    frame = recorded_rollouts.drop_repeats(await reading.dataframe(question))
     return frame[frame["index"] < count]
 
 
 def coverage_of(held_out: pd.DataFrame, policy: Policy) -> float | None:
-    """The share of these rollouts' successes that the policy could have made; None if there is none."""
+    """Return the share of these rollouts' successes that the policy could have chosen; None if none succeeded."""
     choices = choices_of(recorded_rollouts.successes(held_out))
     return policy.coverage(choices) if choices else None
 
 
 def choices_of(frame: pd.DataFrame) -> list[PickUpChoice]:
-    """The rows as choices."""
+    """Convert the rows to choices."""
     columns = (frame.arm, frame.grasp, frame.object_x, frame.object_y)
     return [
         PickUpChoice(Arms[arm], Grasp[grasp], float(x), float(y)) for arm, grasp, x, y in zip(*columns, strict=True)

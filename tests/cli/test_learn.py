@@ -51,7 +51,7 @@ def test_it_tells_what_was_done_what_it_came_to_and_where_the_policy_is(document
 def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> None:
     refused = pycrorm(*SMALL, cwd=folder)
     line = one_line_of(refused)
-    assert "400 rollouts of this experiment are remembered already" in line
+    assert "400 rollouts of this experiment are recorded already" in line
     assert "--resume" in line
     assert refused.returncode == 2
     done = pycrorm(*SMALL, "--resume", "--figure", "two.svg", "--study", "5", cwd=folder)

@@ -17,12 +17,12 @@ import pytest
 from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.learning import Policy, Scene, default_policy, experiment, name_of
-from pycrorm_async.learning.evaluation import elsewhere, study
-from pycrorm_async.learning.experiment import Experiment, Learned, known, run
+from pycrorm_async.learning.evaluation import scene_variants, study
+from pycrorm_async.learning.experiment import Experiment, ExperimentResult, read_rollouts, run
 from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.learning.rollouts import recorded_rollouts
 from pycrorm_async.learning.rollouts.kitchen_trial import pick_up_in_kitchen
-from pycrorm_async.learning.rollouts.rollout_pool import Job, Place, WorkerLost, Workers
+from pycrorm_async.learning.rollouts.rollout_pool import Job, MemoryLocation, WorkerLost, Workers
 from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import MoveAndPickUpAction
@@ -34,8 +34,8 @@ LONGER = Experiment(rollouts=3_000, evaluate=50, held_out=50, workers=2)
 
 
 @pytest.fixture
-def place(database_url: str, tmp_path: Path) -> Place:
-    return Place(database_url, tmp_path / "spool")
+def place(database_url: str, tmp_path: Path) -> MemoryLocation:
+    return MemoryLocation(database_url, tmp_path / "spool")
 
 
 def workers_running() -> list[psutil.Process]:
@@ -55,7 +55,7 @@ def after(rollouts: int, act: Callable[[], None]) -> Callable[[str, int, int, Ta
     return watch
 
 
-async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_often(place: Place) -> None:
+async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_often(place: MemoryLocation) -> None:
     told: dict[str, tuple[int, int]] = {}
     learned = await run(SMALL, place, lambda name, done, total, _: told.update({name: (done, total)}))
     assert [(each.name, each.tally.rollouts) for each in learned.phases] == [
@@ -84,10 +84,10 @@ async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_ofte
     studied = await study(replace(SMALL, resume=True), learned, place, rollouts=100, watch=lambda *_: None)
     assert [each.rollouts for each in studied.curve] == [500]
     assert {each.rollouts for each in studied.costs} == {400, 200}
-    turned = [each for each in studied.elsewhere if each.scene.yaw]
+    turned = [each for each in studied.scenes if each.scene.yaw]
     assert turned
     for each in turned:  # in the object's own frame nothing is other than it was
-        assert each.learned == studied.elsewhere[0].learned
+        assert each.learned == studied.scenes[0].learned
     assert ask(place.url, f"SELECT count(*) FROM {MoveAndPickUpAction.__tablename__}") == [(everything,)]
 
     picked = await pick_up_in_kitchen(learned.policy, place, seed=69)
@@ -97,20 +97,20 @@ async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_ofte
     assert [each.dtype for each in tree].count("MoveAndPickUpAction") == picked.tries
 
 
-async def fails_without_resume(place: Place) -> None:
-    with pytest.raises(CallerError, match=r"700 rollouts .* remembered already .* --resume"):
+async def fails_without_resume(place: MemoryLocation) -> None:
+    with pytest.raises(CallerError, match=r"700 rollouts .* recorded already .* --resume"):
         await run(SMALL, place)
 
 
-async def finished(experiment: Experiment, place: Place) -> Learned:
+async def finished(experiment: Experiment, place: MemoryLocation) -> ExperimentResult:
     """What is left of it, held against an experiment that nothing happened to."""
     learned = await run(replace(experiment, resume=True), place)
     for phase in learned.phases:
         async with Reading.open(place.url) as reading:
-            frame = await known(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
+            frame = await read_rollouts(reading, experiment.scene, phase.policy, phase.seed, phase.tally.rollouts)
         assert sorted(frame["index"]) == list(range(phase.tally.rollouts))
     async with Workers(1, None) as workers:
-        job = Job(experiment.scene, default_policy(), experiment.seed, remembered=False)
+        job = Job(experiment.scene, default_policy(), experiment.seed, recorded=False)
         undisturbed = await workers.roll_out(job, [(0, experiment.rollouts)])
     assert learned.default.tally == undisturbed
     return learned
@@ -121,20 +121,20 @@ def kill_one() -> None:
 
 
 async def test_a_worker_that_is_killed_is_told_and_resumed_nothing_is_lost_or_counted_twice(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
-    with pytest.raises(WorkerLost, match="a worker was killed by SIGKILL; what it had done is remembered"):
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
+    with pytest.raises(WorkerLost, match="a rollout worker was killed by SIGKILL; its finished rollouts are recorded"):
         await run(LONGER, place, after(1, kill_one))
     assert not workers_running()
     async with Reading.open(place.url) as reading:
-        before = await known(reading, Scene(), name_of(default_policy()), 69, 3_000)
+        before = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 3_000)
     assert 0 < len(before) < 3_000
     learned = await finished(LONGER, place)
     assert learned.default.done_now == 3_000 - len(before)
 
 
 async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it_can_be_resumed(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
-    task: asyncio.Task[Learned]
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
+    task: asyncio.Task[ExperimentResult]
 
     def interrupt() -> None:
         task.cancel()
@@ -158,11 +158,11 @@ async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is
     await process.wait()
     _, alive = await asyncio.to_thread(psutil.wait_procs, spawned, 30)
     assert not alive
-    await finished(replace(SMALL, workers=1, evaluate=50, held_out=50), Place(url))
+    await finished(replace(SMALL, workers=1, evaluate=50, held_out=50), MemoryLocation(url))
 
 
 async def test_the_one_who_drains_may_leave_and_what_comes_after_is_drained_too(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     job = Job(Scene(), default_policy(), 5)
     leave, ready = asyncio.Event(), asyncio.Event()
     other = asyncio.create_task(serve(place.url, spool=None, leave=leave, say=lambda _: ready.set()))
@@ -174,11 +174,11 @@ async def test_the_one_who_drains_may_leave_and_what_comes_after_is_drained_too(
         async with asyncio.timeout(60):
             await workers.roll_out(job, [(10, 10)])  # returns when it is in the tables
     async with Reading.open(place.url) as reading:
-        assert len(await known(reading, Scene(), name_of(default_policy()), 5, 20)) == 20
+        assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 20)) == 20
 
 
 async def test_of_experiments_on_one_memory_the_one_that_is_over_first_leaves_the_other_at_work(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     small = replace(SMALL, rollouts=150, evaluate=20, held_out=60, workers=1, min_samples_leaf=5)
     first, second = await asyncio.gather(run(small, place), run(replace(small, seed=70, rollouts=500), place))
     assert [each.tally.rollouts for each in first.phases] == [150, 20, 60]
@@ -186,7 +186,7 @@ async def test_of_experiments_on_one_memory_the_one_that_is_over_first_leaves_th
 
 
 async def test_workers_that_are_not_free_take_no_job() -> None:
-    job = Job(Scene(), default_policy(), 5, remembered=False)
+    job = Job(Scene(), default_policy(), 5, recorded=False)
     workers = Workers(1, None)
     with pytest.raises(CallerError, match="workers do one job at a time"):
         await workers.roll_out(job, [(0, 5)])
@@ -198,12 +198,12 @@ async def test_workers_that_are_not_free_take_no_job() -> None:
         one.cancel()
         with pytest.raises(asyncio.CancelledError):
             await one
-        with pytest.raises(CallerError, match="none after one that was interrupted: start others"):
+        with pytest.raises(CallerError, match="none after an interrupted job: start new workers"):
             await workers.roll_out(job, [(0, 5)])
 
 
 async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     tiny = replace(SMALL, rollouts=150, evaluate=20, held_out=1, workers=1, min_samples_leaf=5)
     learned = await run(tiny, place)
     assert learned.held_out.tally.successes == 0
@@ -214,8 +214,8 @@ async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There are 500 here, but of the first 500 not all."""
-    monkeypatch.setattr("pycrorm_async.learning.evaluation.elsewhere", lambda _scene: ())
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    monkeypatch.setattr("pycrorm_async.learning.evaluation.scene_variants", lambda _scene: ())
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
         await workers.roll_out(Job(Scene(), default_policy(), 69), [(400, 200)])
     small = replace(SMALL, rollouts=300, evaluate=20, held_out=60, workers=1, min_samples_leaf=5, resume=True)
@@ -227,22 +227,22 @@ async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
 
 @pytest.mark.parametrize("collisions", [True, False])
 def test_a_policy_is_tried_elsewhere_with_collisions_and_without(collisions: bool) -> None:
-    scenes = elsewhere(Scene(collisions=collisions))
+    scenes = scene_variants(Scene(collisions=collisions))
     assert len(set(scenes)) == len(scenes)
     assert replace(scenes[0], collisions=not collisions) in scenes
 
 
 async def test_too_few_successes_are_told_and_all_rollouts_kept(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(NotEnoughExperience, match="too few to learn from"):
         await run(replace(SMALL, rollouts=40, workers=1), place)
     async with Reading.open(place.url) as reading:
-        frame = await known(reading, Scene(), name_of(default_policy()), 69, 700)
+        frame = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 700)
     assert len(frame) == 40
 
 
 async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     learned = await run(replace(SMALL, rounds=2, workers=1, evaluate=200, held_out=100, rollouts=600), place)
     assert [each.name for each in learned.phases][:3] == ["default policy", "learned policy, round 2", "learned policy"]
     assert len(learned.successes) == learned.phases[0].tally.successes + learned.phases[1].tally.successes
@@ -252,7 +252,7 @@ async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Pa
 async def test_what_is_rolled_out_is_not_rolled_out_again_when_learning_from_it_had_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     twice = Experiment(rollouts=200, rounds=2, evaluate=10, held_out=10)
     learned_from: list[int] = []
 
@@ -271,44 +271,44 @@ async def test_what_is_rolled_out_is_not_rolled_out_again_when_learning_from_it_
 
 
 async def test_each_rollout_may_be_an_episode(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(2, place) as workers:
         job = Job(Scene(), default_policy(), 5, episode_each=True)
         tally = await workers.roll_out(job, [(0, 15), (15, 15)])
         assert ask(place.url, "SELECT count(*) FROM process_metadata") == [(30,)]
     async with Reading.open(place.url) as reading:
-        frame = await known(reading, Scene(), name_of(default_policy()), 5, 30)
+        frame = await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 30)
     assert recorded_rollouts.tally_of(frame) == tally
 
 
 async def test_what_is_not_to_be_remembered_leaves_no_trace_beside_what_is(tmp_path: Path) -> None:
-    place = Place(f"sqlite:///{tmp_path}/memory.db")
+    place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
         job = Job(Scene(), default_policy(), 5)
-        forgotten = await workers.roll_out(replace(job, remembered=False), [(0, 30)])
+        forgotten = await workers.roll_out(replace(job, recorded=False), [(0, 30)])
         assert ask(place.url, "SELECT count(*) FROM event") == [(0,)]
         assert await workers.roll_out(job, [(0, 30)]) == forgotten
-        await workers.roll_out(replace(job, remembered=False), [(0, 30)])
+        await workers.roll_out(replace(job, recorded=False), [(0, 30)])
     async with Reading.open(place.url) as reading:
-        assert len(await known(reading, Scene(), name_of(default_policy()), 5, 30)) == 30
+        assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 30)) == 30
 
 
 async def test_what_a_worker_raises_is_told_in_one_line(tmp_path: Path) -> None:
     job = Job(Scene(position=(float("nan"), 0.0, 0.0)), default_policy(), 1)
-    async with Workers(1, Place(f"sqlite:///{tmp_path}/memory.db")) as workers:
-        with pytest.raises(WorkerLost, match="a worker failed: PoseRefused") as told:
+    async with Workers(1, MemoryLocation(f"sqlite:///{tmp_path}/memory.db")) as workers:
+        with pytest.raises(WorkerLost, match="a rollout worker failed: PoseRefused") as told:
             await workers.roll_out(job, [(0, 5)])
     assert "\n" not in str(told.value)
 
 
 def test_what_cannot_be_an_experiment_is_refused() -> None:
-    with pytest.raises(CallerError, match="at least one of held-out"):
+    with pytest.raises(CallerError, match="needs held-out >= 1, got 0"):
         Experiment(held_out=0)
-    with pytest.raises(CallerError, match="at least one of workers"):
+    with pytest.raises(CallerError, match="needs workers >= 1, got 0"):
         Experiment(workers=0)
     with pytest.raises(CallerError, match="a leaf needs two samples or more"):
         Experiment(min_samples_leaf=1)
-    with pytest.raises(CallerError, match="a seed is"):
+    with pytest.raises(CallerError, match="seed must be >= 0"):
         Experiment(seed=-1)
-    with pytest.raises(CallerError, match="at least one worker"):
+    with pytest.raises(CallerError, match="worker count must be >= 1, got 0"):
         Workers(0, None)

@@ -90,7 +90,7 @@ def test_arms_and_grasps_that_are_asked_for_are_the_only_ones(stage: Stage) -> N
     assert {each.grasp for each in action.plain()} == {Grasp.TOP, Grasp.LEFT}
     with pytest.raises(ImpossibleCondition):
         MoveAndPickUp(stage.target, [])
-    with pytest.raises(CallerError, match="at least one sample, not 0"):
+    with pytest.raises(CallerError, match="samples must be >= 1, got 0"):
         MoveAndPickUp(stage.target, samples=0)
 
 
@@ -140,7 +140,7 @@ def test_what_begins_at_the_mode_stands_where_the_density_is_highest(stage: Stag
 
 def test_where_nobody_can_stand_the_object_is_unreachable(kitchen: Stage) -> None:
     inside = MoveAndPickUp(kitchen.target, policy=at(0.1, -0.3))  # in the worktop
-    with pytest.raises(ObjectUnreachable, match="no way to pick up milk here"):
+    with pytest.raises(ObjectUnreachable, match="no way to pick up milk in this scene"):
         inside.resolve()
     with pytest.raises(ObjectUnreachable):
         list(inside.from_mode())
@@ -149,7 +149,7 @@ def test_where_nobody_can_stand_the_object_is_unreachable(kitchen: Stage) -> Non
 
 def test_experience_with_other_heights_is_none_with_this_one(stage: Stage) -> None:
     policy = at(-0.6, 0.0, height=(0.55, 0.65))
-    with pytest.raises(ObjectUnreachable, match="no way to pick up milk this high"):
+    with pytest.raises(ObjectUnreachable, match="no way to pick up milk at this height"):
         list(MoveAndPickUp(stage.target, policy=policy).plain())
     torso = stage.robot.robot_description
     assert torso is not None

@@ -172,7 +172,7 @@ def test_the_mode_is_the_square_that_holds_most() -> None:
 
 def test_a_window_holds_as_much_as_one_of_its_width_can() -> None:
     linear = WEST.x
-    assert linear.peak(-5.0, 5.0, 4.0).held == pytest.approx(1.0)
+    assert linear.peak(-5.0, 5.0, 4.0).probability == pytest.approx(1.0)
     assert linear.peak(-5.0, 5.0, 0.3) == pytest.approx((-1.0, -0.7, 0.8 + 0.2 / 3))
     assert Linear((0.0, 1.0, 1.1), (0.0, 0.1, 1.0)).peak(-5.0, 5.0, 0.3) == pytest.approx((0.8, 1.1, 0.92))
     assert linear.peak(-0.9, -0.7, 4.0) == pytest.approx((-0.9, -0.7, 0.4 + 0.2 / 3))
@@ -201,11 +201,11 @@ def test_what_no_evidence_can_be_is_refused() -> None:
     with pytest.raises(CallerError, match="evidence on grasps takes members of Grasp"):
         Evidence(grasps=frozenset({"LEFT"}))  # type: ignore[arg-type]
     for height in ((0.9, 0.9), (1.0, 0.9), (0.9, math.nan)):
-        with pytest.raises(CallerError, match="a height is known as an interval"):
+        with pytest.raises(CallerError, match="evidence on height takes an interval"):
             Evidence(height=height)
     with pytest.raises(CallerError, match="-1 choices"):
         default_policy().sample(np.random.default_rng(1), -1)
     with pytest.raises(CallerError, match="no choices"):
         default_policy().coverage([])
-    with pytest.raises(CallerError, match="a square 0 m wide"):
+    with pytest.raises(CallerError, match="width_m must be > 0, got 0"):
         default_policy().mode(width_m=0)

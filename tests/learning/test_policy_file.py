@@ -103,7 +103,7 @@ def test_no_cut_gives_another_policy(tmp_path: Path) -> None:
 def test_another_version_is_named(tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
     path.write_text('{"format":"pycrorm policy","version":2,"crc32":0,"more":1}\n{"nodes":[]}\n')
-    with pytest.raises(PolicyFileRefused, match="is of format version 2, where this program reads 1"):
+    with pytest.raises(PolicyFileRefused, match="has format version 2, but this program reads 1"):
         load_policy(path)
 
 
@@ -177,5 +177,5 @@ def _refused(change: dict[str, object], said: str, tmp_path: Path) -> None:
     heading, content = (json.loads(line) for line in path.read_text().splitlines())
     line = json.dumps(content | change)
     path.write_text(json.dumps(heading | {"crc32": zlib.crc32(line.encode())}) + "\n" + line + "\n")
-    with pytest.raises(PolicyDamaged, match=f"its checksum fits, but it holds no policy: .*{said}"):
+    with pytest.raises(PolicyDamaged, match=f"its checksum matches, but it holds no policy: .*{said}"):
         load_policy(path)

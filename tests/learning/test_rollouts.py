@@ -176,7 +176,7 @@ async def test_told_to_stop_it_ends_before_the_next_one(tmp_path: Path) -> None:
         assert tally.rollouts == 7
         frame = await frame_of(memory)
         assert frame["index"].tolist() == list(range(7))
-        left = list(recorded_rollouts.missing(frame["index"], 12, at_once=3))
+        left = list(recorded_rollouts.missing_runs(frame["index"], 12, length_max=3))
         assert left == [(7, 3), (10, 2)]
         assert (await rolled_out(5, stop=lambda: True)).rollouts == 0
 
@@ -220,7 +220,7 @@ async def test_rollouts_that_were_done_twice_count_once(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         for first, count in ((0, 20), (10, 20)):
             await rolled_out(count, first=first)
-        frame = recorded_rollouts.once(await frame_of(memory))
+        frame = recorded_rollouts.drop_repeats(await frame_of(memory))
         assert frame["index"].tolist() == list(range(30))
 
 
@@ -249,7 +249,7 @@ async def test_a_fault_in_the_plan_ends_the_batch(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"first": -1}, {"count": -1}])
 async def test_what_cannot_be_counted_is_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(CallerError, match="are 0 or more, not"):
+    with pytest.raises(CallerError, match="must be >= 0, got"):
         await rolled_out(**({"count": 1} | wrong))
 
 
@@ -290,7 +290,7 @@ def test_rates_come_with_an_interval() -> None:
 
 
 def test_what_is_missing_comes_in_runs() -> None:
-    assert list(recorded_rollouts.missing([], 5, at_once=2)) == [(0, 2), (2, 2), (4, 1)]
-    assert list(recorded_rollouts.missing([0, 1, 5], 8, at_once=10)) == [(2, 3), (6, 2)]
-    assert list(recorded_rollouts.missing(range(8), 8, at_once=10)) == []
-    assert list(recorded_rollouts.missing([9], 3, at_once=10)) == [(0, 3)]
+    assert list(recorded_rollouts.missing_runs([], 5, length_max=2)) == [(0, 2), (2, 2), (4, 1)]
+    assert list(recorded_rollouts.missing_runs([0, 1, 5], 8, length_max=10)) == [(2, 3), (6, 2)]
+    assert list(recorded_rollouts.missing_runs(range(8), 8, length_max=10)) == []
+    assert list(recorded_rollouts.missing_runs([9], 3, length_max=10)) == [(0, 3)]

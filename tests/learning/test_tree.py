@@ -282,7 +282,7 @@ def test_every_frame_of_repeated_and_lonely_values_is_learned_whole(seed: int) -
         ({"grasp": [Grasp.TOP] * 30}, "column grasp holds 3, which is none of FRONT, LEFT, RIGHT, TOP"),
         ({"grasp": ["TOP"] * 29 + [None]}, "column grasp holds nan"),
         ({"object_x": [0.1] * 28 + [math.nan, math.inf]}, "object_x has no finite number in 2 of 30 rows"),
-        ({"object_y": ["near"] * 30}, "column object_y holds something else than numbers"),
+        ({"object_y": ["near"] * 30}, "column object_y holds values that are not numbers"),
         ({"height": [None] * 30}, "height has no finite number in 30 of 30 rows"),
     ],
 )

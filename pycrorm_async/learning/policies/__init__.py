@@ -1,1 +1,1 @@
-"""Policies for move-and-pick-up: fitted, stored, drawn."""
+"""Fit, sample, store and draw policies for move-and-pick-up."""

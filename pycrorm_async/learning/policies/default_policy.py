@@ -1,7 +1,7 @@
-"""The policy of one who knows nothing yet: any arm, any grasp, somewhere within 2 m around the object.
+"""The default policy picks any arm and any grasp at random, from a random position within 2 m of the object.
 
 Arm and grasp are equally likely. relative_x and relative_y are normal with a variance of 0.5 m², in (-2 m, 2 m)²
-without the open square (-0.2 m, 0.2 m)² in which the object stands; 0.94107 of the normal distribution lies there.
+without the open square (-0.2 m, 0.2 m)² around the object; that region holds 0.94107 of the normal distribution.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ AROUND_OBJECT = Region(
 
 
 def default_policy() -> Policy:
-    """The policy to start from; it knows nothing of heights.
+    """Return the policy to start learning from; it does not depend on height.
 
     >>> default_policy().probability(Evidence(arms=frozenset({Arms.LEFT})))
     0.5

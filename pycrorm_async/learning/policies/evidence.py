@@ -1,7 +1,9 @@
-"""What is known, or demanded, of a pick-up before it is chosen. Metres, in the object's own frame.
+"""Evidence restricts a policy to pick-ups with given arms, grasps, places and heights.
+
+Lengths are in metres, in the object's own frame.
 
 >>> near = Region((Rectangle(-1.0, -0.5, -0.3, 0.3),))
->>> known = Evidence(arms=frozenset({Arms.LEFT}), region=near)
+>>> evidence = Evidence(arms=frozenset({Arms.LEFT}), region=near)
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ __all__ = ["Evidence", "Rectangle", "Region"]
 
 
 class Rectangle(NamedTuple):
-    """Where the robot may stand: relative_x and relative_y between the two, which belong to it."""
+    """A rectangle of robot positions: relative_x and relative_y between the limits, limits included; m."""
 
     x_min: float
     x_max: float
@@ -31,9 +33,9 @@ class Rectangle(NamedTuple):
 
 @dataclass(frozen=True)
 class Region:
-    """Rectangles that have at most edges in common; none is nowhere.
+    """A union of rectangles that may share edges but not overlap; without rectangles, the empty set.
 
-    Raises `CallerError`: rectangles that overlap, without an extent, or without end.
+    Raises `CallerError` for rectangles that overlap, are empty, or are infinite.
     """
 
     rectangles: tuple[Rectangle, ...]
@@ -41,7 +43,7 @@ class Region:
     def __post_init__(self) -> None:
         for each in self.rectangles:
             if not (all(map(math.isfinite, each)) and each.x_min < each.x_max and each.y_min < each.y_max):
-                raise CallerError(f"a rectangle has finite limits, the smaller first: {each}")
+                raise CallerError(f"a rectangle needs finite limits, the smaller first, got {each}")
         x_min, x_max, y_min, y_max = self.limits()
         for number, each in enumerate(self.rectangles[:-1]):
             later = slice(number + 1, None)
@@ -52,7 +54,7 @@ class Region:
                 raise CallerError(f"the rectangles of a region must not overlap: {each} and {other}")
 
     def __and__(self, other: Region) -> Region:
-        """What is in both."""
+        """Intersect the two regions."""
         mine, theirs = self.limits()[:, :, None], other.limits()[:, None, :]
         x_min, y_min = np.maximum(mine[[0, 2]], theirs[[0, 2]])
         x_max, y_max = np.minimum(mine[[1, 3]], theirs[[1, 3]])
@@ -60,11 +62,11 @@ class Region:
         return Region(tuple(Rectangle(*each) for each in common.T.tolist()))
 
     def limits(self) -> Floats:
-        """x_min, x_max, y_min and y_max of the rectangles, an array (4, number of rectangles)."""
+        """Return x_min, x_max, y_min and y_max of the rectangles, an array of shape (4, number of rectangles)."""
         return np.array(self.rectangles, dtype=np.float64).reshape(-1, 4).T
 
     def contains(self, x: Floats, y: Floats) -> NDArray[np.bool_]:
-        """For each point whether it is inside or on an edge."""
+        """Return for each point whether it is inside a rectangle or on an edge."""
         x_min, x_max, y_min, y_max = self.limits()
         x, y = x[:, None], y[:, None]
         return np.asarray(((x >= x_min) & (x <= x_max) & (y >= y_min) & (y <= y_max)).any(axis=1))
@@ -72,15 +74,15 @@ class Region:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Everything that is not None must hold.
+    """The conditions that a pick-up must meet; None leaves an attribute unrestricted.
 
     Attributes:
-        arms, grasps: one of these.
-        region: the robot stands there.
-        height: the object's height minus the torso's, between the two, m. A policy that knows nothing of heights
-            passes it over.
+        arms, grasps: the allowed members.
+        region: the allowed positions of the robot.
+        height: limits (low, high) of the object's height minus the torso's, m. A policy that has not learned heights
+            ignores it.
 
-    Raises `CallerError`: members of another enum, a height that is no interval.
+    Raises `CallerError` for members of another enum and for a height that is not an interval.
     """
 
     arms: frozenset[Arms] | None = None
@@ -90,16 +92,16 @@ class Evidence:
 
     def __post_init__(self) -> None:
         for name, members, kind in (("arms", self.arms, Arms), ("grasps", self.grasps, Grasp)):
-            # Arms.LEFT == Grasp.LEFT, for both are the number 1
+            # Arms.LEFT == Grasp.LEFT because both are the integer 1: compare the types.
             if members is not None and not all(isinstance(each, kind) for each in members):
                 raise CallerError(f"evidence on {name} takes members of {kind.__name__}, not {set(members)}")
         if self.height is not None:
             low, high = self.height
             if not -math.inf < low < high < math.inf:
-                raise CallerError(f"a height is known as an interval (low, high) in m, not {self.height}")
+                raise CallerError(f"evidence on height takes an interval (low, high) in m, got {self.height}")
 
     def __and__(self, other: Evidence) -> Evidence:
-        """What must hold if both must. Two heights that have nothing in common hold nowhere."""
+        """Combine both conditions. Two disjoint heights give the empty region, which no pick-up meets."""
         region = other.region if self.region is None else self.region
         if self.region is not None and other.region is not None:
             region = self.region & other.region
@@ -111,10 +113,10 @@ class Evidence:
         return Evidence(_common(self.arms, other.arms), _common(self.grasps, other.grasps), region, height)
 
     def __str__(self) -> str:
-        said = [f"{name} {_names(members)}" for name, members in (("arms", self.arms), ("grasps", self.grasps))]
+        members = [f"{name} {_names(members)}" for name, members in (("arms", self.arms), ("grasps", self.grasps))]
         region = "anywhere" if self.region is None else f"in {len(self.region.rectangles)} rectangles"
         height = "any height" if self.height is None else f"height {self.height[0]:.3f} to {self.height[1]:.3f} m"
-        return ", ".join((*said, region, height))
+        return ", ".join((*members, region, height))
 
 
 _Member = TypeVar("_Member", Arms, Grasp)

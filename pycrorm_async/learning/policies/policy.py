@@ -1,13 +1,13 @@
-"""A policy: with which arm and grasp to pick an object up and where to stand for it, with what probability.
+"""A policy is a probability distribution over ways to pick an object up: arm, grasp, and position of the robot.
 
 >>> policy = default_policy().condition(Evidence(arms=frozenset({Arms.LEFT})))
 >>> choices = policy.sample(np.random.default_rng(69), 20)
 >>> best_first = sorted(zip(-policy.likelihood(choices), choices))
 
-It is a mixture of leaves, in each of which arm, grasp, relative_x, relative_y and, if it was learned, the object's
-height over the torso are independent. Together with the evidence it is conditioned on, that is all there is to it:
-probabilities under evidence are sums of products, exact, and every policy, the default one or a learned one, is a value
-of this one class. Chance comes in as an argument; the same generator gives the same samples.
+It is a mixture of leaves. Inside a leaf arm, grasp, relative_x, relative_y and, if learned, the object's height over
+the torso are independent, so that probabilities under evidence are exact: sums of products. The default policy and
+every learned one are values of this class. The random generator is an argument; the same generator state gives the
+same samples.
 """
 
 from __future__ import annotations
@@ -48,12 +48,13 @@ class PickUpChoice(NamedTuple):
 
 
 class Leaf(msgspec.Struct, frozen=True):
-    """A part of a policy in which nothing depends on anything else.
+    """A component of the mixture, in which all variables are independent.
 
     Attributes:
         weight: the probability of the leaf.
         arms, grasps: a probability for each of `ARMS` and of `GRASPS`.
-        height: the object's height minus the torso's, m; None where it was not learned.
+        x, y: distributions of relative_x and relative_y, m.
+        height: distribution of the object's height minus the torso's, m; None where it was not learned.
     """
 
     weight: float
@@ -65,30 +66,32 @@ class Leaf(msgspec.Struct, frozen=True):
 
     def __post_init__(self) -> None:
         if not 0 < self.weight <= 1:
-            raise ValueError(f"a leaf of weight {self.weight}")
+            raise ValueError(f"a leaf needs a weight in (0, 1], got weight {self.weight}")
         for shares, members in ((self.arms, ARMS), (self.grasps, GRASPS)):
             if len(shares) != len(members) or min(shares) < 0 or not math.isclose(sum(shares), 1, rel_tol=1e-6):
-                raise ValueError(f"a leaf with probabilities {shares}")
+                raise ValueError(
+                    f"a leaf needs {len(members)} probabilities >= 0 that sum to 1, got probabilities {shares}"
+                )
 
     def allowed(self, evidence: Evidence) -> tuple[Floats, Floats, float]:
-        """The probabilities of the arms and grasps that may be, 0 for the others; that of the height."""
+        """Return the probabilities of arms and grasps, 0 where the evidence excludes them, and that of the height."""
         height = 1.0
         if self.height is not None and evidence.height is not None:
             height = float(np.diff(self.height.cdf(np.array(evidence.height)))[0])
-        return _only(evidence.arms, ARMS, self.arms), _only(evidence.grasps, GRASPS, self.grasps), height
+        return _mask(evidence.arms, ARMS, self.arms), _mask(evidence.grasps, GRASPS, self.grasps), height
 
 
 @dataclass(frozen=True)
 class Policy:
-    """A distribution over `PickUpChoice`, given the evidence.
+    """A distribution over `PickUpChoice`, conditioned on the evidence.
 
     Attributes:
-        leaves: their weights sum to one. Those of a tree have no point in common.
-        evidence: what holds for sure.
-        constant_height: where all experience was with objects at one height over the torso, that one, m. Then the
-            policy is offered for every height, and how it does at others is to be tried.
+        leaves: their weights sum to one. The leaves of a tree do not overlap.
+        evidence: the condition.
+        constant_height: the height over the torso, m, if all samples it was learned from had the same one. Such a
+            policy applies to every height; its success at other heights is not known.
 
-    Raises `ImpossibleCondition`: nothing is left under the evidence.
+    Raises `ImpossibleCondition` if the evidence has probability 0.
     """
 
     leaves: tuple[Leaf, ...]
@@ -100,9 +103,9 @@ class Policy:
             raise ImpossibleCondition(f"the policy gives no probability to: {self.evidence}")
 
     def sample(self, rng: np.random.Generator, count: int = 1) -> list[PickUpChoice]:
-        """So many independent choices. Two calls for one draw the same as one call for two."""
+        """Draw `count` independent choices. Two calls with count 1 draw the same choices as one call with count 2."""
         if count < 0:
-            raise CallerError(f"{count} choices cannot be drawn")
+            raise CallerError(f"cannot draw {count} choices: count must be >= 0")
         chance = rng.random((count, 5)).T
         cumulative = self._cells.ravel().cumsum()
         cell = np.searchsorted(cumulative, chance[0] * cumulative[-1], side="right")
@@ -110,23 +113,23 @@ class Policy:
         arms, grasps = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
         places = np.zeros((2, count))
         for number in np.unique(leaf).tolist():
-            here = leaf == number
+            rows = leaf == number
             drawn = self.leaves[number]
             arm_shares, grasp_shares, _ = drawn.allowed(self.evidence)
-            arms[here] = _picked(arm_shares, chance[1, here])
-            grasps[here] = _picked(grasp_shares, chance[2, here])
-            x_min, x_max, y_min, y_max = self._limits[:, rectangle[here]]
-            places[0, here] = _between(drawn.x, x_min, x_max, chance[3, here])
-            places[1, here] = _between(drawn.y, y_min, y_max, chance[4, here])
+            arms[rows] = _draw_indices(arm_shares, chance[1, rows])
+            grasps[rows] = _draw_indices(grasp_shares, chance[2, rows])
+            x_min, x_max, y_min, y_max = self._limits[:, rectangle[rows]]
+            places[0, rows] = _draw_between(drawn.x, x_min, x_max, chance[3, rows])
+            places[1, rows] = _draw_between(drawn.y, y_min, y_max, chance[4, rows])
         return [
             PickUpChoice(ARMS[arm], GRASPS[grasp], x, y)
             for arm, grasp, x, y in zip(arms.tolist(), grasps.tolist(), *places.tolist(), strict=True)
         ]
 
     def likelihood(self, choices: Sequence[PickUpChoice]) -> Floats:
-        """For each choice the probability of its arm and grasp times the density of its place, 1/m²; 0 if impossible.
+        """Return for each choice the probability of its arm and grasp times the density of its place, 1/m².
 
-        Given the evidence, that on the height included.
+        All of it conditioned on the evidence, including that on the height; 0 for an impossible choice.
         """
         arm, grasp = (
             np.array([_index(members, each[part]) for each in choices], dtype=np.int64)
@@ -145,49 +148,51 @@ class Policy:
         return total / self._mass
 
     def coverage(self, choices: Sequence[PickUpChoice]) -> float:
-        """The share of the choices that the policy could have made: one that only repeats what it saw has little."""
+        """Return the share of the choices with a likelihood > 0; small for a policy that only repeats its samples."""
         if not choices:
-            raise CallerError("the coverage of no choices is not defined")
+            raise CallerError("coverage needs at least one choice: no choices were given")
         return float((self.likelihood(choices) > 0).mean())
 
     def condition(self, evidence: Evidence) -> Policy:
-        """The policy where this holds too. Raises `ImpossibleCondition` where it never does."""
+        """Condition the policy on more evidence. Raises `ImpossibleCondition` if that has probability 0."""
         return replace(self, evidence=self.evidence & evidence)
 
     def probability(self, evidence: Evidence) -> float:
-        """How likely it is that this holds, given the evidence there is; between 0 and 1."""
+        """Return the probability of `evidence` given the policy's own evidence, between 0 and 1."""
         return min(1.0, float(_cells(self.leaves, self.evidence & evidence).sum()) / self._mass)
 
     def mode(self, *, width_m: float = 0.05) -> Policy:
-        """Conditioned on where it is most likely: on a square of this width, and the arms and grasps likeliest there.
+        """Condition the policy on its most probable square of this width and on the likeliest arms and grasps there.
 
-        Of all squares, cut to the region, the one in which a leaf has most of its probability for one arm and grasp.
-        Ties in another leaf are left out. Where the density is highest in a point tells little: a tree's distributions
-        are steep wherever two samples lay close together by chance.
+        The square, cut to the region, is the one with the highest probability of one leaf, arm and grasp. Squares of
+        other leaves that tie with it are ignored. The square replaces the point of highest density because the
+        density of a tree is also high wherever two samples lie close together by chance.
         """
         if not width_m > 0:
-            raise CallerError(f"a square {width_m} m wide is none")
+            raise CallerError(f"width_m must be > 0, got {width_m}")
         peaks = list(self._peaks(width_m))
-        most = max(held for _, _, held in peaks)
-        number = next(number for number, _, held in peaks if held == most)
+        highest = max(probability for _, _, probability in peaks)
+        number = next(number for number, _, probability in peaks if probability == highest)
         arms, grasps, _ = self.leaves[number].allowed(self.evidence)
         return self.condition(
             Evidence(
                 arms=frozenset(arm for arm, share in zip(ARMS, arms, strict=True) if share == arms.max()),
                 grasps=frozenset(grasp for grasp, share in zip(GRASPS, grasps, strict=True) if share == grasps.max()),
-                region=Region(tuple(square for leaf, square, held in peaks if (leaf, held) == (number, most))),
+                region=Region(
+                    tuple(square for leaf, square, probability in peaks if (leaf, probability) == (number, highest))
+                ),
             )
         )
 
     def _peaks(self, width_m: float) -> Iterator[tuple[int, Rectangle, float]]:
-        """Of each leaf in each rectangle: the leaf's number, the square that holds most of it, and how much."""
+        """Yield for each leaf in each rectangle: the leaf's number, its most probable square, and the probability."""
         for number, rectangle in zip(*(each.tolist() for each in self._cells.nonzero()), strict=True):
             leaf = self.leaves[number]
             arms, grasps, height = leaf.allowed(self.evidence)
             x_min, x_max, y_min, y_max = self._limits[:, rectangle].tolist()
             x, y = leaf.x.peak(x_min, x_max, width_m), leaf.y.peak(y_min, y_max, width_m)
-            held = leaf.weight * height * float(arms.max() * grasps.max()) * x.held * y.held
-            yield number, Rectangle(x.low, x.high, y.low, y.high), held
+            probability = leaf.weight * height * float(arms.max() * grasps.max()) * x.probability * y.probability
+            yield number, Rectangle(x.low, x.high, y.low, y.high), probability
 
     @cached_property
     def _cells(self) -> Floats:
@@ -203,7 +208,7 @@ class Policy:
 
 
 def _cells(leaves: Sequence[Leaf], evidence: Evidence) -> Floats:
-    """The probability of each leaf in each rectangle, (leaves, rectangles), together with all other evidence."""
+    """Return the probability of each leaf in each rectangle under all evidence, shape (leaves, rectangles)."""
     x_min, x_max, y_min, y_max = _limits(evidence)
     cells = np.zeros((len(leaves), len(x_min)))
     for row, leaf in zip(cells, leaves, strict=True):
@@ -217,24 +222,24 @@ def _limits(evidence: Evidence) -> Floats:
     return _ANYWHERE if evidence.region is None else evidence.region.limits()
 
 
-def _between(marginal: Marginal, low: Floats, high: Floats, chance: Floats) -> Floats:
-    """Values between the two, drawn by turning the distribution round."""
+def _draw_between(marginal: Marginal, low: Floats, high: Floats, chance: Floats) -> Floats:
+    """Draw values inside [low, high] by inverting the cumulative distribution."""
     below, up_to = marginal.cdf(low), marginal.cdf(high)
     return np.clip(marginal.quantile(below + chance * (up_to - below)), low, high)
 
 
-def _picked(shares: Floats, chance: Floats) -> NDArray[np.intp]:
-    """Indices, each as often as its share says; never one of share 0."""
+def _draw_indices(shares: Floats, chance: Floats) -> NDArray[np.intp]:
+    """Draw indices with probabilities proportional to the shares; an index of share 0 is never drawn."""
     cumulative = shares.cumsum()
     return np.asarray(np.searchsorted(cumulative, chance * cumulative[-1], side="right"))
 
 
 def _index(members: Sequence[object], member: object) -> int:
-    """Of an arm or grasp that no policy chooses: -1."""
+    """Return the member's index; -1 for an arm or grasp that no policy chooses, such as `Arms.BOTH`."""
     return members.index(member) if member in members else -1
 
 
-def _only(wanted: Container[object] | None, members: Sequence[object], shares: Sequence[float]) -> Floats:
-    """The shares, 0 for members that are not wanted."""
+def _mask(allowed: Container[object] | None, members: Sequence[object], shares: Sequence[float]) -> Floats:
+    """Return the shares, 0 for members that are not allowed."""
     pairs = zip(members, shares, strict=True)
-    return np.array([share if wanted is None or member in wanted else 0.0 for member, share in pairs])
+    return np.array([share if allowed is None or member in allowed else 0.0 for member, share in pairs])

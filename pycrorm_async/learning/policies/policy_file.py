@@ -1,11 +1,12 @@
-"""A policy as a file of two lines of JSON: what it is and the checksum of the second, and the policy itself.
+"""Read and write policy files: two lines of JSON, a heading with the second line's checksum, then the policy.
 
     {"format":"pycrorm policy","version":1,"crc32":2868103911}
     {"arms":["LEFT","RIGHT"],"grasps":["FRONT","LEFT","RIGHT","TOP"],"leaves":[...],"evidence":{...},...}
 
-Numbers are written with all their digits: what is read back gives equal likelihoods, in every process. `arms` and
-`grasps` name what the leaves' probabilities stand for, in order. Neither numpy's nor Python's pickle is used, so a
-file from elsewhere can do no more than be refused; reading and using one needs nothing that learning needs.
+Numbers are written with all their digits, so that a policy read back gives the same likelihoods in every process.
+`arms` and `grasps` name the members that the leaves' probabilities belong to, in order. No pickle is used, so a file
+from an untrusted source cannot run code. Reading a policy and sampling it need none of the packages that learning
+needs.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class _Heading(msgspec.Struct, frozen=True):
 
 
 class _Evidence(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Members by name; rectangles as x_min, x_max, y_min, y_max."""
+    """Evidence as written: members by name, rectangles as x_min, x_max, y_min, y_max."""
 
     arms: list[str] | None
     grasps: list[str] | None
@@ -53,44 +54,44 @@ class _Policy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def save_policy(policy: Policy, path: Path | str) -> None:
-    """Write the policy, in place of what the file held before; a reader finds the one or the other, whole.
+    """Write the policy to the file and replace its content atomically: a reader gets the old policy or the new one.
 
-    Raises `PolicyFileRefused` where it cannot be written.
+    Raises `PolicyFileRefused` if the file cannot be written.
     """
-    path, content = Path(path), _content(policy)
+    path, content = Path(path), _encode(policy)
     heading = msgspec.json.encode(_Heading(FORMAT, VERSION, zlib.crc32(content)))
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_bytes(heading + b"\n" + content + b"\n")
-        beside.replace(path)
+        temporary.write_bytes(heading + b"\n" + content + b"\n")
+        temporary.replace(path)
     except OSError as error:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise PolicyFileRefused(path, f"cannot be written: {error.strerror or error}") from None
 
 
 def name_of(policy: Policy) -> str:
-    """Twelve hexadecimal digits that tell policies apart: equal ones have the same, in every process."""
-    return hashlib.blake2b(_content(policy), digest_size=6).hexdigest()
+    """Return the policy's name, 12 hexadecimal digits: a hash of its content, the same in every process."""
+    return hashlib.blake2b(_encode(policy), digest_size=6).hexdigest()
 
 
-def _content(policy: Policy) -> bytes:
+def _encode(policy: Policy) -> bytes:
     return msgspec.json.encode(
         _Policy(
             [each.name for each in ARMS],
             [each.name for each in GRASPS],
             policy.leaves,
-            _written(policy.evidence),
+            _encode_evidence(policy.evidence),
             policy.constant_height,
         )
     )
 
 
 def load_policy(path: Path | str) -> Policy:
-    """The policy that was saved there.
+    """Read a policy that `save_policy` wrote.
 
     Raises:
-        PolicyFileRefused: there is no such file, or it holds something else, or a policy of another version.
-        PolicyDamaged: it is not what was written.
+        PolicyFileRefused: the file does not exist, is not a policy file, or has another format version.
+        PolicyDamaged: the content differs from what was written.
     """
     path = Path(path)
     try:
@@ -102,37 +103,37 @@ def load_policy(path: Path | str) -> Policy:
     except msgspec.DecodeError:
         heading = _Heading("", 0, 0)
     if heading.format != FORMAT:
-        raise PolicyFileRefused(path, "holds no policy: give a file that `save_policy` or `pycrorm learn` wrote")
+        raise PolicyFileRefused(path, "holds no policy: pass a file written by `save_policy` or `pycrorm learn`")
     if heading.version != VERSION:
-        raise PolicyFileRefused(path, f"is of format version {heading.version}, where this program reads {VERSION}")
+        raise PolicyFileRefused(path, f"has format version {heading.version}, but this program reads {VERSION}")
     content = rest.removesuffix(b"\n")
     if zlib.crc32(content) != heading.crc32:
-        raise PolicyDamaged(path, "its checksum does not fit what it holds")
+        raise PolicyDamaged(path, "its checksum does not match its content")
     try:
-        return _policy(msgspec.json.decode(content, type=_Policy))
+        return _decode(msgspec.json.decode(content, type=_Policy))
     except (msgspec.DecodeError, CallerError, ImpossibleCondition, KeyError, ValueError) as error:
-        raise PolicyDamaged(path, f"its checksum fits, but it holds no policy: {error}") from None
+        raise PolicyDamaged(path, f"its checksum matches, but it holds no policy: {error}") from None
 
 
-def _policy(written: _Policy) -> Policy:
-    if (written.arms, written.grasps) != ([each.name for each in ARMS], [each.name for each in GRASPS]):
-        raise ValueError(f"probabilities of arms {written.arms} and grasps {written.grasps}")
-    if not math.isclose(sum(leaf.weight for leaf in written.leaves), 1, rel_tol=1e-6):
+def _decode(content: _Policy) -> Policy:
+    if (content.arms, content.grasps) != ([each.name for each in ARMS], [each.name for each in GRASPS]):
+        raise ValueError(f"unexpected members: probabilities of arms {content.arms} and grasps {content.grasps}")
+    if not math.isclose(sum(leaf.weight for leaf in content.leaves), 1, rel_tol=1e-6):
         raise ValueError("the weights of the leaves do not sum to one")
-    evidence = written.evidence
+    evidence = content.evidence
     return Policy(
-        written.leaves,
+        content.leaves,
         Evidence(
             arms=None if evidence.arms is None else frozenset(Arms[name] for name in evidence.arms),
             grasps=None if evidence.grasps is None else frozenset(Grasp[name] for name in evidence.grasps),
             region=None if evidence.region is None else Region(tuple(evidence.region)),
             height=evidence.height,
         ),
-        written.constant_height,
+        content.constant_height,
     )
 
 
-def _written(evidence: Evidence) -> _Evidence:
+def _encode_evidence(evidence: Evidence) -> _Evidence:
     return _Evidence(
         None if evidence.arms is None else sorted(each.name for each in evidence.arms),
         None if evidence.grasps is None else sorted(each.name for each in evidence.grasps),

@@ -1,4 +1,4 @@
-"""A picture of policies: where around the object each would have the robot stand, and where it went well."""
+"""Draw policies: the density of robot positions around the object under each policy, and the positions that worked."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 __all__ = ["draw_policies"]
 
 _SAMPLES = 200_000
-_SHOWN_M = (-1.5, 1.5)
+_PLOT_RANGE_M = (-1.5, 1.5)
 _CELLS = 120
 
 
 def draw_policies(
     policies: Mapping[str, Policy], path: Path | str, *, successes: Sequence[PickUpChoice] = (), seed: int = 0
 ) -> None:
-    """Draws the policies side by side, each by its title, into a file whose ending says its format (.png, .svg, .pdf).
+    """Draw the policies side by side under their titles into a file whose suffix sets the format (.png, .svg, .pdf).
 
-    The density over relative_x and relative_y, whatever arm and grasp, is that of 200,000 samples; the dots are the
-    successes. Raises `MissingExtra` without matplotlib, `CallerError` for a file that cannot be written.
+    The density over relative_x and relative_y, for all arms and grasps together, is that of 200,000 samples; the dots
+    are the successes. Raises `MissingExtra` without matplotlib, `CallerError` if the file cannot be written.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -35,16 +35,16 @@ def draw_policies(
     panels = figure.subplots(1, len(policies), squeeze=False)[0]
     for axes, (title, policy) in zip(panels, policies.items(), strict=True):
         drawn = policy.sample(np.random.default_rng(seed), _SAMPLES)
-        *_, image = axes.hist2d(*_places(drawn), bins=_CELLS, range=(_SHOWN_M, _SHOWN_M), density=True)
+        *_, image = axes.hist2d(*_places(drawn), bins=_CELLS, range=(_PLOT_RANGE_M, _PLOT_RANGE_M), density=True)
         figure.colorbar(image, ax=axes, shrink=0.8, label="probability per m²")
         axes.plot(*_places(successes), ".", color="white", markersize=1.2, alpha=0.5)
         axes.plot(0, 0, "+", color="red", markersize=12)
         axes.set(title=title, xlabel="relative x, m (in the object's frame)", ylabel="relative y, m")
-        axes.set(xlim=_SHOWN_M, ylim=_SHOWN_M, aspect="equal")
+        axes.set(xlim=_PLOT_RANGE_M, ylim=_PLOT_RANGE_M, aspect="equal")
     try:
         figure.savefig(path, dpi=110)
     except (OSError, ValueError) as error:
-        raise CallerError(f"the figure cannot be drawn: {error}") from None
+        raise CallerError(f"cannot write the figure {path}: {error}") from None
 
 
 def _places(choices: Sequence[PickUpChoice]) -> tuple[list[float], list[float]]:

@@ -1,1 +1,1 @@
-"""Rollouts of move-and-pick-up: performed in kitchens, in many processes, and read back from a memory."""
+"""Perform rollouts of move-and-pick-up in one or several processes, and read them back from a memory."""

@@ -1,4 +1,7 @@
-"""Where around an object a robot could stand and see it here and now, as rectangles in the object's own frame."""
+"""Compute the places around an object that are free for the robot's base and from which its camera sees the object.
+
+The places are rectangles in the object's own frame.
+"""
 
 from __future__ import annotations
 
@@ -16,23 +19,23 @@ from pycrorm_async.world.queries.costmaps import Costmap, OccupancyCostmap, Visi
 __all__ = ["free_and_visible", "rectangles", "CLEARANCE_M", "REACH_M"]
 
 CLEARANCE_M = 0.3
-"""How far from the middle of the robot furniture has to be, as in the thesis."""
+"""Minimum distance between the middle of the robot's base and any obstacle, the thesis' value."""
 REACH_M = 2.0
-"""So far from the object, along either of its axes, places are looked at: as far as the default policy goes."""
+"""Half the side of the square of places around the object: the same as the range of the default policy."""
 _RESOLUTION_M = 0.05
 _CELLS = round(2 * REACH_M / _RESOLUTION_M)
 _VISIBLE_SHARE_MIN = 0.5
 
 
 def free_and_visible(robot: RobotHere, target: Object) -> Region:
-    """The places from which the robot, standing clear of everything, sees the object. Nothing is moved."""
+    """Return the places where the robot's base is clear of obstacles and its camera sees the object. Moves nothing."""
     world, ignored = target.world, robot.with_load()
     ground = Pose((target.pose.position.x, target.pose.position.y, 0.0))
     low, high = robot.description.camera_height_m
-    # Turned with the object, the square of its own frame takes up to √2 times as much of the map.
+    # The maps are not turned with the object, so the square in its frame needs up to √2 times the side: 1.5 is enough.
     size = {"size_cells": 2 * round(0.75 * _CELLS), "resolution_m": _RESOLUTION_M}
     free = OccupancyCostmap(world, ground, distance_to_obstacle_m=CLEARANCE_M, ignore=ignored, **size)  # type: ignore[arg-type]
-    seen = VisibilityCostmap(
+    visible = VisibilityCostmap(
         world,
         target,
         min_height_m=low,
@@ -42,13 +45,13 @@ def free_and_visible(robot: RobotHere, target: Object) -> Region:
         **size,  # type: ignore[arg-type]
     )
     middles = (np.arange(_CELLS) + 0.5) * _RESOLUTION_M - REACH_M
-    stands = _values(free, target.pose.yaw, middles) > 0
-    stands &= _values(seen, target.pose.yaw, middles) >= _VISIBLE_SHARE_MIN
-    return Region(tuple(rectangles(stands)))
+    places = _values(free, target.pose.yaw, middles) > 0
+    places &= _values(visible, target.pose.yaw, middles) >= _VISIBLE_SHARE_MIN
+    return Region(tuple(rectangles(places)))
 
 
 def _values(costmap: Costmap, yaw: float, middles: NDArray[np.floating]) -> NDArray[np.float64]:
-    """What the map says at the cells of a grid that is turned about its origin."""
+    """Sample the map at the cells of a grid that is turned by `yaw` about the map's origin."""
     x, y = np.meshgrid(middles, middles, indexing="ij")
     turned = (np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y)
     row, column = (np.floor(each / costmap.resolution_m + costmap.size_cells / 2).astype(int) for each in turned)
@@ -56,7 +59,7 @@ def _values(costmap: Costmap, yaw: float, middles: NDArray[np.floating]) -> NDAr
 
 
 def rectangles(cells: NDArray[np.bool_]) -> Iterator[Rectangle]:
-    """The true cells as few rectangles without overlap: runs along y that are the same in neighbouring rows are one."""
+    """Cover the true cells with disjoint rectangles; equal runs along y in consecutive rows become one rectangle."""
     open_runs: dict[tuple[int, int], int] = {}
     for row in range(len(cells) + 1):
         runs = set(_runs(cells[row])) if row < len(cells) else set()
@@ -67,7 +70,7 @@ def rectangles(cells: NDArray[np.bool_]) -> Iterator[Rectangle]:
 
 
 def _runs(cells: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """Where runs of true cells begin, and where they are over."""
+    """Yield the start and the end (exclusive) of each run of true cells."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], cells, [False]])))
     yield from zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 

@@ -1,4 +1,4 @@
-"""One pick-up in the kitchen with a policy that was learned without one, as at the end of the thesis' notebook."""
+"""Try one pick-up in the kitchen with a policy learned without a kitchen, as at the end of the thesis' notebook."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ import numpy as np
 
 from pycrorm_async.learning.policies.policy import Policy
 from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.learning.rollouts.rollout_pool import Place
+from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
 from pycrorm_async.learning.rollouts.scene import Scene
 from pycrorm_async.memory import Memory
 from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
 from pycrorm_async.plan.failures import PlanFailure
 
-__all__ = ["InKitchen", "pick_up_in_kitchen", "KITCHEN"]
+__all__ = ["KitchenResult", "pick_up_in_kitchen", "KITCHEN"]
 
 KITCHEN = Scene(kitchen=True, collisions=True, torso_height=0.3)
-"""The milk of the thesis on the worktop, and the torso up: the arm has to stay out of the worktop."""
+"""The thesis' milk on the worktop, with the torso raised so that the arm can stay clear of the worktop."""
 
 
 @dataclass(frozen=True)
-class InKitchen:
-    """How it went.
+class KitchenResult:
+    """The result of `pick_up_in_kitchen`.
 
     Attributes:
-        tries: how many samples were tried; the last one succeeded, if any did.
-        done: what succeeded; None if nothing did, then `failure` says why in the end.
+        tries: number of samples tried; only the last one can have succeeded.
+        done: the action that succeeded; None if none did.
+        failure: message of the last failure; None after a success.
         episode: the episode's id.
     """
 
@@ -36,10 +37,12 @@ class InKitchen:
     episode: str
 
 
-async def pick_up_in_kitchen(policy: Policy, place: Place, *, seed: int, scene: Scene = KITCHEN) -> InKitchen:
-    """Samples of the policy, grounded in where the robot can stand and see the object, the likeliest first.
+async def pick_up_in_kitchen(
+    policy: Policy, place: MemoryLocation, *, seed: int, scene: Scene = KITCHEN
+) -> KitchenResult:
+    """Try samples of the policy in order of likelihood until one succeeds, at places that `free_and_visible` allows.
 
-    Remembered as one episode, in the tables when this returns.
+    Records one episode, which is visible when this returns.
     """
     tries, done, failure = 0, None, None
     async with Memory.open(place.url, spool=place.spool) as memory:
@@ -57,7 +60,7 @@ async def pick_up_in_kitchen(policy: Policy, place: Place, *, seed: int, scene: 
                         else:
                             done, failure = each, None
                             break
-                except PlanFailure as nowhere:
-                    failure = str(nowhere)
+                except PlanFailure as reason:  # raised by the iteration: the policy has no sample that fits the scene
+                    failure = str(reason)
         await memory.flush()
-    return InKitchen(tries, done, failure, str(episode))
+    return KitchenResult(tries, done, failure, str(episode))

@@ -1,4 +1,4 @@
-"""Moving somewhere and picking up from there, as a policy would have it (thesis 5.2)."""
+"""Describe move-and-pick-up actions whose arm, grasp and base position are sampled from a policy (thesis 5.2)."""
 
 from __future__ import annotations
 
@@ -26,25 +26,28 @@ from pycrorm_async.world.pose import Pose, rotated
 __all__ = ["MoveAndPickUp", "HEIGHT_TOLERANCE_M"]
 
 HEIGHT_TOLERANCE_M = 0.05
-"""Experience with an object that was so much higher or lower, measured from the torso, is experience with this one."""
+"""Experience with objects up to this much higher or lower, measured from the torso, applies to the object at hand."""
 _UPRIGHT_MIN = 0.1
+"""Minimum vertical component of the object's own z axis (a cosine); below it the object lies on its side and its x-y
+plane no longer maps to the floor."""
 
 
 class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
-    """Alternatives for moving somewhere and picking an object up, as often as its policy has them.
+    """A description whose alternatives for moving to an object and picking it up are samples of a policy.
 
-    Iterating draws samples that fit the scene, and gives the likeliest first:
+    Iterating draws samples that fit the scene and yields the likeliest first:
 
     >>> await Retry(MoveAndPickUp(milk, policy=learned), max_tries=20).perform()
 
     Args:
         target: the object, or a description of it.
-        arms, grasps: only these; left out, any.
-        policy: where to stand and how to grasp; left out, the default policy of the thesis.
-        samples: how many alternatives there are.
-        rng: where chance comes from; left out, a new one that nobody can repeat.
+        arms, grasps: the allowed ones; None allows all.
+        policy: the distribution of base positions, arms and grasps; None means the thesis' default policy.
+        samples: number of alternatives.
+        rng: random generator; None means a new one with an unpredictable seed.
 
-    Raises `ImpossibleCondition` if the policy never does it with such an arm or grasp, `CallerError` for no samples.
+    Raises `ImpossibleCondition` if the policy gives these arms or grasps no probability, `CallerError` if
+    samples < 1.
     """
 
     def __init__(
@@ -59,14 +62,14 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     ) -> None:
         super().__init__(MoveAndPickUpPerformable)
         if samples < 1:
-            raise CallerError(f"there is at least one sample, not {samples}")
+            raise CallerError(f"samples must be >= 1, got {samples}")
         self.target = target.resolve() if isinstance(target, ObjectDesignatorDescription) else designator_of(target)
-        wanted = Evidence(
+        evidence = Evidence(
             arms=frozenset(arms) if arms is not None else None,
             grasps=frozenset(grasps) if grasps is not None else None,
         )
         policy = default_policy() if policy is None else policy
-        self.policy: Policy = policy if wanted == Evidence() else policy.condition(wanted)
+        self.policy: Policy = policy if evidence == Evidence() else policy.condition(evidence)
         self.samples = samples
         self._rng = np.random.default_rng() if rng is None else rng
 
@@ -75,11 +78,10 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     @staticmethod
     def query_for_database() -> Select[Arms, Grasp, float, float, float | None]:
-        """What a policy is learned from: how objects were picked up when it went well, in all episodes.
+        """Select the successful pick-ups of all episodes, the input of `learn`.
 
-        A frame of it has the columns that `learn` takes: arm, grasp, object_x, object_y (where the robot stood, m, in
-        the object's own frame) and height (of the object over the lifted torso, m). Add a `where` for a part of the
-        episodes.
+        A data frame of it has the columns arm, grasp, object_x, object_y (the robot's position in the object's own
+        frame, m) and height (of the object over the lifted torso, m). Add a `where` to restrict the episodes.
         """
         view = PickUpWithContextView
         return select(
@@ -90,25 +92,28 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             view.height_over_torso.label("height"),
         ).where(view.status == TaskStatus.SUCCEEDED)
 
-    # --- what is known here -----------------------------------------------------------------------------------
+    # --- policies for the current scene -----------------------------------------------------------------------
 
     @property
     def height(self) -> float:
-        """How much higher than the lifted torso the object is now, m. Raises `NoWorld`, `NoRobotHere`."""
+        """Height of the object over the lifted torso at this moment, m. Raises `NoWorld`, `NoRobotHere`."""
         robot = robot_here()
         torso = robot.body.joint_position(robot.description.torso_joint)
         return self.target.pose.position.z - robot.body.pose.position.z - torso
 
     def policy_here(self) -> Policy:
-        """The policy for an object as high as this one. Raises `ObjectUnreachable` where it knows none."""
-        return self._given(Evidence(height=_around(self.height)), "this high")
+        """Condition the policy on the object's height. Raises `ObjectUnreachable` if that has probability 0."""
+        return self._condition(Evidence(height=_around(self.height)), "at this height")
 
     def grounded(self) -> Policy:
-        """The policy for where the robot can stand and see the object here. Raises `ObjectUnreachable`."""
-        region = free_and_visible(robot_here(), in_world(self.target))
-        return self._given(Evidence(region=region, height=_around(self.height)), "here")
+        """Condition the policy on the object's height and on the free places that see the object.
 
-    def _given(self, evidence: Evidence, where: str) -> Policy:
+        Raises `ObjectUnreachable` if that has probability 0.
+        """
+        region = free_and_visible(robot_here(), in_world(self.target))
+        return self._condition(Evidence(region=region, height=_around(self.height)), "in this scene")
+
+    def _condition(self, evidence: Evidence, where: str) -> Policy:
         try:
             return self.policy.condition(evidence)
         except ImpossibleCondition as impossible:
@@ -118,15 +123,15 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     # --- alternatives -----------------------------------------------------------------------------------------
 
     def __iter__(self) -> Iterator[MoveAndPickUpPerformable]:
-        """Samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none can."""
+        """Yield samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none fits."""
         yield from self._likeliest_first(self.grounded())
 
     def from_mode(self) -> Iterator[MoveAndPickUpPerformable]:
-        """The same from around the likeliest way of doing it here alone. Raises `ObjectUnreachable`."""
+        """Yield samples from around the mode of the grounded policy only. Raises `ObjectUnreachable`."""
         yield from self._likeliest_first(self.grounded().mode())
 
     def plain(self) -> Iterator[MoveAndPickUpPerformable]:
-        """Samples of the policy in the order they are drawn, whatever is around."""
+        """Yield samples in the order they are drawn, without regard to obstacles and visibility."""
         for choice in self.policy_here().sample(self._rng, self.samples):
             yield self.chosen(choice)
 
@@ -136,17 +141,19 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             yield self.chosen(choices[number])
 
     def chosen(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
-        """This very choice, for the object where it is now. Raises `ObjectUnreachable` for one that lies on its side.
+        """Return the action for this choice and the object's current pose.
 
-        The base stands on the floor where the object's own frame has these x and y.
+        The base's position is the point of the floor that has these x and y in the object's own frame. Raises
+        `ObjectUnreachable` for an object that lies on its side, whose x-y plane does not map to the floor.
         """
-        there = self.target.pose
-        up = rotated(there.orientation, (0.0, 0.0, 1.0))
+        pose = self.target.pose
+        up = rotated(pose.orientation, (0.0, 0.0, 1.0))
         if abs(up.z) < _UPRIGHT_MIN:
-            raise ObjectUnreachable(f"{self.target.name} lies on its side: no place is beside it", self.target.name)
-        x, y, z = (there @ Pose((choice.relative_x, choice.relative_y, 0.0))).position
-        stand = Pose((x - z * up.x / up.z, y - z * up.y / up.z, 0.0))
-        return MoveAndPickUpPerformable(stand, self.target, choice.arm, choice.grasp)
+            message = f"{self.target.name} lies on its side: its frame gives no position on the floor"
+            raise ObjectUnreachable(message, self.target.name)
+        x, y, z = (pose @ Pose((choice.relative_x, choice.relative_y, 0.0))).position
+        standing_position = Pose((x - z * up.x / up.z, y - z * up.y / up.z, 0.0))
+        return MoveAndPickUpPerformable(standing_position, self.target, choice.arm, choice.grasp)
 
 
 def _around(height: float) -> tuple[float, float]:

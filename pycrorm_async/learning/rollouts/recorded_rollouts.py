@@ -1,4 +1,4 @@
-"""The rollouts a memory holds, each with its index, how it ended, and at which of the three goals of the hand."""
+"""Query the recorded rollouts: index, status, failure, choice, and number of goals set for the hand."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from pycrorm_async.task_status import TaskStatus
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["rollouts_question", "once", "successes", "tally_of", "stages_of", "missing", "STAGES"]
+__all__ = ["rollouts_question", "drop_repeats", "successes", "tally_of", "stages_of", "missing_runs", "STAGES"]
 
 STAGES = ("before the pre-pose", "pre-pose", "grasp", "lift")
-"""Where a pick-up can fail: by how many goals its hand was given."""
+"""Stages at which a pick-up can fail, indexed by the number of goals its hand was given."""
 
 
 def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Select[Any]:
-    """All that were brought to an end, in the order of their index: what was interrupted never counts.
+    """Select the rollouts that succeeded or failed, ordered by index; interrupted ones are left out.
 
-    A frame of it has the columns policy, index, status, failure, arm, grasp, object_x, object_y, height (as
-    in `MoveAndPickUp.query_for_database`) and goals: how many goals the hand was given.
+    A data frame of it has the columns policy, index, status, failure, arm, grasp, object_x, object_y, height (as
+    in `MoveAndPickUp.query_for_database`) and goals: the number of goals the hand was given.
     """
     batch, node, view = BatchRolloutAction, TaskTreeNode, PickUpWithContextView
     tried, picked, moved = aliased(TaskTreeNode), aliased(TaskTreeNode), aliased(TaskTreeNode)
-    # In two steps: first which rollouts, numbered within their batch, then what is to be known of each.
+    # Two steps: the subquery selects and numbers the rollouts within their batch, the outer query joins the details.
     ended = (
         select(
             tried.id,
@@ -70,37 +70,37 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
     )
 
 
-def once(frame: pd.DataFrame) -> pd.DataFrame:
-    """Each index once. Should two runs have done the same rollout, they did the same in it."""
+def drop_repeats(frame: pd.DataFrame) -> pd.DataFrame:
+    """Keep one row per index. Rollouts with the same seed and index are identical, so any of them will do."""
     return frame.drop_duplicates("index")
 
 
 def successes(frame: pd.DataFrame, *, among: int | None = None) -> pd.DataFrame:
-    """What can be learned from, of the rollouts with an index below `among`, or of all."""
-    kept = frame[frame.status == TaskStatus.SUCCEEDED.value]
-    return kept if among is None else kept[kept["index"] < among]
+    """Select the rollouts that succeeded, if `among` is set only those with an index below it."""
+    succeeded = frame[frame.status == TaskStatus.SUCCEEDED.value]
+    return succeeded if among is None else succeeded[succeeded["index"] < among]
 
 
 def tally_of(frame: pd.DataFrame) -> Tally:
-    """How the rollouts ended."""
+    """Count successes and, per failure class, failures."""
     failed = frame[frame.status != TaskStatus.SUCCEEDED.value]
     return Tally(len(frame) - len(failed), Counter(each.rpartition(".")[2] for each in failed.failure))
 
 
 def stages_of(frame: pd.DataFrame) -> dict[str, int]:
-    """How many failed at which goal of the hand; those at which none did are left out."""
+    """Count the failures per stage; stages without a failure are left out."""
     failed = frame[frame.status != TaskStatus.SUCCEEDED.value]
     counts = Counter(STAGES[min(int(goals), len(STAGES) - 1)] for goals in failed.goals)
     return {stage: counts[stage] for stage in STAGES if counts[stage]}
 
 
-def missing(done: Iterable[int], count: int, *, at_once: int) -> Iterator[tuple[int, int]]:
-    """Runs of indexes below `count` that are not done yet, at most so long: first index and length."""
-    known = set(done)
+def missing_runs(done: Iterable[int], count: int, *, length_max: int) -> Iterator[tuple[int, int]]:
+    """Yield the first index and the length of each run of indexes below `count` that are not in `done`."""
+    indexes_done = set(done)
     first, length = 0, 0
     for index in range(count + 1):
-        if length and (index == count or index in known or length == at_once):
+        if length and (index == count or index in indexes_done or length == length_max):
             yield first, length
             length = 0
-        if index < count and index not in known:
+        if index < count and index not in indexes_done:
             first, length = (index, 1) if not length else (first, length + 1)

@@ -1,7 +1,32 @@
-"""Rollouts in several processes, each with its own world and recorder; this process is the daemon behind them.
+"""Perform rollouts in several worker processes, each with its own world and recorder, and drain their recorders.
 
-Each worker is spawned, gets jobs and runs of indexes through a pipe, and answers with tallies. Which worker does which
-rollout makes no difference to it. Without a place to remember, nothing is: the same rollouts, for comparison.
+Theory of operation
+-------------------
+
+The caller's process holds a `Workers` object, one `_Worker` per worker process, and one task that runs the daemon. Each
+worker process is spawned and connected by one pipe. With a `MemoryLocation` each worker opens a memory with
+``writer="daemon"``: it writes to its own folder in the spool, and the daemon task drains all of them into the database.
+Without one nothing is recorded, and no daemon runs; the rollouts are the same. Seed and index alone determine a
+rollout, so it does not matter which worker performs it.
+
+The parent sends ``job`` (scene, policy, seed), ``run`` (first index, length), ``flush`` and ``stop``. A worker answers
+a run with ``so far`` messages, at most one per 0.2 s, and one ``done``; it answers a flush with ``flushed``; an
+exception ends the worker with ``failed``. A worker has at most one run at a time, and while it has one the parent
+sends it nothing but ``stop``. Therefore the worker does not read the pipe during a run: any pending message, and also
+the end of file after the parent has closed the pipe or died, makes ``poll`` true and ends the run after the current
+rollout.
+
+A `Workers` object performs one job at a time (`_is_free`). After an interrupted or failed job it accepts no other,
+because answers to the old job may still be in the pipes.
+
+A worker that dies closes its end of the pipe; the parent reads the end of file and raises `WorkerLost`. Its finished
+rollouts survive in its spool folder, which the daemon adopts and drains. If the parent dies, every worker reads the end
+of file, ends its run and closes its memory; the next `recover` or daemon drains the folders. Ctrl-C reaches every
+process of the terminal, so workers are started with SIGINT ignored: the parent alone handles it and stops them.
+
+At exit the parent closes the pipes, waits for the processes in a thread so that the daemon keeps draining meanwhile,
+and stops the daemon last. Only one daemon drains a spool: while another holds it (`SpoolTaken`), the task retries every
+second and takes over when that one ends, so that a flush always has a daemon to wait for.
 """
 
 from __future__ import annotations
@@ -30,25 +55,26 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.settings import Settings
 
-__all__ = ["Workers", "WorkerLost", "Place", "Job", "AT_ONCE"]
+__all__ = ["Workers", "WorkerLost", "MemoryLocation", "Job", "ROLLOUTS_PER_RUN"]
 
-AT_ONCE = 500
-"""A worker is given so many rollouts at once: they are one episode."""
-_TELL_S = 0.2
-_LOOK_S = 0.02
-_TAKE_OVER_S = 1.0
-"""So often it is looked whether another daemon has left."""
+ROLLOUTS_PER_RUN = 500
+"""Rollouts in one run of a worker, which is one episode: enough to make the cost of building the world negligible."""
+_PROGRESS_INTERVAL_S = 0.2
+_POLL_INTERVAL_S = 0.02
+_TAKEOVER_INTERVAL_S = 1.0
+"""Time between attempts to drain the spool while another daemon drains it."""
 _SETTINGS = Settings(flush_timeout_s=120)
+"""Workers wait longer than usual in `flush`, because one daemon drains and folds the records of all of them."""
 _log = logging.getLogger(__name__)
 
 
 class WorkerLost(PycrormError):
-    """A worker died, or raised; what it had done is remembered."""
+    """A worker process died or raised; its finished rollouts are recorded."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where rollouts are remembered."""
+class MemoryLocation:
+    """The database URL and the spool that rollouts are recorded to; without a spool, the URL's default one."""
 
     url: str
     spool: Path | None = None
@@ -56,34 +82,36 @@ class Place:
 
 @dataclass(frozen=True)
 class Job:
-    """Rollouts of one kind.
+    """The parameters that the rollouts of one `roll_out` share.
 
     Attributes:
-        remembered: whether they are; False leaves no trace of them.
-        episode_each: each is an episode, and not what a worker does at once.
+        recorded: whether rollouts are recorded.
+        episode_each: whether each rollout is an episode; otherwise each run is one.
     """
 
     scene: Scene
     policy: Policy
     seed: int
-    remembered: bool = True
+    recorded: bool = True
     episode_each: bool = False
 
 
 class Workers:
-    """Processes that do rollouts. They are spawned: a script that uses them does so below `if __name__ == "__main__":`.
+    """A pool of worker processes that perform rollouts.
 
-    >>> async with Workers(2, Place("sqlite:///learn.db")) as workers:
+    The processes are spawned, so a script must use the pool below `if __name__ == "__main__":`.
+
+    >>> async with Workers(2, MemoryLocation("sqlite:///learn.db")) as workers:
     ...     tally = await workers.roll_out(Job(Scene(), default_policy(), seed=69), [(0, 500), (500, 500)])
     """
 
-    def __init__(self, count: int, place: Place | None) -> None:
-        """Raises `CallerError` for fewer than one."""
+    def __init__(self, count: int, place: MemoryLocation | None) -> None:
+        """Raise `CallerError` if count < 1."""
         if count < 1:
-            raise CallerError(f"there is at least one worker, not {count}")
+            raise CallerError(f"worker count must be >= 1, got {count}")
         self._count = count
         self._place = place
-        self._links: list[_Link] = []
+        self._workers: list[_Worker] = []
         self._is_free = False
         self._stack = AsyncExitStack()
         self._check_daemon: Callable[[], None] = lambda: None
@@ -91,201 +119,205 @@ class Workers:
     async def __aenter__(self) -> Self:
         try:
             if self._place is not None:
-                self._check_daemon = await self._stack.enter_async_context(_daemon(self._place))
-            with _uninterrupted():
+                self._check_daemon = await self._stack.enter_async_context(_run_daemon(self._place))
+            with _ignore_sigint():
                 for _ in range(self._count):
-                    self._links.append(_Link.started(self._place))
+                    self._workers.append(_Worker.start(self._place))
             self._is_free = True
         except BaseException:
-            await self._end()
+            await self._close()
             raise
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self._end()
+        await self._close()
 
-    async def _end(self) -> None:
-        """Every worker ends what it is at, hands over what it recorded, and leaves; then the daemon drains the rest."""
+    async def _close(self) -> None:
+        """Close the pipes, wait until the workers have closed their memories and exited, then stop the daemon."""
         self._is_free = False
-        for link in self._links:
-            link.leave()
-        for link in self._links:
-            await asyncio.to_thread(link.process.join)
+        for worker in self._workers:
+            worker.close()
+        for worker in self._workers:
+            await asyncio.to_thread(worker.process.join)
         await self._stack.aclose()
 
     async def roll_out(
-        self, job: Job, runs: Iterable[tuple[int, int]], tell: Callable[[Tally], None] = lambda _: None
+        self, job: Job, runs: Iterable[tuple[int, int]], report: Callable[[Tally], None] = lambda _: None
     ) -> Tally:
-        """Does these runs of indexes (first, length); returns when all is done and, if remembered, in the tables.
+        """Perform the runs of indexes (first, length); return when all are performed and, if recorded, visible.
 
-        Cancelled, the workers stop after the rollout they are at; what was done is remembered.
+        On cancellation the workers stop after their current rollout; finished rollouts are recorded.
 
         Raises:
-            WorkerLost: one died or raised; what was done is remembered.
-            CallerError: these workers are not started, at another job, or were interrupted in one.
+            WorkerLost: a worker died or raised; finished rollouts are recorded.
+            CallerError: the workers are not started, perform another job, or were interrupted in one.
         """
         if not self._is_free:
-            raise CallerError("workers do one job at a time, and none after one that was interrupted: start others")
+            raise CallerError("workers do one job at a time, and none after an interrupted job: start new workers")
         self._is_free = False
-        waiting = iter(runs)
-        tallies = {link: Tally() for link in self._links}
+        pending_runs = iter(runs)
+        tallies = {worker: Tally() for worker in self._workers}
         ended = Tally()
-        for link in self._links:
-            link.send(("job", job))
-        busy = {link for link in self._links if link.given(next(waiting, None))}
+        for worker in self._workers:
+            worker.send(("job", job))
+        busy = {worker for worker in self._workers if worker.send_run(next(pending_runs, None))}
         try:
             while busy:
-                for link in [each for each in busy if each.has_news]:
-                    word, tally = link.receive()
-                    tallies[link] = tally
-                    if word == "done":
-                        ended, tallies[link] = ended + tally, Tally()
-                        if not link.given(next(waiting, None)):
-                            busy.discard(link)
-                    tell(sum(tallies.values(), ended))
+                for worker in [each for each in busy if each.has_message]:
+                    kind, tally = worker.receive()
+                    tallies[worker] = tally
+                    if kind == "done":
+                        ended, tallies[worker] = ended + tally, Tally()
+                        if not worker.send_run(next(pending_runs, None)):
+                            busy.discard(worker)
+                    report(sum(tallies.values(), ended))
                 self._check_daemon()
-                await asyncio.sleep(_LOOK_S)
+                await asyncio.sleep(_POLL_INTERVAL_S)
         except BaseException:
-            for link in busy:
-                link.send(("stop", None))
+            for worker in busy:
+                worker.send(("stop", None))
             raise
-        if job.remembered:
-            await self._flushed()
+        if job.recorded:
+            await self._flush()
         self._is_free = True
         return ended
 
-    async def _flushed(self) -> None:
-        for link in self._links:
-            link.send(("flush", None))
-        for link in self._links:
-            while not link.has_news:
+    async def _flush(self) -> None:
+        for worker in self._workers:
+            worker.send(("flush", None))
+        for worker in self._workers:
+            while not worker.has_message:
                 self._check_daemon()
-                await asyncio.sleep(_LOOK_S)
-            link.receive()
+                await asyncio.sleep(_POLL_INTERVAL_S)
+            worker.receive()
 
 
-class _Link:
-    """One worker, as this process sees it."""
+class _Worker:
+    """One worker process and the parent's end of its pipe."""
 
     def __init__(self, process: SpawnProcess, pipe: Connection) -> None:
         self.process = process
         self._pipe = pipe
 
     @classmethod
-    def started(cls, place: Place | None) -> _Link:
+    def start(cls, place: MemoryLocation | None) -> _Worker:
         context = multiprocessing.get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_work, args=(theirs, place), name="pycrorm rollouts")
+        process = context.Process(target=_run_worker, args=(theirs, place), name="pycrorm rollouts")
         process.start()
-        theirs.close()
+        theirs.close()  # while this process holds that end too, the death of the worker would not be an end of file
         return cls(process, ours)
 
     @property
-    def has_news(self) -> bool:
+    def has_message(self) -> bool:
         return self._pipe.poll()
 
     def send(self, message: tuple[str, Any]) -> None:
-        with suppress(OSError):  # it is told where it is missed
+        with suppress(OSError):  # a dead worker: the next `receive` raises WorkerLost
             self._pipe.send(message)
 
-    def given(self, run: tuple[int, int] | None) -> bool:
-        """Whether there was a run to be given."""
+    def send_run(self, run: tuple[int, int] | None) -> bool:
+        """Send the run, if there is one, and return whether there was one."""
         if run is not None:
             self.send(("run", run))
         return run is not None
 
     def receive(self) -> tuple[str, Tally]:
         try:
-            word, answer = self._pipe.recv()
+            kind, answer = self._pipe.recv()
         except (EOFError, OSError):
             self.process.join()
-            raise WorkerLost(f"a worker {_how(self.process.exitcode)}; what it had done is remembered") from None
-        if word == "failed":
-            raise WorkerLost(f"a worker failed: {answer}; what it had done is remembered")
-        return word, answer
+            ending = _describe_exit(self.process.exitcode)
+            raise WorkerLost(f"a rollout worker {ending}; its finished rollouts are recorded") from None
+        if kind == "failed":
+            raise WorkerLost(f"a rollout worker failed: {answer}; its finished rollouts are recorded")
+        return kind, answer
 
-    def leave(self) -> None:
+    def close(self) -> None:
         self._pipe.close()
 
 
-def _how(code: int | None) -> str:
+def _describe_exit(code: int | None) -> str:
     if code is None or code >= 0:
         return f"ended with exit code {code}"
     return f"was killed by {signal.Signals(-code).name}"
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
-    """What is started inside does not hear Ctrl-C, which a terminal gives to all: we tell it."""
+def _ignore_sigint() -> Iterator[None]:
+    """Start processes with SIGINT ignored, because a terminal sends Ctrl-C to every process; the parent stops them."""
     try:
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # not in the main thread, which alone hears it
+        previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except ValueError:  # only the main thread can set a handler
         yield
         return
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, previous)
 
 
 @asynccontextmanager
-async def _daemon(place: Place) -> AsyncIterator[Callable[[], None]]:
-    """Drains the workers' recorders while the context lasts; while another daemon does so, that one does.
+async def _run_daemon(place: MemoryLocation) -> AsyncIterator[Callable[[], None]]:
+    """Drain the workers' recorders until the context ends, except while another daemon drains the spool.
 
-    Gives a function that raises what stopped it. Raises as `serve` does.
+    Yields a function that raises the exception that ended the daemon, if one did. Raises as `serve` does.
     """
-    leave, ready = asyncio.Event(), asyncio.Event()
+    stop, ready = asyncio.Event(), asyncio.Event()
 
     def check() -> None:
         if task.done():
             task.result()
 
-    task = asyncio.create_task(_drained(place, leave, ready), name="pycrorm daemon")
+    task = asyncio.create_task(_drain(place, stop, ready), name="pycrorm daemon")
     task.add_done_callback(lambda _: ready.set())
     try:
         await ready.wait()
         check()
         yield check
     finally:
-        leave.set()
+        stop.set()
         await asyncio.wait([task])
         check()
 
 
-async def _drained(place: Place, leave: asyncio.Event, ready: asyncio.Event) -> None:
-    """Until told to leave; `ready` once somebody drains. Raises as `serve` does, but for `SpoolTaken`."""
+async def _drain(place: MemoryLocation, stop: asyncio.Event, ready: asyncio.Event) -> None:
+    """Drain until `stop` is set; set `ready` when this or another daemon drains.
 
-    def say(line: str) -> None:
+    Raises as `serve` does, except that it retries after `SpoolTaken` and, once ready, after `DatabaseUnavailable`.
+    """
+
+    def log(line: str) -> None:
         _log.info(line)
         ready.set()
 
-    while not leave.is_set():
+    while not stop.is_set():
         try:
-            await serve(place.url, spool=place.spool, leave=leave, say=say)
+            await serve(place.url, spool=place.spool, leave=stop, say=log)
         except SpoolTaken:
             ready.set()
         except DatabaseUnavailable:
             if not ready.is_set():
                 raise
         with suppress(TimeoutError):
-            await asyncio.wait_for(leave.wait(), _TAKE_OVER_S)
+            await asyncio.wait_for(stop.wait(), _TAKEOVER_INTERVAL_S)
 
 
 # --- in the worker --------------------------------------------------------------------------------------------
 
 
-def _work(pipe: Connection, place: Place | None) -> None:
-    """What a worker process does until its pipe is closed, by whoever started it or by his death."""
+def _run_worker(pipe: Connection, place: MemoryLocation | None) -> None:
+    """Serve jobs until the pipe is closed, by the parent or because the parent died."""
     logging.disable(logging.WARNING)
     try:
-        asyncio.run(_working(pipe, place))
-    except Exception as error:  # noqa: BLE001  told to who started it, in one line, if he is still there
+        asyncio.run(_serve_jobs(pipe, place))
+    except Exception as error:  # noqa: BLE001  reported to the parent in one line, if the parent is alive
         with suppress(OSError):
             pipe.send(("failed", f"{type(error).__name__}: {error}"))
 
 
-async def _working(pipe: Connection, place: Place | None) -> None:
-    forgetful = contextvars.copy_context()  # as it is before a memory is open
+async def _serve_jobs(pipe: Connection, place: MemoryLocation | None) -> None:
+    context_without_memory = contextvars.copy_context()  # copied before a memory is open: hooks record nothing in it
     async with AsyncExitStack() as stack:
         memory = None
         if place is not None:
@@ -294,27 +326,27 @@ async def _working(pipe: Connection, place: Place | None) -> None:
         job: Job | None = None
         with suppress(EOFError):
             while True:
-                word, content = await asyncio.to_thread(pipe.recv)
-                if word == "job":
+                kind, content = await asyncio.to_thread(pipe.recv)
+                if kind == "job":
                     job = content
-                elif word == "flush" and memory is not None:
+                elif kind == "flush" and memory is not None:
                     await memory.flush()
                     pipe.send(("flushed", Tally()))
-                elif word == "run" and job is not None:
+                elif kind == "run" and job is not None:
                     first, count = content
-                    run = _run(pipe, job, first, count, memory if job.remembered else None)
-                    context = contextvars.copy_context() if job.remembered else forgetful
+                    run = _run(pipe, job, first, count, memory if job.recorded else None)
+                    context = contextvars.copy_context() if job.recorded else context_without_memory
                     pipe.send(("done", await asyncio.create_task(run, context=context)))
 
 
 async def _run(pipe: Connection, job: Job, first: int, count: int, memory: Memory | None) -> Tally:
-    told = time.monotonic()
+    reported_s = time.monotonic()
 
-    def tell(tally: Tally) -> None:
-        nonlocal told
-        if time.monotonic() > told + _TELL_S:
-            told = time.monotonic()
-            with suppress(OSError):  # nobody there: the pipe says so to `stop` too
+    def report(tally: Tally) -> None:
+        nonlocal reported_s
+        if time.monotonic() > reported_s + _PROGRESS_INTERVAL_S:
+            reported_s = time.monotonic()
+            with suppress(OSError):  # the parent is dead: `stop` sees the end of file too
                 pipe.send(("so far", tally))
 
     async with AsyncExitStack() as stack:
@@ -330,6 +362,6 @@ async def _run(pipe: Connection, job: Job, first: int, count: int, memory: Memor
             scene=str(job.scene),
             reset=stage.reset,
             each_in=memory if job.episode_each else None,
-            stop=pipe.poll,  # whatever comes while a run is on means that it shall end
-            tell=tell,
+            stop=pipe.poll,  # during a run the parent sends nothing but `stop`
+            tell=report,
         )

@@ -1,6 +1,6 @@
-"""Many tries of one action, each chosen by a policy, each from the same start: what is learned from (thesis 5.2).
+"""Perform rollouts: many tries of one action, each sampled from a policy, each from the same start (thesis 5.2).
 
-A rollout is given by its seed and its index alone: the same two make the same choice, in whatever process and order.
+Seed and index alone determine a rollout, independent of the process and the order in which rollouts are performed.
 
 >>> with Scene().entered() as stage:
 ...     tally = await batch_rollout(MoveAndPickUp(stage.target), 500, seed=69, reset=stage.reset)
@@ -36,11 +36,11 @@ __all__ = ["Tally", "batch_rollout", "BatchRolloutActionPerformable", "randomnes
 
 @dataclass
 class Tally:
-    """How rollouts ended.
+    """The number of rollouts by result.
 
     Attributes:
-        successes: how many went well.
-        failures: the class of the plan failure → how often.
+        successes: number of rollouts that succeeded.
+        failures: number of failed rollouts by the class name of the plan failure.
     """
 
     successes: int = 0
@@ -52,12 +52,12 @@ class Tally:
 
     @property
     def success_rate(self) -> float:
-        """Share of successes; NaN before the first rollout."""
+        """Share of successes, 0 to 1; NaN before the first rollout."""
         return self.successes / self.rollouts if self.rollouts else math.nan
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Where the rate lies with 95 % confidence, by Wilson's formula."""
+        """Limits of the 95 % confidence interval of the success rate, by Wilson's formula."""
         count, z = self.rollouts, 1.959964
         if not count:
             return 0.0, 1.0
@@ -71,7 +71,7 @@ class Tally:
 
 
 def randomness(seed: int, index: int) -> np.random.Generator:
-    """The random numbers of one rollout."""
+    """Return the random generator of one rollout."""
     return np.random.default_rng((seed, index))
 
 
@@ -87,26 +87,26 @@ async def batch_rollout(
     stop: Callable[[], bool] = lambda: False,
     tell: Callable[[Tally], None] | None = None,
 ) -> Tally:
-    """Performs the action so often, each time as a sample of its policy says and from the same start.
+    """Perform `count` rollouts of the action, each with its own sample of the policy and from the same start.
 
-    With a memory open all of it is one episode: the one that is open, or one of its own.
+    With a memory open, all rollouts belong to one episode: the open one, or a new one.
 
     Args:
-        count, first: the rollouts with these indexes: `first`, `first + 1`, …
-        scene: where, in words; remembered, to tell rollouts in different scenes apart.
-        reset: puts the world back after each; left out, everything at its original pose with joints at 0.
-        each_in: makes each rollout an episode of this memory.
-        stop: asked before each rollout whether to end here.
-        tell: is told after each rollout how they went so far; left out, a bar shows it, where stderr is a terminal.
+        count, first: the indexes of the rollouts: `first`, `first + 1`, … `first + count - 1`.
+        scene: the scene in words; recorded, so that queries can separate rollouts in different scenes.
+        reset: restores the world after each rollout; None moves everything to its original pose with joints at 0.
+        each_in: the memory in which each rollout becomes an episode of its own.
+        stop: called before each rollout; True ends the batch.
+        tell: called with the results so far after each rollout; None shows a progress bar if stderr is a terminal.
 
-    Raises `CallerError` for a count, index or seed below 0, and whatever is no `PlanFailure`: a plan may fail, a fault
-    in it ends the batch.
+    Raises `CallerError` for a count, index or seed below 0. A `PlanFailure` is counted as a failed rollout; any other
+    exception ends the batch and is raised.
     """
     if min(count, first, seed) < 0:
-        raise CallerError(f"count, first and seed of rollouts are 0 or more, not {count}, {first} and {seed}")
+        raise CallerError(f"count, first and seed of rollouts must be >= 0, got {count}, {first} and {seed}")
     tally = Tally()
-    with _shown(count) if tell is None else nullcontext(tell) as told:
-        run = _Run(action, action.policy_here(), reset or world_here().reset, stop, tally, told)
+    with _progress_bar(count) if tell is None else nullcontext(tell) as report:
+        run = _Run(action, action.policy_here(), reset or world_here().reset, stop, tally, report)
         slices = ((index, 1) for index in range(first, first + count)) if each_in is not None else ((first, count),)
         for begin, length in slices:
             if stop():
@@ -118,7 +118,7 @@ async def batch_rollout(
 
 
 @contextmanager
-def _shown(count: int) -> Iterator[Callable[[Tally], None]]:
+def _progress_bar(count: int) -> Iterator[Callable[[Tally], None]]:
     with watched("rollouts", unit="rollouts") as watch:
         yield lambda tally: watch(tally.rollouts, count, f"{tally.success_rate:.1%} succeed")
 
@@ -131,21 +131,21 @@ def _episode_of(memory: Memory | None, batch: BatchRolloutActionPerformable) -> 
 
 @dataclass
 class _Run:
-    """What a batch needs besides what is remembered of it."""
+    """The parts of a batch that are not recorded."""
 
     action: MoveAndPickUp
     policy: Policy
     reset: Callable[[], None]
     stop: Callable[[], bool]
     tally: Tally
-    tell: Callable[[Tally], None]
+    report: Callable[[Tally], None]
 
 
 @dataclass
 class BatchRolloutActionPerformable(ActionAbstract):
-    """The node that rollouts are remembered in: the one with index `first + n` is its n-th child that ended.
+    """The task-tree node above a batch of rollouts; the rollout with index `first + n` is its n-th child that ended.
 
-    Made by `batch_rollout`.
+    `batch_rollout` creates it.
     """
 
     policy: str
@@ -157,7 +157,7 @@ class BatchRolloutActionPerformable(ActionAbstract):
 
     async def perform(self) -> None:
         run = self._run
-        assert run is not None, "made by batch_rollout"
+        assert run is not None, "only batch_rollout creates and performs a batch"
         for index in self._indexes(run):
             choice = run.policy.sample(randomness(self.seed, index))[0]
             try:
@@ -167,7 +167,7 @@ class BatchRolloutActionPerformable(ActionAbstract):
             else:
                 run.tally.successes += 1
             run.reset()
-            run.tell(run.tally)
+            run.report(run.tally)
 
     def _indexes(self, run: _Run) -> Iterator[int]:
         for index in range(self.first, self.first + self.count):

@@ -1,4 +1,4 @@
-"""Where rollouts take place: a robot, one object to be picked up, and maybe a kitchen around them."""
+"""Build the scene of a rollout: a world with a robot, one object to pick up, and optionally a kitchen."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ __all__ = ["Scene", "Stage"]
 
 @dataclass(frozen=True)
 class Scene:
-    """What a world for rollouts is made from; the default is that of the thesis (5.2): milk in the air, nothing else.
+    """The parameters of a world for rollouts; the default is the thesis' scene (5.2): milk in the air, nothing else.
 
     Attributes:
-        name, object_type: of the object.
-        position: of the object, m in the map.
-        yaw: how the object is turned about the vertical, rad.
-        torso_height: m, at the start of every rollout. The thesis' rollouts have it at 0.
-        limits: what the arms keep to. Within soft limits and with the torso at 0 nothing is grasped from above here.
-        collisions: an arm that would be in something is a failure; otherwise nobody looks.
-        kitchen: whether the kitchen is there.
+        name, object_type: name and type of the object.
+        position: position of the object in the map frame, m.
+        yaw: rotation of the object about the vertical, rad.
+        torso_height: torso height at the start of every rollout, m. The thesis' rollouts have 0.
+        limits: joint limits of the arms. Within soft limits and with the torso at 0 no grasp from above is reachable.
+        collisions: whether an arm in collision is a failure; if False, collisions are not checked.
+        kitchen: whether the world contains the kitchen.
     """
 
     name: str = "milk"
@@ -41,10 +41,10 @@ class Scene:
     kitchen: bool = False
 
     def __str__(self) -> str:
-        """In words, by which the rollouts in it are found again: no two scenes have the same."""
+        """Describe the scene in words. Queries select rollouts by these words; no two scenes have the same."""
         kind = self.object_type.name.lower()
-        what = kind if self.name == kind else f"{self.name} ({kind})"
-        parts = [f"{what} at {', '.join(map(_digits, self.position))} m"]
+        label = kind if self.name == kind else f"{self.name} ({kind})"
+        parts = [f"{label} at {', '.join(map(_digits, self.position))} m"]
         if self.yaw:
             parts.append(f"turned by {_digits(math.degrees(self.yaw))}°")
         parts.append(f"torso at {_digits(self.torso_height)} m")
@@ -57,7 +57,7 @@ class Scene:
 
     @contextmanager
     def entered(self) -> Iterator[Stage]:
-        """A world as described, entered, with its robot chosen."""
+        """Build the world, enter it, and choose its robot; the world closes with the context."""
         with BulletWorld() as world, simulated_robot_within(self.limits, collisions=self.collisions):
             robot = Object("pr2", ObjectType.ROBOT)
             if self.kitchen:
@@ -70,7 +70,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene that is there, to be acted in and put back."""
+    """A scene's world, its robot and its object, with a method to restore them."""
 
     scene: Scene
     world: BulletWorld
@@ -78,7 +78,7 @@ class Stage:
     target: Object
 
     def reset(self) -> None:
-        """Everything as at the start. Only what is not so is touched: a fifth of the time that Bullet's own takes."""
+        """Restore the start of a rollout. Moves only what has changed: a fifth of the time of Bullet's own reset."""
         self.world.reset()
         description = self.robot.robot_description
         if self.scene.torso_height and description is not None:
