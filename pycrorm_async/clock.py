@@ -1,7 +1,7 @@
-"""The only reader of a clock.
+"""Read the wall clock and the monotonic clock; no other module does.
 
-What is recorded is timed by the `Clock` that a part gets as an argument, so that tests can hand in their own; plans and
-poses without a memory read the system's.
+Each part that records gets its `Clock` as an argument, so that tests can pass one of their own. Plans and poses without
+a memory read `SYSTEM_CLOCK`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ __all__ = ["Clock", "SYSTEM_CLOCK", "monotonic_ns"]
 
 
 class Clock(NamedTuple):
-    """Two readings in nanoseconds: UTC since 1970, and one that never goes back."""
+    """Two clocks that return nanoseconds: UTC since 1970, and a monotonic one, which never runs backwards."""
 
     wall_ns: Callable[[], int]
     monotonic_ns: Callable[[], int]

@@ -1,11 +1,11 @@
-"""Context variables with a value of the whole process behind them, for notebooks.
+"""Extend context variables by a default value for the whole process, for notebooks.
 
-Each cell of a notebook that awaits runs in a copy of the context of its own, so what one cell sets no other finds. What
-is *connected* is found by every context of the process that has no value of its own: by the cells that follow, by other
-tasks, and by threads. If several are connected, the last one is found; where it is disconnected, the one before.
+A notebook runs each cell that awaits in its own copy of the context, so a value set in one cell is invisible in the
+next. A *connected* value is the default of every context in the process that has no value of its own: later cells,
+other tasks and threads. Of several connected values the last one counts; disconnecting it restores the one before.
 
-This is the only state of a module that is no ContextVar. It holds what its owner connects until the owner disconnects
-it, and nothing else. While nothing is connected, `get` is that of the ContextVar itself and costs the same.
+This is the package's only module state that is not a ContextVar. It keeps a value from `connect` to `disconnect`. While
+no value is connected, `get` is the ContextVar's own method and costs the same.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ T = TypeVar("T")
 
 
 class ConnectedVar(Generic[T]):
-    """A ContextVar whose default is what was connected last.
+    """A ContextVar whose default is the last connected value.
 
     Attributes:
-        get: the value of this context, or else what was connected last, or else None.
+        get: the value of this context, else the last connected value, else None.
         here: the value of this context alone.
-        set, reset: as of a ContextVar.
+        set, reset: the methods of the ContextVar.
     """
 
     __slots__ = ("_connected", "get", "here", "reset", "set")
@@ -40,12 +40,12 @@ class ConnectedVar(Generic[T]):
         self.reset: Callable[[Token[T | None]], None] = variable.reset
 
     def connect(self, value: T) -> None:
-        """Every context without a value of its own finds this one from now on."""
+        """Make this value the default of every context without a value of its own."""
         self._connected = (*self._connected, value)
         self.get = self._here_or_connected
 
     def disconnect(self, value: T) -> None:
-        """No context finds it any more, unless it is its own. Does nothing for what is not connected."""
+        """Remove this value from the defaults, if it is one; a context that has set it keeps it."""
         self._connected = tuple(each for each in self._connected if each is not value)
         if not self._connected:
             self.get = self.here
@@ -57,13 +57,13 @@ class ConnectedVar(Generic[T]):
 
 @contextmanager
 def set_inside(variable: ConnectedVar[Any] | ContextVar[Any], value: object) -> Iterator[None]:
-    """The variable has this value inside. Left in another context than entered in, there is nothing of ours to undo."""
+    """Set the variable inside the `with` block; leaving it in another context resets nothing."""
     before = variable.get()
     token = variable.set(value)
     try:
         yield
     finally:
-        # Memories may be closed in another order than they were opened: only what we set is taken back.
+        # Memories may close in another order than they opened: reset only the value set by this block.
         if variable.get() is value:
             with suppress(ValueError):
                 variable.reset(token)

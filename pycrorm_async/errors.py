@@ -1,8 +1,8 @@
-"""Every error of this package descends from `PycrormError`; its branch says who is at fault.
+"""Define the errors of this package: all descend from `PycrormError`, and each branch names the party at fault.
 
-`CallerError`: the call, the plan file, the URL. `FilesError`: the spool's files or their disk. `DatabaseError`: the
-database or the way to it. `DamageError`: stored bytes that contradict themselves. `InternalError`: us.
-The outcome of a plan is none of these: plans fail with `pycrorm_async.plan.PlanFailure`.
+`CallerError`: the call, the plan file or the URL. `FilesError`: the spool's files or their disk. `DatabaseError`: the
+database or the connection to it. `DamageError`: stored bytes that contradict themselves. `InternalError`: this package.
+A plan that fails raises none of these, but `pycrorm_async.plan.PlanFailure`.
 """
 
 from __future__ import annotations
@@ -46,22 +46,22 @@ __all__ = [
 
 
 class PycrormError(Exception):
-    """The root: catch this to catch everything the memory itself can raise."""
+    """The root of the tree: `except PycrormError` catches every error that the memory itself can raise."""
 
 
 # --- the caller -----------------------------------------------------------------------------------------------
 
 
 class CallerError(PycrormError):
-    """The call cannot be carried out as it was made; the message says what to change."""
+    """The call cannot be carried out with these arguments; the message says what to change."""
 
 
 class UnknownUrl(CallerError):
-    """The database URL has a scheme or a form that is not ours. Never shows a password."""
+    """The database URL has an unsupported scheme or form. The message never shows a password."""
 
 
 class Unrecordable(CallerError):
-    """A value of a designator cannot be written down without changing its meaning."""
+    """A designator's value cannot be encoded without changing its meaning."""
 
     def __init__(self, designator: str, field: str, reason: str) -> None:
         super().__init__(f"{designator}.{field} cannot be recorded: {reason}")
@@ -71,7 +71,7 @@ class Unrecordable(CallerError):
 
 
 class DeclarationRefused(CallerError):
-    """A designator class cannot be remembered as it is declared."""
+    """A designator class has a declaration that no table can hold."""
 
     def __init__(self, designator: str, reason: str) -> None:
         super().__init__(f"{designator} cannot be declared: {reason}")
@@ -80,27 +80,27 @@ class DeclarationRefused(CallerError):
 
 
 class EpisodeRefused(CallerError):
-    """An episode cannot be opened here: one is open already in this task, or a world is in the way."""
+    """An episode cannot be opened: this task has one open already, or the world belongs to another episode."""
 
 
 class UnknownEpisode(CallerError):
-    """No episode of that number or id is in this database."""
+    """The database holds no episode of that number or id."""
 
 
 class MissingExtra(CallerError):
-    """The call needs an optional part of the package; the message names the extra to install."""
+    """The call needs an optional dependency; the message names the extra to install."""
 
 
 class ImpossibleCondition(CallerError):
-    """A policy is asked for what it gives no probability at all; the message says for what."""
+    """The policy gives the condition a probability of zero; the message names the condition."""
 
 
 class NotEnoughExperience(CallerError):
-    """There are too few samples to learn from; the message says how many there are, and how many it takes."""
+    """Learning needs more samples than the database holds; the message gives both numbers."""
 
 
 class PolicyFileRefused(CallerError):
-    """A file cannot be read or written, holds something else than a policy, or one of another version."""
+    """A policy file cannot be read or written, is not a policy, or has another version."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"policy {path}: {reason}")
@@ -112,11 +112,11 @@ class PolicyFileRefused(CallerError):
 
 
 class FilesError(PycrormError):
-    """The spool's files, or the disk below them, cannot be used."""
+    """The spool's files, or the disk they are on, cannot be used."""
 
 
 class SpoolUnavailable(FilesError):
-    """The spool cannot be opened, written or synced; `path` says where."""
+    """The spool cannot be opened, written or synced; `path` is the file or folder that failed."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"spool {path}: {reason}")
@@ -129,15 +129,15 @@ class SpoolTaken(SpoolUnavailable):
 
 
 class SpoolFull(FilesError):
-    """The spool holds as much as it may (`spool_bytes_max`) and the caller chose not to wait."""
+    """The spool has reached `spool_bytes_max` and the caller chose not to wait."""
 
 
 class SpoolStuck(FilesError):
-    """The spool is full and waiting is no use: nothing empties it any more; the message says why."""
+    """The spool is full and waiting cannot help, because draining has stopped; the message gives the reason."""
 
 
 class SpoolClosed(FilesError):
-    """Nothing more can be put: the queue was closed, or belongs to another process (a fork)."""
+    """The queue takes no more events: it was closed, or it belongs to the parent of this forked process."""
 
 
 class SpoolForeign(FilesError):
@@ -148,17 +148,17 @@ class SpoolForeign(FilesError):
 
 
 class DatabaseError(PycrormError):
-    """The database cannot do what was asked; the message names it without its password."""
+    """The database cannot carry out the operation; the message names the database without its password."""
 
 
 class DatabaseUnavailable(DatabaseError):
-    """No such database, or it does not answer."""
+    """The database does not exist or does not answer."""
 
 
 class LogWentBack(DatabaseUnavailable):
-    """The log holds less of an episode than it had confirmed: a failover, or a backup that was restored.
+    """The log holds less of an episode than it had confirmed: after a failover, or after a backup was restored.
 
-    Nothing of the batch is stored, and the call may be made again once what is missing was offered again.
+    The log stored nothing of the batch. Append the missing events again, then retry the call.
     """
 
     def __init__(self, episode: str, confirmed: int, head: int) -> None:
@@ -171,23 +171,23 @@ class LogWentBack(DatabaseUnavailable):
 
 
 class DatabaseForeign(DatabaseError):
-    """A database of another program, or of a newer version of this one."""
+    """The database belongs to another program, or to a newer version of this one."""
 
 
 class TablesForeign(DatabaseForeign):
-    """This process can append to the log and cannot use the tables: recording goes on."""
+    """This process can append to the log but cannot use the tables: recording continues."""
 
 
 class TablesOutdated(TablesForeign):
-    """The tables were made by an older fold: they are shown again after `pycrorm rebuild`."""
+    """An older fold made the tables: `pycrorm rebuild` makes them usable again."""
 
 
 class TablesUntrusted(TablesForeign):
-    """The tables belong to a role with fewer rights than this login has, and could hold code that would use them."""
+    """A role with fewer rights than this login owns the tables, so their code could misuse the login's rights."""
 
 
 class EpisodeParked(DatabaseError):
-    """An episode stopped on its way to the tables; `reasons` maps its id to why."""
+    """At least one episode is not stored or not folded; `reasons` maps episode id to reason."""
 
     def __init__(self, reasons: dict[str, str]) -> None:
         lines = "; ".join(f"episode {episode}: {reason}" for episode, reason in reasons.items())
@@ -196,18 +196,18 @@ class EpisodeParked(DatabaseError):
 
 
 class FlushTimeout(DatabaseError):
-    """`flush` did not finish in time; what was emitted is safe in the spool."""
+    """`flush` did not finish in time; the events emitted so far are safe in the spool."""
 
 
 # --- damage ---------------------------------------------------------------------------------------------------
 
 
 class DamageError(PycrormError):
-    """Stored bytes contradict themselves. Nothing is cut or overwritten when this is raised."""
+    """Stored bytes contradict themselves. The operation that raises this has not cut or overwritten any of them."""
 
 
 class SpoolDamaged(DamageError):
-    """A segment holds bytes that were safe once and are not what was written."""
+    """A segment's bytes were once synced, but differ from the bytes that were written."""
 
     def __init__(self, path: Path, offset: int, reason: str) -> None:
         super().__init__(f"{path} is damaged at byte {offset}: {reason}")
@@ -227,7 +227,7 @@ class LogDamaged(DamageError):
 
 
 class PolicyDamaged(DamageError):
-    """A policy's file is not what was written."""
+    """A policy file differs from the bytes that were written."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"policy {path} is damaged: {reason}")
@@ -235,8 +235,8 @@ class PolicyDamaged(DamageError):
         self.reason = reason
 
 
-# --- us -------------------------------------------------------------------------------------------------------
+# --- this package ---------------------------------------------------------------------------------------------
 
 
 class InternalError(PycrormError):
-    """A fault of this package; please report it with the message."""
+    """This package has a defect; please report it with the message."""

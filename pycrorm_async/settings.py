@@ -1,4 +1,4 @@
-"""What can be set, frozen, with a unit in every name. The defaults serve one robot on one machine.
+"""Hold the settings of one memory: frozen, with a unit in every name. The defaults serve one robot on one machine.
 
 >>> Settings(spool_bytes_max=2**30, on_full="fail").sync_interval_ms
 50
@@ -20,11 +20,11 @@ OnUnrecordable = Literal["record_missing", "refuse"]
 Writer = Literal["thread", "daemon"]
 FileAccess = Literal["owner", "group"]
 FILE_MODES: Final[Mapping[FileAccess, int]] = {"owner": 0o600, "group": 0o660}
-"""Mode of a file in the spool, and of a SQLite database."""
+"""Mode of a file in the spool and of a SQLite database, by file access."""
 _MAY_BE_NONE = frozenset({"sample_interval_ms"})
 _MAY_BE_ZERO = frozenset({"keep_stored_bytes", "keep_stored_s", "sample_change_min"})
 _EPISODE_EVENTS = range(100, 2**26)
-"""What a sequence of 26 bits can count (`events.ids.SEQUENCE_MAX`); fewer than a hundred leave no room for a plan."""
+"""Bounds `episode_events_max`: a sequence has 26 bits (`events.ids.SEQUENCE_MAX`); a plan needs about 100 events."""
 _CHOICES = {
     "writer": get_args(Writer),
     "on_full": get_args(OnFull),
@@ -35,42 +35,42 @@ _CHOICES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Limits and rhythms of one memory.
+    """Limits and intervals of one memory.
 
     Attributes:
-        writer: who moves events to the database: a thread of this process, or the daemon `pycrorm writer`.
-        sync_interval_ms: a sync of what was written begins after at most this long.
-        segment_bytes: size of one file of the write-ahead queue, allocated ahead.
-        spool_bytes_max: what one recorder may hold on disk before `on_full` applies.
-        spool_reserve_bytes: kept free below that for ends and world observations, which never wait for room.
-        keep_stored_s: a segment is kept for so long after all in it is stored, to heal a database that went back (a
-            failover, a restored backup); 0: not at all.
-        keep_stored_bytes: all kept segments of a spool take at most so much, beside `spool_bytes_max`. The default is
-            about a million events: a day of one busy robot, and a sixteenth of `spool_bytes_max`. A full disk takes
-            them first.
-        record_bytes_max: the largest single event; a larger one is refused.
-        episode_events_max: before it has more events than this, an episode is ended and goes on in a follow-up episode.
-        batch_events_max, batch_bytes_max, batch_age_ms: a batch closes at whichever comes first.
-        fold_worker_restart_s: how long the daemon waits before it starts a fold worker again that has died; twice as
-            long after each further death, at most a minute.
-        fold_worker_healthy_s: a fold worker that has lived for so long is restarted as after a first death.
-        fold_worker_report_s: a fold worker that is stopped (SIGSTOP, a debugger) while it folds is reported after so
-            long, because it may hold a lock of the database,
-        fold_worker_stopped_s: and killed and replaced after so long.
-        fold_worker_answer_s: a fold worker that gives no answer for so long is replaced even if it is at work. A batch
-            takes about a second; this is not for slow disks, it is for what never ends.
-        idle_ms: a plan that has emitted nothing for so long is idle: its tables are brought up to date.
-        flush_timeout_s: `flush` and closing fail when the database has taken nothing for this long; nothing is lost.
-        connect_timeout_s: how long a database may take to answer at the first connection.
-        sample_interval_ms: how often the robot's state is sampled while a motion runs; None: never. Each motion is then
-            sampled at its start and end as well.
-        sample_change_min: between those, only joints (rad or m) and numbers of the base's pose that changed by more
-            than this since they were last written.
-        on_full: what a node does that starts while the spool is full: wait for room, or fail with `SpoolFull`.
-        on_unrecordable: record a parameter that cannot be recorded as missing, with the reason, count it and warn once;
-            or, while a plan is developed, refuse the perform.
-        file_access: a new spool (mode 0700) and a new SQLite database (0600) belong to their `owner` alone, or to the
-            `group` of the folder that holds them (2770, 0660), whose processes share them.
+        writer: a thread of this process ("thread") or the daemon `pycrorm writer` ("daemon") drains the spool.
+        sync_interval_ms: written records wait at most this long for a sync to begin.
+        segment_bytes: size of one file of the write-ahead queue, allocated before use.
+        spool_bytes_max: one recorder holds at most this much on disk; beyond it `on_full` applies.
+        spool_reserve_bytes: part of `spool_bytes_max` reserved for node ends and world observations, which never wait.
+        keep_stored_s: a segment whose records are all stored is kept this long, to refill a database that went back
+            (a failover, a restored backup); 0 keeps none.
+        keep_stored_bytes: these kept segments of a spool take at most this much, in addition to `spool_bytes_max`. The
+            default is about a million events, a day of one busy robot, and a sixteenth of `spool_bytes_max`. They are
+            deleted first when the disk is full.
+        record_bytes_max: size of the largest event; a larger one is refused.
+        episode_events_max: an episode that reaches this many events is ended and continued in a follow-up episode.
+        batch_events_max, batch_bytes_max, batch_age_ms: a batch closes at the limit it reaches first.
+        fold_worker_restart_s: the daemon waits this long before it restarts a fold worker that died; the wait doubles
+            after each further death, up to a minute.
+        fold_worker_healthy_s: a fold worker that lived this long is restarted with the first, shortest wait.
+        fold_worker_report_s: a fold worker stopped (SIGSTOP, a debugger) while it folds is reported after this long,
+            because it may hold a database lock.
+        fold_worker_stopped_s: such a worker is killed and replaced after this long.
+        fold_worker_answer_s: a fold worker that has not answered for this long is replaced even while it runs. A batch
+            takes about a second, so this limit catches endless loops, not slow disks.
+        idle_ms: a plan that has emitted no event for this long counts as idle, and its events are folded.
+        flush_timeout_s: `flush` and closing fail when the database has stored no event for this long; none is lost.
+        connect_timeout_s: the first connection to a database may take this long.
+        sample_interval_ms: the robot's state is sampled at this interval while a motion runs, and also at the motion's
+            start and end; None samples nothing.
+        sample_change_min: samples between start and end hold only the joints (rad or m) and the numbers of the base
+            pose that changed by more than this since they were last recorded.
+        on_full: a node that starts while the spool is full waits for space ("wait") or fails with `SpoolFull` ("fail").
+        on_unrecordable: "record_missing" records a parameter that cannot be recorded as missing, with the reason,
+            counts it and warns once; "refuse", for developing a plan, raises before `perform` runs.
+        file_access: a new spool (mode 0700) and a new SQLite database (0600) belong to their "owner" alone, or to the
+            "group" of the folder that holds them (2770, 0660), whose processes share them.
     """
 
     writer: Writer = "thread"
@@ -100,15 +100,15 @@ class Settings:
     file_access: FileAccess = "owner"
 
     def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            fault = _fault(each.name, value)
-            if fault is not None:
-                raise CallerError(f"Settings.{each.name} is {value!r}: {fault}")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            violation = _violation(field.name, value)
+            if violation is not None:
+                raise CallerError(f"Settings.{field.name} is {value!r}: {violation}")
 
 
-def _fault(name: str, value: object) -> str | None:
-    """What a setting must be and is not."""
+def _violation(name: str, value: object) -> str | None:
+    """Return the rule that a setting's value breaks, or None if the value is valid."""
     choices = _CHOICES.get(name)
     if choices is not None:
         return None if value in choices else f"use {' or '.join(map(repr, choices))}"
