@@ -51,7 +51,7 @@ from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
-from pycrorm_async.queue.files.locks import in_forked_child
+from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.settings import Settings, Writer
@@ -96,7 +96,7 @@ class Memory:
         self._stack = AsyncExitStack()
         self._parts: Parts | None = None
         self._told: set[str] = set()
-        in_forked_child(self._forked)
+        call_in_forked_child(self._forked)
 
     @classmethod
     def open(

@@ -57,7 +57,7 @@ class MemoryStatus(NamedTuple):
     def of(cls, parts: Parts, unadopted: Mapping[str, PycrormError]) -> Self:
         """How the memory with these parts is, at this moment."""
         queue, emitter, told = parts.queue, parts.emitter, parts.recorder
-        outside = queue.drained_outside
+        outside = queue.external_drain_status
         return cls(
             written=queue.written,
             synced=queue.synced,

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from pycrorm_async.cli.output import stdout
-from pycrorm_async.queue.files.recorder_folder import available
+from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
 from pycrorm_async.queue.retention.stored_segments import kept_segments
 from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
@@ -40,7 +40,7 @@ class Durability:
 
 def kept_in(spool: Path) -> KeptSegments:
     """Raises `SpoolUnavailable`."""
-    with available(spool):
+    with wrap_os_errors(spool):
         segments = kept_segments(spool)
     return KeptSegments(
         len(segments), sum(each.bytes for each in segments), _moment(segments[0].stored_ns) if segments else None

@@ -26,7 +26,7 @@ from pycrorm_async.operations import recovery
 from pycrorm_async.operations.recovery import Rebinding
 from pycrorm_async.projections.custom.discovery import named
 from pycrorm_async.queue.files.names import REFUSED
-from pycrorm_async.queue.files.recorder_folder import fault_in
+from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.maintenance.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
 from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
 from pycrorm_async.queue.maintenance.salvage import Range
@@ -78,7 +78,7 @@ def repair(folder: FolderArgument, as_json: JsonOption = False) -> int:
         try:
             report = repair_folder(Path(each.path))
         except Exception as fault:  # noqa: BLE001 - reported of this folder; the next may be repaired
-            refused[each.name] = fault_in(Path(each.path), fault)
+            refused[each.name] = folder_error(Path(each.path), fault)
         else:
             mended += [report] if report is not None else []
     if as_json:

@@ -23,7 +23,7 @@ from pycrorm_async.projections.schema.unmade_types import unmade_types
 from pycrorm_async.queue.files.drain_status import Progress
 from pycrorm_async.queue.files.locks import is_locked
 from pycrorm_async.queue.files.names import DRAIN
-from pycrorm_async.queue.files.recorder_folder import available, fault_in
+from pycrorm_async.queue.files.recorder_folder import folder_error, wrap_os_errors
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.store.address import DatabaseAddress
@@ -203,12 +203,12 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
     try:
         return _state(folder)
     except Exception as error:  # noqa: BLE001 - shown with this recorder; the others are looked at
-        fault = str(fault_in(folder.path, error))
+        fault = str(folder_error(folder.path, error))
         return RecorderState(folder.name, folder.alive, "nobody", None, None, None, 0, None, None, {}, fault)
 
 
 def _state(folder: RecorderFolder) -> RecorderState:
-    with available(folder.path):
+    with wrap_os_errors(folder.path):
         locked = is_locked(folder.path / DRAIN)
         spooled = _bytes(folder.path)
         progress = Progress.open(folder.path, writing=False) if folder.alive else None

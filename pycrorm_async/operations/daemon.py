@@ -20,7 +20,7 @@ from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldW
 from pycrorm_async.projections.custom.discovery import checked
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.recorder_folder import fault_in
+from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.queue.sources.dead_source import RecoveredQueue, open_dead
@@ -125,7 +125,7 @@ class _Folders:
             try:
                 taken = _take(folder, self._stored, again=folder.name in self._taken)
             except Exception as error:  # noqa: BLE001 - said of this folder; the others are drained
-                failed[folder.name] = fault_in(folder.path, error)
+                failed[folder.name] = folder_error(folder.path, error)
             else:
                 if taken is not None:
                     held.append(taken)
@@ -164,7 +164,7 @@ class _Living(LiveQueue):
         is_alive, closed = self.is_alive, self.is_closed
         self.release()
         what = "has ended" if closed else "is left at work" if is_alive else "died"
-        return ReleaseOutcome(what, whole=self.stored == self.given or not is_alive)
+        return ReleaseOutcome(what, whole=self.stored == self.supplied or not is_alive)
 
 
 class _Dead(ClaimedSource):

@@ -20,7 +20,7 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.operations.destination import open_destination, shared_address
 from pycrorm_async.projections.custom.discovery import checked
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.queue.files.recorder_folder import fault_in
+from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
@@ -77,7 +77,7 @@ def dead_queues(
             if recovered.damage is not None:  # not logged here: the caller that drained this queue reports the damage
                 failures[folder.name] = recovered.damage
         except Exception as error:  # noqa: BLE001 - kept in `failures`; the next folder may be readable
-            failures[folder.name] = fault_in(folder.path, error)
+            failures[folder.name] = folder_error(folder.path, error)
             _log.warning("%s", failures[folder.name])
 
 
@@ -125,7 +125,7 @@ async def recover(
             done = await drain_once(sources, destination, settings=settings)
             for queue, state in zip(living, done.drained, strict=False):
                 stopped = {each: why for each, why in done.stopped.items() if each in queue.episodes}
-                queue.mark_visible(state.appended or queue.given, {**state.refused, **stopped})
+                queue.mark_visible(state.appended or queue.supplied, {**state.refused, **stopped})
     dead_letters = {each.refused: each.path for each in place.recorders() if each.refused is not None}
     return RecoveryReport(done, len(living), tuple(lost), {**done.failed, **failures}, dead_letters)
 
@@ -149,7 +149,7 @@ def _living_queues(spool: Spool, failures: dict[str, PycrormError], stack: ExitS
         try:
             queue = _LivingQueue.take(folder.path) if folder.alive else None
         except Exception as error:  # noqa: BLE001 - kept in `failures`; the next folder may be readable
-            failures[folder.name] = fault_in(folder.path, error)
+            failures[folder.name] = folder_error(folder.path, error)
             continue
         if queue is not None:
             stack.callback(queue.release)

@@ -1,21 +1,21 @@
-"""The write-ahead queue: events in files that survive the process at once and the machine soon after.
+"""Keep events in a write-ahead queue: files that survive the process at once and a power cut soon after.
 
     spool/                     one folder, bound to one database
-      log                      id of that database's log, one line; stays while a recorder's folder is here
+      log                      id of that database's log, one line; fixed while the spool holds a recorder's folder
       writer                   locked by the daemon that drains the spool
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
-        drain                  locked by whoever drains the folder
-        progress               how far it is drained, if that is another process (`progress.py`)
+        drain                  locked by the process that drains the folder
+        progress               how far another process has drained the folder (`files/drain_status.py`)
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
-        00000002.segment       the last one may be made ahead: all zero
-        00000001.segment.tail  what was torn at the end of a refused folder that is written on
-      <recorder>.<episode>.refused/   what the database refused of this episode (`refused.py`), in the same format
-      <recorder>.damaged/      a damaged folder as it was, when `repair` put another in its place
+        00000002.segment       the last one may be allocated ahead: all zero
+        00000001.segment.tail  the torn bytes cut off the end of a segment
+      <recorder>.<episode>.refused/   dead letters of this episode (`sources/dead_letters.py`), in the same format
+      <recorder>.damaged/      a damaged folder, unchanged, after `repair` replaced it
 
-Everything below is little endian, and every structure begins at a multiple of 8 bytes.
+All numbers in segments are little endian, and every structure begins at a multiple of 8 bytes.
 
-**Segment**: a header, frames without space between them, zeros to the end of the file.
+**Segment**: a header, contiguous frames, then zeros to the end of the file.
 
     offset  type  header of a segment
     0       8 s   magic, "PYCRQSEG"
@@ -24,7 +24,7 @@ Everything below is little endian, and every structure begins at a multiple of 8
     16      16 s  the recorder's id
     32      u64   number of the segment, 1 …
     40      u64   base: position of its first record
-    48      u32   n, how many episodes are open
+    48      u32   n, number of open episodes
     52      u32   crc32 of bytes 56 to the header's end, continued over bytes 0 to 52
     56      n of  the open episodes: id 16 s, then of its last record: sequence u64, wall_ns i64, monotonic_ns i64
 
@@ -35,27 +35,28 @@ Everything below is little endian, and every structure begins at a multiple of 8
     1       u8    length of the type's name                                  0
     2       u16   version of the type                                        0
     4       u32   length of the payload                                      4
-    8       u64   position             its own            its own            last one that is safe
+    8       u64   position             its own            its own            last one covered
     16      u64   sequence             in the episode     0                  records since the commit before
     24      i64   wall_ns              UTC, since 1970
     32      i64   monotonic_ns
     40      16 s  episode              UUIDv7             zeros              zeros
     56      u32   salt                 that of the segment
-    60      u32   crc32 of what follows the header, padding too, continued over bytes 0 to 60
+    60      u32   crc32 of the bytes after the header, with padding, continued over bytes 0 to 60
 
-A commit's payload is the crc32 over the crc32 fields (u32 each) of those records. Kind 0 is no frame, so space made
-ahead is never a record. The salt keeps what another file once left on the same blocks from coming back to life.
+The payload of a commit frame is the crc32 over the crc32 fields (u32 each) of the records it covers. No frame has kind
+0, so preallocated space never decodes as a record. The salt keeps frames that another file left on the same disk blocks
+from decoding here.
 
-**Order on the disk.** A sync makes the records safe, then appends a commit frame that says so, then makes that safe,
-and only then tells anybody. So all that a commit frame covers was on the disk before the frame existed: if any of it is
-missing that is *damage*. What no commit frame covers may be there or not, in any order, because pages reach a disk in
-any order: the first hole in it is where it is *torn*, and it is cut there. A commit frame written before the one sync
-that covers both would look like damage after an ordinary power cut. Records may stand between the last record a
-commit covers and the commit.
+**Order on the disk.** A sync writes the records to the disk (fdatasync), appends a commit frame, writes that to the
+disk too, and only then reports the records as synced. So every record that a commit frame covers was on the disk before
+the frame existed: a missing one is *damage*. Records that no commit frame covers may be missing in any combination,
+because pages reach a disk in any order: their first hole is a *torn* tail, and recovery truncates it. If one fdatasync
+covered records and commit frame together, an ordinary power cut could look like damage. Records may lie between the
+last record that a commit frame covers and the commit frame.
 
 **Reading.** Positions run 1, 2, 3 … through all segments. A segment ends where no frame decodes; the next continues it
-if its base is the next position. The oldest segment's header knows the open episodes, so that their end can be told
-when the segments that began them are gone: a segment goes only after the next one's header is safe.
+if its base is the next position. The oldest segment's header lists the open episodes, so that recovery can end them
+when the segments that began them are deleted: a segment is deleted only after the next one's header is on the disk.
 """
 
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool

@@ -70,7 +70,7 @@ class DelegatedWriter:
 
     @property
     def _said(self) -> DrainProgress:
-        said = self._queue.drained_outside
+        said = self._queue.external_drain_status
         assert said is not None, "made for a queue that is offered"
         return said
 

@@ -211,7 +211,7 @@ class OfferedQueue(Protocol):
         ...
 
     @property
-    def drained_outside(self) -> DrainProgress | None:
+    def external_drain_status(self) -> DrainProgress | None:
         """How far the other process has got; None for a queue that is drained in this process."""
         ...
 

@@ -9,7 +9,7 @@ import pytest
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, parse_episode_id
 from pycrorm_async.queue.files.recorder_folder import make_folder
-from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
@@ -48,7 +48,7 @@ def test_an_episode_without_a_number_is_a_problem_each_time_and_is_kept(database
 def test_what_was_refused_earlier_is_a_problem_also_while_its_recorder_lives(tmp_path: Path, *, alive: bool) -> None:
     spool = tmp_path / "pycrorm.db.spool"
     folder, lock = make_folder(spool, RECORDER)
-    refused = RefusedRecords(folder)
+    refused = DeadLetters(folder)
     refused.put([Record(1, parse_episode_id(EPISODE), 5, "NodeStarted", 1, 7, 8, b"{}")])
     refused.release()
     if not alive:

@@ -9,7 +9,7 @@ import pytest
 
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.queue.factories import overwrite
 
@@ -159,7 +159,7 @@ def test_what_the_database_refused_is_told_with_its_place_by_status_and_inspect(
     assert pycrorm("writer", "--once", cwd=folder).returncode == 0
     spool = folder / "pycrorm.db.spool"
     recorder, identity = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
-    refused = RefusedRecords(spool / recorder)
+    refused = DeadLetters(spool / recorder)
     refused.put([Record(1, parse_episode_id(identity), 5, "NodeStarted", 1, 7, 8, b"{}")])
     refused.release()
     place = spool / f"{recorder}.{identity}.refused"

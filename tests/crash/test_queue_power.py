@@ -22,7 +22,7 @@ from pycrorm_async.queue import RecorderQueue, open_dead
 from pycrorm_async.queue.files.frame import EVENT
 from pycrorm_async.queue.files.segment import Segment, salt_of
 from pycrorm_async.queue.live.appender import Appender, Span
-from pycrorm_async.queue.live.sync_thread import Syncer
+from pycrorm_async.queue.live.sync_thread import SyncThread
 from tests.queue.factories import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
 
 SECTOR = 512
@@ -140,7 +140,7 @@ def machine(tmp_path: Path, seed: int) -> Iterator[Machine]:
 def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
     """A machine whose every sync is watched, with a cut before and after each."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Syncer, "start", lambda self: None)
+        patch.setattr(SyncThread, "start", lambda self: None)
         machine = Machine(place, rng)
         sync = Segment.sync
 

@@ -99,7 +99,7 @@ def test_a_spool_in_use_is_not_rebound(tmp_path: Path, holder: str) -> None:
     lock = spool.take_writer() if holder == "daemon" else None
     if holder == "drainer":
         lock = type(alive).take(folder / "drain")
-    reasons = {"recorder": "still records", "daemon": "`pycrorm writer` drains it", "drainer": "stores what is in it"}
+    reasons = {"recorder": "still records", "daemon": "`pycrorm writer` drains it", "drainer": "drains it"}
     with pytest.raises(SpoolTaken, match=reasons[holder]):
         spool.rebind("b")
     assert spool.log_id() == "a"

@@ -11,7 +11,7 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import LiveQueue, Spool, open_dead
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from pycrorm_async.queue.maintenance.repair import finish_repairs, repair_folder
-from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
@@ -55,7 +55,7 @@ def placed(records: list[Record]) -> list[Record]:
 
 def put(own: Path, *batches: list[Record]) -> None:
     """By a process of its own."""
-    refused = RefusedRecords(own)
+    refused = DeadLetters(own)
     for batch in batches:
         refused.put(batch)
     refused.release()
@@ -124,7 +124,7 @@ async def test_a_file_that_has_grown_large_is_followed_by_another(own: Path) -> 
 
 
 def test_an_event_that_does_not_follow_what_is_kept_is_refused_and_named(own: Path) -> None:
-    refused = RefusedRecords(own)
+    refused = DeadLetters(own)
     refused.put(some(5, 7))
     with pytest.raises(SpoolUnavailable, match=r"\.refused: holds events up to 7, and 9 does not follow$"):
         refused.put(some(9, 9))
@@ -197,7 +197,7 @@ async def test_damage_in_it_is_told_and_mended(own: Path) -> None:
     overwrite(folder / "00000001.segment", content.index(b'{"n":7}'), b"#")
     [_, one] = inspect_spool(own.parent).recorders
     assert one.damage is not None
-    refused = RefusedRecords(own)
+    refused = DeadLetters(own)
     with pytest.raises(Exception, match="is damaged at byte"):
         refused.put(some(9, 9))
     report = repair_folder(folder)
@@ -216,4 +216,4 @@ async def test_damage_in_it_is_told_and_mended(own: Path) -> None:
 
 def test_only_episodes_are_refused(own: Path) -> None:
     with pytest.raises(AssertionError):
-        RefusedRecords(own).put([record(1, Heading(None, "DesignatorTypeDeclared", 1), 0, b"{}")])
+        DeadLetters(own).put([record(1, Heading(None, "DesignatorTypeDeclared", 1), 0, b"{}")])

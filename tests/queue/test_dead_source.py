@@ -11,7 +11,7 @@ from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.files.frame import CHECKSUM, EVENT, encode
 from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.recorder_folder import held_by
+from pycrorm_async.queue.files.recorder_folder import parse_folder_name
 from pycrorm_async.queue.files.scan import scan, seal, tails
 from pycrorm_async.queue.files.segment import salt_of
 from tests.queue.factories import (
@@ -228,7 +228,7 @@ async def test_damage_is_told_with_file_and_offset_and_changes_nothing(author: A
         open_dead(author.folder)
     assert (damage.value.path, damage.value.offset) == (path, offset)
     assert "position 2 is missing" in damage.value.reason
-    assert "up to position 3 was safe" in damage.value.reason
+    assert "covers all records up to position 3" in damage.value.reason
     assert path.read_bytes() == before
     assert [each.alive for each in Spool(author.folder.parent).recorders()] == [False]
 
@@ -284,7 +284,7 @@ async def test_other_records_than_those_that_were_safe_are_damage(author: Author
         salt=salt_of(RECORDER, 1),
     )
     overwrite(path, offset, other)
-    with pytest.raises(SpoolDamaged, match="not those that were safe"):
+    with pytest.raises(SpoolDamaged, match="differ from those that were synced"):
         open_dead(author.folder)
 
 
@@ -489,5 +489,5 @@ async def test_a_live_queue_that_was_let_go_has_no_tail(spool: Path) -> None:
     recovered.check()
     assert len(await drain(recovered)) == 2
     recovered.release()
-    kept = scan(queue.folder, held_by(queue.name).recorder)
+    kept = scan(queue.folder, parse_folder_name(queue.name).recorder)
     assert [tail for _, tail in tails(queue.folder, kept) if tail] == []

@@ -177,11 +177,11 @@ async def test_losses_are_named_also_when_the_new_folder_goes_before_it_has_its_
     base = queue._appender.begun[-1].base
     deleted: list[Path] = []
 
-    def finish(unfinished: Path, *, instead_of: Path | None) -> Path:
+    def finish(unfinished: Path, *, replaced: Path | None) -> Path:
         if not deleted:
             deleted.append(unfinished)
             delete(unfinished)
-        return finish_folder(unfinished, instead_of=instead_of)
+        return finish_folder(unfinished, replaced=replaced)
 
     monkeypatch.setattr("pycrorm_async.queue.live.relocation.finish_folder", finish)
     delete_the_folder(queue)
@@ -333,8 +333,8 @@ async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_t
     second.mark_visible(3, {})
     queue.close()
     await queue.synced_to()
-    assert queue.drained_outside is not None
-    assert (queue.drained_outside.stored, queue.drained_outside.folded) == (3, 3)
+    assert queue.external_drain_status is not None
+    assert (queue.external_drain_status.stored, queue.external_drain_status.folded) == (3, 3)
     second.release()
     queue.release()
 

@@ -20,21 +20,21 @@ def both(folder: Path) -> tuple[Progress, Progress]:
 def test_each_side_reads_what_the_other_said_last(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(0, closed=False), DrainStatus(0, 0, DrainNote()))
-    recorder.tell_recorded(RecorderStatus(2**63, closed=True))
-    drainer.tell_drained(SAID)
+    recorder.write_recorder_status(RecorderStatus(2**63, closed=True))
+    drainer.write_drain_status(SAID)
     assert drainer.recorded() == RecorderStatus(2**63, closed=True)
     assert recorder.drained() == SAID
-    drainer.tell_drained(DrainStatus(8, 8))
+    drainer.write_drain_status(DrainStatus(8, 8))
     assert recorder.drained() == DrainStatus(8, 8, DrainNote())
 
 
 def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
-    recorder.tell_recorded(RecorderStatus(1000, closed=False))
-    drainer.tell_drained(SAID)
+    recorder.write_recorder_status(RecorderStatus(1000, closed=False))
+    drainer.write_drain_status(SAID)
     before = (tmp_path / "progress").read_bytes()
-    recorder.tell_recorded(RecorderStatus(2**40 + 77, closed=True))
-    drainer.tell_drained(DrainStatus(2**40, 2**33, DrainNote(given_up="another reason")))
+    recorder.write_recorder_status(RecorderStatus(2**40 + 77, closed=True))
+    drainer.write_drain_status(DrainStatus(2**40, 2**33, DrainNote(given_up="another reason")))
     after = (tmp_path / "progress").read_bytes()
     changed = [place for place in range(len(after)) if before[place] != after[place]]
     for place in changed:
@@ -57,12 +57,12 @@ def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_pa
 
 def test_a_file_that_is_cut_while_both_use_it_kills_nobody(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
-    recorder.tell_recorded(RecorderStatus(3))
-    drainer.tell_drained(SAID)
+    recorder.write_recorder_status(RecorderStatus(3))
+    drainer.write_drain_status(SAID)
     assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(3), SAID)
     os.truncate(tmp_path / "progress", 0)
     assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(3), SAID)
-    recorder.tell_recorded(RecorderStatus(4))
+    recorder.write_recorder_status(RecorderStatus(4))
     assert drainer.recorded() == RecorderStatus(4)
 
 
@@ -81,11 +81,11 @@ def test_a_short_file_and_one_of_another_format_are_as_good_as_none(tmp_path: Pa
 def test_a_note_that_is_too_long_is_cut_and_the_numbers_are_said(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     stopped = {f"episode {number}": "é" * 10_000 for number in range(1000)}
-    drainer.tell_drained(DrainStatus(9, 8, DrainNote(given_up="ü" * 10_000, stopped=stopped)))
+    drainer.write_drain_status(DrainStatus(9, 8, DrainNote(given_up="ü" * 10_000, stopped=stopped)))
     said = recorder.drained()
     assert (said.stored, said.folded) == (9, 8)
     assert said.note.given_up == "ü" * 300
     assert said.note.stopped
     assert set(said.note.stopped.values()) == {"é" * 300}
-    drainer.tell_drained(DrainStatus(9, 8, DrainNote(given_up="\U0001f916" * 10_000, away="\U0001f916" * 10_000)))
+    drainer.write_drain_status(DrainStatus(9, 8, DrainNote(given_up="\U0001f916" * 10_000, away="\U0001f916" * 10_000)))
     assert recorder.drained().note.given_up == "\U0001f916" * 300

@@ -16,7 +16,7 @@ from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.queue.files.file_access import open_file
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
-from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from pycrorm_async.settings import FileAccess
 from tests.memory.note_actions import NoteActionPerformable
 
@@ -52,7 +52,7 @@ async def test_every_file_has_the_mode_that_was_chosen(
             await NoteActionPerformable("a").perform()
             await memory.flush()
             [recorder] = Spool(spool).recorders()
-            refused = RefusedRecords(recorder.path)
+            refused = DeadLetters(recorder.path)
             refused.put([Record(1, EPISODE, 5, "NodeStarted", 1, 7, 8, b"{}")])
             refused.release()
             segment = recorder.path / "00000009.segment"

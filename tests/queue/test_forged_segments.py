@@ -66,7 +66,7 @@ async def test_a_name_that_no_recorder_writes_is_damage_at_its_frame_and_a_repai
 
 
 def test_a_declaration_that_no_database_takes_is_damage_and_not_a_folder_that_is_stuck(tmp_path: Path) -> None:
-    for payload, reason in ((b"\xff", "not text"), (b"\0", "not text")):
+    for payload, reason in ((b"\xff", "not valid UTF-8"), (b"\0", "not valid UTF-8")):
         author = Author(tmp_path / payload.hex())
         author.put(DECLARED, payload)
         author.sync()
@@ -153,7 +153,7 @@ async def test_what_is_no_file_where_one_should_be_is_one_error_that_names_its_f
 async def test_a_file_larger_than_any_segment_is_damage_and_is_not_read(tmp_path: Path) -> None:
     author = journal(tmp_path)
     as_a_huge_file(author.segments[0])
-    with pytest.raises(SpoolDamaged, match="takes 4,398,046,511,104 bytes, and a segment at most 1,073,741,824"):
+    with pytest.raises(SpoolDamaged, match="has 4,398,046,511,104 bytes; a segment has at most 1,073,741,824"):
         open_dead(author.folder)
     with pytest.raises(CallerError, match="must be at most"):
         Capacity.of(SMALL.__class__(segment_bytes=SEGMENT_BYTES_MAX + 1, spool_bytes_max=2**40))
@@ -183,5 +183,5 @@ def test_a_hint_of_garbage_is_no_hint(tmp_path: Path) -> None:
 
 def test_a_note_of_the_database_that_is_no_text_is_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(b"\xff\xfe")
-    with pytest.raises(SpoolUnavailable, match="does not hold the id of a log"):
+    with pytest.raises(SpoolUnavailable, match="does not contain the id of a log"):
         Spool(tmp_path).bind(episode_text(RECORDER))

@@ -131,7 +131,7 @@ def test_what_is_no_spool_is_refused_in_one_line(tmp_path: Path) -> None:
     for name, reason in (
         ("none", "does not exist"),
         ("file", "is a file, not a folder"),
-        ("folder", "is not a spool: no recorder's folder is in it, and no note of a database"),
+        ("folder", "is not a spool: it contains neither a recorder's folder nor the note of a database"),
     ):
         with pytest.raises(SpoolUnavailable, match=reason) as refused:
             inspect_spool(tmp_path / name)

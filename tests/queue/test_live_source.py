@@ -161,7 +161,7 @@ async def test_a_queue_that_its_own_process_drains_is_not_taken(queue: RecorderQ
     await queue.synced_to()
     assert LiveQueue.take(queue.folder) is None
     assert len(await queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)) == 1
-    assert queue.drained_outside is None
+    assert queue.external_drain_status is None
     assert queue.is_drained
 
 
@@ -276,12 +276,12 @@ async def test_what_cannot_be_true_is_not_believed(offered: RecorderQueue) -> No
     await offered.synced_to()
     lying = Progress.open(offered.folder, writing=True)
     assert lying is not None
-    lying.tell_drained(DrainStatus(stored=2, folded=2))
-    assert (offered.stored, offered.drained_outside) == (0, DrainStatus())
-    lying.tell_drained(DrainStatus(stored=1, folded=1))
-    assert (offered.stored, offered.drained_outside) == (1, DrainStatus(1, 1))
+    lying.write_drain_status(DrainStatus(stored=2, folded=2))
+    assert (offered.stored, offered.external_drain_status) == (0, DrainStatus())
+    lying.write_drain_status(DrainStatus(stored=1, folded=1))
+    assert (offered.stored, offered.external_drain_status) == (1, DrainStatus(1, 1))
     source = taken(offered)
-    lying.tell_recorded(RecorderStatus(synced=9))
+    lying.write_recorder_status(RecorderStatus(synced=9))
     with pytest.raises(SpoolDamaged, match="position 2 is missing"):
         await some(source)
     source.release()
@@ -295,12 +295,12 @@ async def test_what_shows_and_what_stopped_is_heard_at_once(offered: RecorderQue
     assert await some(source) == [1]
     source.mark_unavailable("locked")
     source.mark_visible(1, {"an episode": "parked"})
-    said = offered.drained_outside
+    said = offered.external_drain_status
     assert said is not None
     assert (said.stored, said.folded) == (0, 1)
     assert (said.note.away, said.note.stopped) == ("locked", {"an episode": "parked"})
     source.mark_unavailable(None)
-    said = offered.drained_outside
+    said = offered.external_drain_status
     assert said is not None
     assert said.note.away is None
     source.release()

@@ -215,7 +215,7 @@ def test_a_living_recorder_and_one_that_is_drained_are_refused(spool: Path) -> N
     queue.release()
     draining = FileLock.take(queue.folder / "drain")
     assert draining is not None
-    with pytest.raises(SpoolUnavailable, match="is being drained: stop that first"):
+    with pytest.raises(SpoolUnavailable, match="another process drains it: stop that process first"):
         repair_folder(queue.folder)
     draining.release()
     assert repair_folder(queue.folder) is None

@@ -8,7 +8,7 @@ import pytest
 
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.files.segment import (
-    Last,
+    LastRecord,
     Segment,
     SegmentHeader,
     decode_header,
@@ -30,8 +30,8 @@ HEADER = SegmentHeader(
     number=5,
     base=43,
     open={
-        EpisodeId(bytes(range(0x10, 0x20))): Last(7, WALL_NS, MONOTONIC_NS),
-        EpisodeId(bytes(range(0x30, 0x40))): Last(1, WALL_NS - 1, MONOTONIC_NS - 1),
+        EpisodeId(bytes(range(0x10, 0x20))): LastRecord(7, WALL_NS, MONOTONIC_NS),
+        EpisodeId(bytes(range(0x30, 0x40))): LastRecord(1, WALL_NS - 1, MONOTONIC_NS - 1),
     },
 )
 

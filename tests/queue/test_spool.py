@@ -62,7 +62,7 @@ def test_a_spool_stays_with_its_log_as_long_as_a_recorder_is_in_it(spool: Path, 
             Spool(spool).bind("0190-log-of-b")
         assert str(refused.value) == (
             f"spool {spool} belongs to log 0190-log-of-a, not to log 0190-log-of-b:"
-            " open the database it belongs to, choose another spool, or store in this database what it holds with"
+            " open the database it belongs to, choose another spool, or move its records to this database with"
             " `pycrorm spool rebind`"
         )
         queue.release()

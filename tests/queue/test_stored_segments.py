@@ -191,7 +191,7 @@ async def test_what_cannot_be_kept_is_deleted_as_it_was_before(bound: Path, capl
     (bound / "stored").write_text("not a folder")
     await live(bound)
     assert sorted(each.name for each in bound.iterdir()) == ["log", "stored"]
-    assert "is stored and cannot be kept: Not a directory" in caplog.text
+    assert "cannot be kept, so it is deleted: Not a directory" in caplog.text
 
 
 async def test_open_episodes_are_known_from_the_first_segment_that_is_kept(bound: Path) -> None:

@@ -1,1 +1,1 @@
-"""The files of a spool: frames, segments, locks, how they are read."""
+"""Read and write the files of a spool: frames, segments, locks, notes."""

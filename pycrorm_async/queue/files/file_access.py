@@ -1,11 +1,10 @@
 """Create the spool's folders and files for their owner alone, or for the group that shares the spool.
 
-The folder in which a file is made decides, because recorders and a daemon of several users must agree: below one with
-the set-group-id bit and write permission for its group, folders get mode 2770 and files 0660; below any other folder
-0700 and 0600. The umask changes neither. What exists keeps its mode.
+The parent folder decides, because recorders and a daemon of several users must agree: in a folder with the set-group-id
+bit and group write permission, new folders get mode 2770 and new files 0660; in any other folder, 0700 and 0600. The
+umask does not matter, and existing files and folders keep their modes.
 
-A file is created for its owner alone and opened to the group afterwards, so that there is no moment at which another
-user could open it.
+`open_file` creates a file for its owner alone and then opens it to the group, so that no other user can open it first.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ _SHARED: Final = stat.S_ISGID | stat.S_IWGRP
 
 
 def create_spool(path: Path, access: FileAccess) -> None:
-    """Make the spool, and its parents, unless it exists; with `group` an existing one is shared from now on.
+    """Make the spool and its parents unless they exist; with "group", open an existing spool to its group.
 
     Raises `OSError`.
     """
@@ -62,7 +61,7 @@ def open_file(path: Path, flags: int) -> int:
 
 
 def rewrite(path: Path) -> BinaryIO:
-    """The file, empty, for writing. Raises `OSError`."""
+    """Open a file for writing, truncated. Raises `OSError`."""
     return os.fdopen(open_file(path, os.O_WRONLY | os.O_TRUNC), "wb")
 
 

@@ -1,11 +1,11 @@
-"""Refuse file systems on which the promises of a spool do not hold, before anything is made there.
+"""Refuse file systems on which a spool is not durable, before creating any file there.
 
-A segment has all its blocks before it is mapped, so that a full disk is an error while making it, and never a SIGBUS
-while writing to it. A file system that copies on write breaks that: it takes a new block each time a page is written
-again, and where it has none the kernel kills the process. On btrfs this was seen with allocated files and with files
-full of zeros. Files that are not copied (`chattr +C`) keep their blocks only until a snapshot, and only from Linux 6.17
-on for mapped files. On a network file system a lock may be lost while its holder lives, and a full disk shows when
-pages are written back; none was tested.
+A segment gets all its blocks before it is mapped, so that a full disk raises an error during allocation and never a
+SIGBUS during a write. A copy-on-write file system breaks this: rewriting a page takes a new block, and when none is
+free the kernel kills the process. This was observed on btrfs, with allocated files and with files of zeros. Files with
+copy-on-write disabled (`chattr +C`) keep their blocks only until a snapshot, and mapped ones only since Linux 6.17. On
+a network file system a lock may be lost while its holder lives, and a full disk shows only when pages are written back;
+no network file system was tested.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ _REFUSED: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
         0x5346414F: ("AFS", _NETWORK),
     }
 )
-"""By the `f_type` of statfs(2)."""
+"""Name of the file system and the reason for refusing it, by the `f_type` of statfs(2)."""
 
 
 def check_file_system(spool: Path) -> None:
-    """Raise `SpoolUnavailable` for a spool, which need not exist yet, that would lie on one of these."""
-    place = spool.absolute()
-    while not place.exists() and place != place.parent:
-        place = place.parent
-    name, reason = _REFUSED.get(file_system_type(place), ("", ""))
+    """Raise `SpoolUnavailable` if the spool is, or would be created, on a refused file system."""
+    ancestor = spool.absolute()
+    while not ancestor.exists() and ancestor != ancestor.parent:
+        ancestor = ancestor.parent
+    name, reason = _REFUSED.get(file_system_type(ancestor), ("", ""))
     if name:
         raise SpoolUnavailable(
             spool,
@@ -56,7 +56,7 @@ def check_file_system(spool: Path) -> None:
 
 
 def file_system_type(path: Path) -> int:
-    """The `f_type` of the file system that holds this path; 0 where the system does not say."""
+    """Return the `f_type` of the file system that holds this path; 0 if statfs fails."""
     buffer = ctypes.create_string_buffer(512)  # larger than struct statfs on any machine
     if ctypes.CDLL(None).statfs(os.fsencode(path), buffer) != 0:
         return 0

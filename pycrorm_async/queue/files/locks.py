@@ -1,7 +1,8 @@
-"""Who is alive and who drains, told by `flock`: the kernel lets go when the holder dies, and not before.
+"""Lock files with `flock`: `alive` shows that a recorder lives, `drain` that a process drains its folder.
 
-A lock belongs to the open file, which a forked child shares. So a child closes its copy the moment it is forked, and
-letting go is said aloud (`LOCK_UN`) rather than left to the last copy being closed.
+The kernel releases a lock when its holder dies, and not before. A lock belongs to the open file description, which a
+forked child shares. Therefore a child closes its copy right after the fork, and `release` unlocks explicitly
+(`LOCK_UN`) instead of relying on the last copy being closed.
 """
 
 from __future__ import annotations
@@ -20,29 +21,31 @@ from zlib import crc32
 
 from pycrorm_async.queue.files.file_access import open_file
 
-__all__ = ["FileIdentity", "FileLock", "is_locked", "note_in", "in_forked_child", "one_at_a_time"]
+__all__ = ["FileIdentity", "FileLock", "is_locked", "read_note", "call_in_forked_child", "folder_lock"]
 
-_TRIES = 5
-_TRIES_IN_TURN = 10_000
-_TRY_AGAIN_S = 0.001
+_ATTEMPTS = 5
+"""Attempts at a lock that a concurrent `is_locked` may hold, and at a note that is being written: milliseconds."""
+_FOLDER_ATTEMPTS = 10_000
+"""Attempts at a folder's lock: ten seconds in total."""
+_RETRY_S = 0.001
 _NOTE = Struct("=II")
-"""Length and checksum before the holder's note."""
+"""The length and the checksum that precede the holder's note."""
 
 
-def in_forked_child(method: Callable[[], None]) -> None:
-    """Calls this bound method in every forked child, as long as its object lives."""
+def call_in_forked_child(method: Callable[[], None]) -> None:
+    """Call this bound method in every forked child, as long as its object lives."""
     reference = weakref.WeakMethod(method)
 
     def call() -> None:
-        alive = reference()
-        if alive is not None:
-            alive()
+        live_method = reference()
+        if live_method is not None:
+            live_method()
 
     os.register_at_fork(after_in_child=call)
 
 
 def is_locked(path: Path) -> bool:
-    """Whether somebody holds this lock now. Raises `OSError`; no such file is not locked."""
+    """Return whether any process holds this lock; a missing file is not locked. Raises `OSError`."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -58,21 +61,21 @@ def is_locked(path: Path) -> bool:
 
 
 @contextmanager
-def one_at_a_time(folder: Path) -> Iterator[None]:
-    """What is done inside, no other process and no other thread does at the same time in this folder.
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder: at most one thread of one process at a time is inside the `with` block.
 
-    For moments: waits ten seconds for others, then raises `TimeoutError`. Raises other `OSError`.
+    For short operations only: after ten seconds of waiting raises `TimeoutError`. Raises other `OSError`.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        for _ in range(_TRIES_IN_TURN):
+        for _ in range(_FOLDER_ATTEMPTS):
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                time.sleep(_TRY_AGAIN_S)
+                time.sleep(_RETRY_S)
         else:
-            raise TimeoutError(errno.ETIMEDOUT, "another process does not let go of it", str(folder))
+            raise TimeoutError(errno.ETIMEDOUT, "another process holds its lock for more than 10 s", str(folder))
         try:
             yield
         finally:
@@ -82,7 +85,7 @@ def one_at_a_time(folder: Path) -> Iterator[None]:
 
 
 class FileIdentity(NamedTuple):
-    """Which file it is, whatever its name."""
+    """The identity of a file, independent of its name."""
 
     device: int
     inode: int
@@ -92,19 +95,19 @@ class FileIdentity(NamedTuple):
         return cls(status.st_dev, status.st_ino)
 
     def is_at(self, path: Path) -> bool:
-        """Whether this name leads to it; not if that cannot be looked up."""
+        """Return whether this path names the file; False if the path cannot be examined."""
         try:
             return FileIdentity.of(path.stat()) == self
         except OSError:
             return False
 
 
-def note_in(path: Path) -> bytes | None:
-    """The note that the holder of this lock wrote last; None for none. Raises `OSError` other than a missing file.
+def read_note(path: Path) -> bytes | None:
+    """Read the last note of this lock's holder; None without a note or a file. Raises other `OSError`.
 
-    Read a few times, because the holder may write while this reads: the checksum shows that it is whole.
+    Retries a few times, because the holder may be writing: the checksum shows whether the note is complete.
     """
-    for _ in range(_TRIES):
+    for _ in range(_ATTEMPTS):
         try:
             content = path.read_bytes()
         except FileNotFoundError:
@@ -114,7 +117,7 @@ def note_in(path: Path) -> bytes | None:
             note = content[_NOTE.size : _NOTE.size + length]
             if len(note) == length and crc32(note) == checksum:
                 return note
-        time.sleep(_TRY_AGAIN_S)
+        time.sleep(_RETRY_S)
     return None
 
 
@@ -124,41 +127,41 @@ class FileLock:
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
         self.identity = FileIdentity.of(os.fstat(descriptor))
-        in_forked_child(self._close)
+        call_in_forked_child(self._close)
 
     @classmethod
     def take(cls, path: Path, *, create: bool = True) -> FileLock | None:
-        """The lock, or None if somebody else holds it or its folder is gone. Raises other `OSError`.
+        """Take the lock; None if another process holds it or its folder is missing. Raises other `OSError`.
 
-        Tried a few times within milliseconds: `is_locked` holds a lock for the moment it looks.
+        Retries for a few milliseconds, because `is_locked` takes the lock itself while it tests.
         """
         try:
             descriptor = open_file(path, os.O_RDWR) if create else os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except FileNotFoundError:
             return None
-        for _ in range(_TRIES):
+        for _ in range(_ATTEMPTS):
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                time.sleep(_TRY_AGAIN_S)
+                time.sleep(_RETRY_S)
             else:
                 break
         else:
             os.close(descriptor)
             return None
-        # The holder before may have deleted the file while this one was being opened: then this locks nothing.
+        # The previous holder may have deleted the file after it was opened here: then this lock protects nothing.
         if not FileIdentity.of(os.fstat(descriptor)).is_at(path):
             os.close(descriptor)
             return None
         return cls(descriptor)
 
     def write_note(self, note: bytes) -> None:
-        """Replaces the holder's note in the lock's file, for `note_in`. Raises `OSError`."""
+        """Replace the holder's note in the lock file, for `read_note`. Raises `OSError`."""
         if self._descriptor >= 0:
             os.pwrite(self._descriptor, _NOTE.pack(len(note), crc32(note)) + note, 0)
 
     def release(self) -> None:
-        """Lets go, also of what a child that was not told still shares. Twice is once."""
+        """Release the lock, also where a forked child still shares it. Idempotent."""
         if self._descriptor >= 0:
             fcntl.flock(self._descriptor, fcntl.LOCK_UN)
             self._close()

@@ -1,6 +1,7 @@
-"""Reads records back from the segments of a recorder that lives, in order, payloads untouched.
+"""Read records of a living recorder from its segments, in order, with payloads untouched.
 
-A hole is an error here: whoever calls knows up to which position the records are there.
+A hole raises an error here, because the caller asks only for records that are synced. Recovery, which expects holes,
+uses `scan.py`.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Buffer, decode_each
 from pycrorm_async.queue.files.segment import decode_header, header_bytes, salt_of
 
-__all__ = ["Cursor", "Batch", "Reader", "checked_type"]
+__all__ = ["Cursor", "Batch", "Reader", "check_type"]
 
 
 class Cursor(NamedTuple):
-    """A place between two records: the next frame to look at, and the position of the record before it."""
+    """A place between two records: segment and offset of the next frame, and position of the record before it."""
 
     number: int
     offset: int
@@ -28,7 +29,7 @@ class Cursor(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Records, their payloads' size, and where the next ones begin. `complete`: one more would pass a limit."""
+    """Records, the size of their payloads, and the cursor behind them. `complete`: one more would exceed a limit."""
 
     records: list[Record]
     payload_bytes: int
@@ -36,19 +37,19 @@ class Batch(NamedTuple):
     complete: bool
 
 
-def checked_type(path: Path, offset: int, name: bytes) -> str:
-    """The name of an event's type in the frame at this place. Raises `SpoolDamaged` for what no recorder writes."""
+def check_type(path: Path, offset: int, name: bytes) -> str:
+    """Decode an event type's name. Raises `SpoolDamaged` for a name that no recorder writes."""
     try:
         type_name = name.decode()
     except UnicodeDecodeError:
         raise SpoolDamaged(path, offset, f"the name of the event's type, {name!r}, is not UTF-8") from None
     if not type_name or "\0" in type_name:
-        raise SpoolDamaged(path, offset, f"the name of the event's type, {name!r}, is not one")
+        raise SpoolDamaged(path, offset, f"the name of the event's type, {name!r}, is empty or contains NUL")
     return type_name
 
 
 class Reader:
-    """Reads one recorder's segments. `load` gives the bytes of the segment of a number."""
+    """Read one recorder's segments. `load` returns the path and the bytes of a segment by number."""
 
     def __init__(self, *, recorder: bytes, start: Cursor, load: Callable[[int], tuple[Path, Buffer]]) -> None:
         self.cursor = start
@@ -59,16 +60,16 @@ class Reader:
         self._buffer: Buffer = b""
         self._types: dict[bytes, str] = {}
 
-    def read(self, *, last: int, events_max: int, bytes_max: int, begun: Batch | None = None) -> Batch:
-        """The records after `begun` (or after the cursor) up to position `last`, those of `begun` before them.
+    def read(self, *, last: int, events_max: int, bytes_max: int, partial: Batch | None = None) -> Batch:
+        """Extend `partial`, or a batch that begins at the cursor, by the records up to position `last`.
 
-        At most `events_max`, and payloads of at most `bytes_max` together unless the first alone is larger. The
-        cursor stays: set it to `after` when the batch was given away. Raises `SpoolDamaged`.
+        The batch holds at most `events_max` records, and payloads of at most `bytes_max` bytes unless its first record
+        is larger. The cursor stays; set it to `after` when the batch is handed out. Raises `SpoolDamaged`.
         """
-        records, total, (number, offset, position), _ = begun or Batch([], 0, self.cursor, complete=False)
+        records, total, (number, offset, position), _ = partial or Batch([], 0, self.cursor, complete=False)
         types = self._types
         if number != self._number:
-            self._turn_to(number)
+            self._open_segment(number)
         until = min(last, position + events_max - len(records))
         full = False
         while position < until and not full:
@@ -85,7 +86,7 @@ class Reader:
                     position = at
                     type_name = types.get(name)
                     if type_name is None:
-                        type_name = types[name] = checked_type(self._path, offset, name)
+                        type_name = types[name] = check_type(self._path, offset, name)
                     owner = episode if kind == EVENT else None
                     values = (position, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
                     records.append(make(Record, values))
@@ -94,32 +95,32 @@ class Reader:
                     break
             else:
                 number, offset = number + 1, self._next_segment(number + 1, offset, position)
-                if not records:  # the segment that ended may be deleted before the next read
+                if not records:  # the finished segment may be deleted before the next read
                     self.cursor = Cursor(number, offset, position)
         complete = full or len(records) >= events_max or total >= bytes_max
         return Batch(records, total, Cursor(number, offset, position), complete)
 
     def skip_to(self, position: int) -> None:
-        """Goes on behind this position, all records up to which are there. Raises as `read` does."""
+        """Move the cursor behind this position; the records up to it must be readable. Raises as `read` does."""
         while self.cursor.position < position:
             self.cursor = self.read(last=position, events_max=10_000, bytes_max=2**22).after
 
     def close(self) -> None:
-        """Gives up the segment it looks at."""
+        """Close the current segment."""
         if isinstance(self._buffer, mmap.mmap):
             self._buffer.close()
         self._number, self._buffer = 0, b""
 
-    def _turn_to(self, number: int) -> None:
+    def _open_segment(self, number: int) -> None:
         self.close()
         self._path, self._buffer = self._load(number)
         self._number = number
 
     def _next_segment(self, number: int, offset: int, position: int) -> int:
-        """The first frame of the segment that goes on where this one ends."""
+        """Open the segment that continues the current one; return the offset of its first frame."""
         before = self._path
         try:
-            self._turn_to(number)
+            self._open_segment(number)
         except FileNotFoundError:
             raise SpoolDamaged(before, offset, f"position {position + 1} is missing") from None
         header = decode_header(self._buffer)

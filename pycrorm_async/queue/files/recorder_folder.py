@@ -1,7 +1,7 @@
-"""One recorder's folder: how it comes to be, what is in it, how it goes.
+"""Create, name and delete one recorder's folder.
 
-It gets its name when its `alive` is locked already, so nobody can take it for dead while it is being made. It loses
-`alive` last, so a deletion that was cut short is recovered like any other dead folder.
+The folder gets its name only after its `alive` is locked, so that no process mistakes it for a dead one while it is
+being created. It loses `alive` last, so that an interrupted deletion is recovered like any other dead folder.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from pycrorm_async.queue.files.segment import segment_numbers, segment_path, syn
 from pycrorm_async.settings import FileAccess
 
 __all__ = [
-    "Holding",
-    "available",
+    "FolderName",
+    "wrap_os_errors",
     "begin_folder",
-    "fault_in",
+    "folder_error",
     "finish_folder",
-    "held_by",
+    "parse_folder_name",
     "make_folder",
     "remove_folder",
     "remove_made_ahead",
-    "write_safely",
+    "write_durably",
 ]
 
 
-class Holding(NamedTuple):
-    """Whose records a folder holds: all of a recorder's, or those of one `episode` that the database refused."""
+class FolderName(NamedTuple):
+    """A folder's name: of a recorder's folder, or of the dead letters of one `episode` of that recorder."""
 
     recorder: EpisodeId
     episode: EpisodeId | None
 
 
-def held_by(name: str) -> Holding:
-    """What a folder of this name holds. Raises `ValueError` for what is no name of ours."""
+def parse_folder_name(name: str) -> FolderName:
+    """Parse the name of a recorder's folder or of a folder of dead letters. Raises `ValueError` for any other name."""
     recorder, dot, rest = name.partition(".")
     if not dot:
-        return Holding(parse_episode_id(recorder), None)
+        return FolderName(parse_episode_id(recorder), None)
     if not rest.endswith(REFUSED):
         raise ValueError(name)
-    return Holding(parse_episode_id(recorder), parse_episode_id(rest.removesuffix(REFUSED)))
+    return FolderName(parse_episode_id(recorder), parse_episode_id(rest.removesuffix(REFUSED)))
 
 
 @contextmanager
-def available(path: Path) -> Iterator[None]:
-    """What the operating system refuses inside becomes a `SpoolUnavailable` that names its own path."""
+def wrap_os_errors(path: Path) -> Iterator[None]:
+    """Convert an `OSError` raised inside to a `SpoolUnavailable` that names the path in the error, else `path`."""
     try:
         yield
     except OSError as error:
@@ -62,46 +62,46 @@ def available(path: Path) -> Iterator[None]:
         raise SpoolUnavailable(where, error.strerror or str(error)) from error
 
 
-def fault_in(folder: Path, error: Exception) -> PycrormError:
-    """The error of one folder as an error of this package that names it: the other folders are not concerned."""
+def folder_error(folder: Path, error: Exception) -> PycrormError:
+    """Convert an error met in one folder to an error of this package that names the folder."""
     if isinstance(error, PycrormError):
         return error
     return SpoolUnavailable(folder, f"cannot be read: {type(error).__name__}: {error}")
 
 
 def make_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, FileLock]:
-    """A new folder below the spool, which is made if need be, and its `alive`. Raises `SpoolUnavailable`."""
+    """Create a recorder's folder, and the spool if missing; return it with its `alive`. Raises `SpoolUnavailable`."""
     unfinished, alive = begin_folder(spool, name, access)
     return finish_folder(unfinished), alive
 
 
 def begin_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, FileLock]:
-    """The same under an unfinished name, which no process that drains looks at. Raises `SpoolUnavailable`."""
+    """Create the folder under an unfinished name, which draining processes ignore. Raises `SpoolUnavailable`."""
     unfinished = spool / f"{name}{MAKING}"
-    with available(spool):
+    with wrap_os_errors(spool):
         check_file_system(spool)
         create_spool(spool, access)
         create_folder(unfinished)
         alive = FileLock.take(unfinished / ALIVE)
         if alive is None:
-            raise SpoolUnavailable(unfinished, "was taken away while it was being made")
+            raise SpoolUnavailable(unfinished, "was deleted while it was being created")
     return unfinished, alive
 
 
-def finish_folder(unfinished: Path, *, instead_of: Path | None = None) -> Path:
-    """Give the folder its name; `instead_of` is no recorder's folder any more then. Raises `SpoolUnavailable`."""
+def finish_folder(unfinished: Path, *, replaced: Path | None = None) -> Path:
+    """Give the folder its final name and take `alive` from the folder it replaces. Raises `SpoolUnavailable`."""
     folder = unfinished.with_name(unfinished.name.removesuffix(MAKING))
-    with available(folder):
+    with wrap_os_errors(folder):
         unfinished.rename(folder)
-        if instead_of is not None:  # at once: recovery ends the open episodes of both, and of one they go on
-            (instead_of / ALIVE).unlink(missing_ok=True)
+        if replaced is not None:  # immediately: recovering it would end episodes that continue in the new folder
+            (replaced / ALIVE).unlink(missing_ok=True)
         sync_folder(folder.parent)
         sync_folder(folder.parent.parent)
     return folder
 
 
 def remove_folder(folder: Path) -> None:
-    """Deletes what is ours in it, and the folder unless somebody else left something there. Raises `OSError`."""
+    """Delete our files in the folder, and the folder unless it contains files of others. Raises `OSError`."""
     remove_made_ahead(folder)
     for number in segment_numbers(folder):  # the oldest first
         segment_path(folder, number).unlink()
@@ -115,8 +115,10 @@ def remove_folder(folder: Path) -> None:
 
 
 def remove_made_ahead(folder: Path) -> None:
-    """Delete the segments that hold nothing yet, before those in use go: one that a kill left alone would look as if
-    its header were lost. Raises `OSError`."""
+    """Delete the preallocated segments without a header. Raises `OSError`.
+
+    Call this before deleting segments in use: if a kill left only a preallocated one, its header would seem lost.
+    """
     for path in [segment_path(folder, number) for number in segment_numbers(folder)]:
         if not _is_begun(path):
             path.unlink()
@@ -127,8 +129,8 @@ def _is_begun(segment: Path) -> bool:
         return file.read(1) != b"\0"
 
 
-def write_safely(path: Path, content: bytes) -> None:
-    """The file holds this, all of it or what it held before, also after a power cut. Raises `OSError`."""
+def write_durably(path: Path, content: bytes) -> None:
+    """Replace a file's content atomically, also across a power cut. Raises `OSError`."""
     unfinished = path.with_name(f"{path.name}{MAKING}")
     with rewrite(unfinished) as file:
         file.write(content)

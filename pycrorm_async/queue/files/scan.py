@@ -1,7 +1,21 @@
-"""What of a dead recorder's folder is kept: everything up to the first hole. Reads, and changes nothing.
+"""Scan a dead recorder's segments: keep every record up to the first hole, and tell a torn tail from damage.
 
-Behind the hole is a torn tail that no sync ever covered, unless a commit frame says that something in the hole was safe
-once: that is damage and raises. Ordinary records behind the hole prove nothing, for pages reach a disk in any order.
+**Theory of operation.** The scanning process holds `alive` and `drain`, so no segment changes during a scan, except
+where a report examines a living recorder. `SegmentScanner` reads one segment per step, the oldest first, and checks
+every frame: salt and checksum (`decode_each`), the next position, the next sequence of its episode, and for a commit
+frame the checksum of the records it covers. The scanner stops at the first byte where no next record decodes, the
+*cut*. The records before the cut are the `ValidPrefix`.
+
+A sync appends its commit frame only after its records are on the disk. So a commit frame behind the cut that covers a
+position behind the cut proves that a synced record is missing: the folder is damaged and the scanner raises
+`SpoolDamaged`. Ordinary records behind the cut prove nothing, because pages reach the disk in any order: they belong to
+a torn tail that no sync covered. Therefore the last step searches the rest of the files for commit frames.
+
+Until the scan has finished, only the records that a commit frame covers are certain to be kept (`confirmed`): if damage
+follows, a repair decides about the others. A caller that passes records on during the scan must stop at `confirmed`.
+
+Scanning changes no file. `seal` truncates the files at the cut and first copies the tail to `<segment>.tail`;
+`sync_segments` makes the kept segments durable before their records are passed on.
 """
 
 from __future__ import annotations
@@ -27,12 +41,12 @@ from pycrorm_async.queue.files.frame import (
     span_checksum,
 )
 from pycrorm_async.queue.files.names import TAIL
-from pycrorm_async.queue.files.reader import Cursor, checked_type
-from pycrorm_async.queue.files.recorder_folder import write_safely
+from pycrorm_async.queue.files.reader import Cursor, check_type
+from pycrorm_async.queue.files.recorder_folder import write_durably
 from pycrorm_async.queue.files.segment import (
-    CLOSES,
+    EPISODE_ENDED,
     FORMAT,
-    Last,
+    LastRecord,
     SegmentHeader,
     decode_header,
     format_of,
@@ -51,79 +65,79 @@ __all__ = [
     "scan",
     "survey",
     "whole_frames",
-    "checked_header",
+    "read_header",
     "check_record",
     "seal",
-    "make_safe",
+    "sync_segments",
     "tails",
 ]
 
 _SALT_OFFSET = HEADER_BYTES - 8
-_CLOSES = CLOSES.encode()
+_EPISODE_ENDED = EPISODE_ENDED.encode()
 _DECLARES = "DesignatorTypeDeclared"
 
 
 class ValidPrefix(NamedTuple):
-    """What of a folder is kept.
+    """The records of a folder up to the first hole.
 
     Attributes:
         start: before the first record.
-        cut: behind the last one; what the files hold from here on is not kept. Number 0 if there is nothing at all.
-        bases: by number, the position of each kept segment's first record.
+        cut: behind the last record; the files' content from here on is not kept. Number 0 if there is no segment.
+        bases: position of the first record of each kept segment, by segment number.
         open: the episodes without an end, and the last record of each.
-        numbers: of all segment files, also those behind the cut.
+        numbers: numbers of all segment files, including those behind the cut.
     """
 
     start: Cursor
     cut: Cursor
     bases: dict[int, int]
-    open: dict[EpisodeId, Last]
+    open: dict[EpisodeId, LastRecord]
     numbers: list[int]
 
 
 class Survey(NamedTuple):
-    """What is whole before the damage, if there is any.
+    """The result of a scan that returns damage instead of raising it.
 
     Attributes:
-        kept: all that stands before the damage.
-        damage: where it begins and what it is, or None.
-        unsaid: the checksums of the last kept records, those that no commit frame covers.
+        prefix: the records before the damage.
+        damage: file, offset and reason of the damage, or None.
+        uncommitted: checksums of the last records of the prefix, which no commit frame covers.
     """
 
-    kept: ValidPrefix
+    prefix: ValidPrefix
     damage: SpoolDamaged | None
-    unsaid: tuple[int, ...]
+    uncommitted: tuple[int, ...]
 
 
 def scan(folder: Path, recorder: bytes) -> ValidPrefix:
-    """Looks at every byte of the folder's segments once.
+    """Scan the segments of a folder, each byte once.
 
     Raises `SpoolDamaged` with file and offset, `SpoolForeign` for a segment of a newer format or another recorder, and
     `OSError`.
     """
-    kept, damage, _ = survey(folder, recorder)
+    prefix, damage, _ = survey(folder, recorder)
     if damage is not None:
         raise damage
-    return kept
+    return prefix
 
 
-def survey(folder: Path, recorder: bytes, *, seen: Callable[[int, Frame], None] | None = None) -> Survey:
-    """What `scan` looks at, with damage as an answer. `seen` is told of each kept frame and its segment's number."""
-    walk = SegmentScanner(folder, recorder, seen=seen)
+def survey(folder: Path, recorder: bytes, *, on_frame: Callable[[int, Frame], None] | None = None) -> Survey:
+    """Scan as `scan` does, and return damage. Calls `on_frame` with the segment number and each kept frame."""
+    scanner = SegmentScanner(folder, recorder, on_frame=on_frame)
     damage: SpoolDamaged | None = None
     try:
-        while walk.step():
+        while scanner.step():
             pass
-    except SpoolDamaged as found:
-        damage = found
-    return Survey(walk.kept, damage, walk.unsaid)
+    except SpoolDamaged as error:
+        damage = error
+    return Survey(scanner.prefix, damage, scanner.uncommitted)
 
 
 class SegmentScanner:
-    """Goes from the oldest segment to the first hole, a segment at each step.
+    """Scan from the oldest segment to the first hole, one segment per step.
 
-    `seen` is told of each kept frame and its segment's number, `found` is given each kept record.
-    With `segments`, files by number wherever they lie, nothing behind the first hole is looked at.
+    Calls `on_frame` with the segment number and each kept frame, and `on_record` with each kept record. With
+    `segments`, paths by number in any folders, the scan ends at the first hole without searching for commit frames.
     """
 
     def __init__(
@@ -131,14 +145,14 @@ class SegmentScanner:
         folder: Path,
         recorder: bytes,
         *,
-        seen: Callable[[int, Frame], None] | None = None,
-        found: Callable[[Record], None] | None = None,
+        on_frame: Callable[[int, Frame], None] | None = None,
+        on_record: Callable[[Record], None] | None = None,
         segments: Mapping[int, Path] | None = None,
     ) -> None:
         self._folder = folder
         self._recorder = recorder
-        self._seen = seen
-        self._found = found
+        self._on_frame = on_frame
+        self._on_record = on_record
         self._types: dict[bytes, str] = {}
         self._paths = segments
         self._numbers = segment_numbers(folder) if segments is None else sorted(segments)
@@ -146,60 +160,60 @@ class SegmentScanner:
         self._start = self._cut = Cursor(0, 0, 0)
         self._bases: dict[int, int] = {}
         self._open: dict[bytes, tuple[int, int, int]] = {}
-        self._unsaid: list[int] = []  # checksums of the records that no commit frame has covered yet
+        self._uncommitted: list[int] = []  # checksums of the records that no commit frame has covered yet
         self.damage: SpoolDamaged | None = None
-        self.over = False
+        self.finished = False
 
     def step(self) -> bool:
-        """Looks at one more segment; False when there is no more to look at: then nothing that was safe is missing.
+        """Scan one more segment; False when the scan has finished and no synced record is missing.
 
         Raises as `scan` does.
         """
         if self.damage is not None:
             raise self.damage
-        if self.over:
+        if self.finished:
             return False
         try:
-            if self._steps < len(self._numbers) and self._enter(self._numbers[self._steps]):
+            if self._steps < len(self._numbers) and self._scan_segment(self._numbers[self._steps]):
                 self._steps += 1
                 return True
             if self._paths is None:
-                _refuse_damage(self._folder, self._recorder, self.kept)
+                _refuse_damage(self._folder, self._recorder, self.prefix)
         except SpoolDamaged as damage:
             self.damage = damage
             raise
         except (PycrormError, OSError):
             raise
-        except Exception as error:  # bytes that this code does not foresee concern this folder alone
-            place = segment_path(self._folder, self._cut.number)
-            self.damage = SpoolDamaged(place, self._cut.offset, f"{type(error).__name__}: {error}")
+        except Exception as error:  # an unforeseen content must fail this folder alone, as damage
+            path = segment_path(self._folder, self._cut.number)
+            self.damage = SpoolDamaged(path, self._cut.offset, f"{type(error).__name__}: {error}")
             raise self.damage from error
-        self.over = True
+        self.finished = True
         return False
 
     @property
-    def kept(self) -> ValidPrefix:
-        """All before the cut, as far as it has gone."""
-        opened = {EpisodeId(episode): Last(*last) for episode, last in self._open.items()}
+    def prefix(self) -> ValidPrefix:
+        """The records scanned so far."""
+        opened = {EpisodeId(episode): LastRecord(*last) for episode, last in self._open.items()}
         return ValidPrefix(self._start, self._cut, self._bases, opened, self._numbers)
 
     @property
-    def settled(self) -> int:
-        """The position up to which all is kept whatever is found further on: a commit frame says that it was safe."""
-        return self._cut.position - (0 if self.over else len(self._unsaid))
+    def confirmed(self) -> int:
+        """The position up to which records are kept even if damage follows, because a commit frame covers them."""
+        return self._cut.position - (0 if self.finished else len(self._uncommitted))
 
     @property
-    def unsaid(self) -> tuple[int, ...]:
-        return tuple(self._unsaid)
+    def uncommitted(self) -> tuple[int, ...]:
+        return tuple(self._uncommitted)
 
-    def _enter(self, number: int) -> bool:
-        """Goes through one segment; False if it does not go on where the one before ended."""
+    def _scan_segment(self, number: int) -> bool:
+        """Scan one segment; False if it does not continue the one before."""
         path = segment_path(self._folder, number) if self._paths is None else self._paths[number]
         buffer = read_segment(path)
-        header = checked_header(path, buffer, recorder=self._recorder, number=number)
+        header = read_header(path, buffer, recorder=self._recorder, number=number)
         if not self._bases:
             if header is None and number > 1:
-                raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are gone")
+                raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are deleted")
             base = 1 if header is None else header.base
             self._start = self._cut = Cursor(number, header_bytes(0), base - 1)
         if header is None or number != self._cut.number + bool(self._bases) or header.base != self._cut.position + 1:
@@ -210,12 +224,18 @@ class SegmentScanner:
             self._open = dict(header.open.items())
         self._bases[number] = header.base
         self._cut = Cursor(number, first, header.base - 1)
-        self._go_through(path, buffer, number)
+        self._scan_records(path, buffer, number)
         return True
 
-    def _go_through(self, path: Path, buffer: Buffer, number: int) -> None:
-        """Keeps a segment's records from the cut on, up to the first hole or damage; there is the cut then."""
-        opened, unsaid, seen, found, types = self._open, self._unsaid, self._seen, self._found, self._types
+    def _scan_records(self, path: Path, buffer: Buffer, number: int) -> None:
+        """Keep a segment's records from the cut to the first hole or damage, and move the cut there."""
+        opened, uncommitted, on_frame, on_record, types = (
+            self._open,
+            self._uncommitted,
+            self._on_frame,
+            self._on_record,
+            self._types,
+        )
         _, offset, position = self._cut
         try:
             for frame in decode_each(buffer, offset, salt_of(self._recorder, number)):
@@ -226,40 +246,40 @@ class SegmentScanner:
                 elif at == position + 1:
                     type_name = types.get(name)
                     if type_name is None:
-                        type_name = types[name] = checked_type(path, offset, name)
+                        type_name = types[name] = check_type(path, offset, name)
                     if kind == EVENT:
                         before = opened.get(episode)
                         if sequence != (before[0] if before else 0) + 1:
                             raise _not_next(path, offset, episode, sequence, before)
                         opened[episode] = (sequence, wall_ns, monotonic_ns)
-                        if name == _CLOSES:
+                        if name == _EPISODE_ENDED:
                             del opened[episode]
                     else:
                         _check_declaration(path, offset, type_name, payload)
-                    unsaid.append(checksum)
+                    uncommitted.append(checksum)
                     position = at
-                    if found is not None:
+                    if on_record is not None:
                         owner = episode if kind == EVENT else None
                         values = (at, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
-                        found(make(Record, values))
+                        on_record(make(Record, values))
                 else:
                     break
                 offset += size
-                if seen is not None:
-                    seen(number, make(Frame, frame))
+                if on_frame is not None:
+                    on_frame(number, make(Frame, frame))
         finally:
             self._cut = Cursor(number, offset, position)
 
     def _check_commit(self, path: Path, frame: Frame) -> None:
-        """The records it covers are all here and are those it was written for."""
+        """Check that the records a commit frame covers are present and unchanged."""
         later = self._cut.position - frame.position
         if later < 0:
-            raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was safe and is missing")
-        covered = self._unsaid[: max(0, len(self._unsaid) - later)]
-        gone = frame.sequence - len(covered)  # more than 0: segments with records it covers are stored and deleted
-        if gone < 0 or (gone == 0 and frame.payload != CHECKSUM.pack(span_checksum(covered))):
-            raise SpoolDamaged(path, self._cut.offset, "the records before are not those that were safe here")
-        del self._unsaid[: len(covered)]
+            raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was synced and is missing")
+        covered = self._uncommitted[: max(0, len(self._uncommitted) - later)]
+        deleted = frame.sequence - len(covered)  # records it covers in segments that are stored and deleted
+        if deleted < 0 or (deleted == 0 and frame.payload != CHECKSUM.pack(span_checksum(covered))):
+            raise SpoolDamaged(path, self._cut.offset, "the records before it differ from those that were synced")
+        del self._uncommitted[: len(covered)]
 
 
 def _not_next(
@@ -270,18 +290,18 @@ def _not_next(
 
 
 def check_record(path: Path, offset: int, frame: Frame) -> None:
-    """Raises `SpoolDamaged` for the frame of a record that no recorder writes, though its checksum is right."""
-    type_name = checked_type(path, offset, frame.type)
+    """Raise `SpoolDamaged` for a frame that no recorder writes although its checksum is right."""
+    type_name = check_type(path, offset, frame.type)
     if frame.kind != EVENT:
         _check_declaration(path, offset, type_name, frame.payload)
 
 
 def _check_declaration(path: Path, offset: int, type_name: str, payload: bytes) -> None:
-    """The database refuses one episode alone, but what belongs to none would keep all that follows from it."""
+    """Check a record without an episode: dead-lettering cannot skip it, so a bad one would block the whole folder."""
     if type_name != _DECLARES:
         raise SpoolDamaged(path, offset, f"holds a {type_name} that belongs to no episode")
     if b"\0" in payload or not _is_utf8(payload):
-        raise SpoolDamaged(path, offset, "the declaration is not text that a database can hold")
+        raise SpoolDamaged(path, offset, "the declaration is not valid UTF-8 without NUL, so no database can store it")
 
 
 def _is_utf8(payload: bytes) -> bool:
@@ -292,11 +312,11 @@ def _is_utf8(payload: bytes) -> bool:
     return True
 
 
-def checked_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
-    """The header of a segment; None if it was never begun, or torn. Raises `SpoolForeign` for one that is not ours."""
-    written_in = format_of(buffer)
-    if written_in is not None and written_in > FORMAT:
-        raise SpoolForeign(f"{path} is in format {written_in} of a newer program; this one reads format {FORMAT}")
+def read_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
+    """Decode a segment's header; None if it is preallocated or torn. Raises `SpoolForeign` for another recorder's."""
+    format_number = format_of(buffer)
+    if format_number is not None and format_number > FORMAT:
+        raise SpoolForeign(f"{path} is in format {format_number} of a newer program; this one reads format {FORMAT}")
     header = decode_header(buffer)
     if header is not None and (header.recorder, header.number) != (recorder, number):
         raise SpoolForeign(f"{path} is segment {header.number} of recorder {episode_text(EpisodeId(header.recorder))}")
@@ -304,59 +324,59 @@ def checked_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) 
 
 
 def whole_frames(buffer: Buffer, start: int, salt: int) -> Iterator[tuple[int, Frame]]:
-    """Every frame from `start` on and its offset, whatever lies between them."""
+    """Find every frame from `start` on, with its offset, whatever bytes lie between them."""
     salted = CHECKSUM.pack(salt)
     end = start
-    found = buffer.find(salted, start)
-    while found >= 0:
-        offset = found - _SALT_OFFSET
+    index = buffer.find(salted, start)
+    while index >= 0:
+        offset = index - _SALT_OFFSET
         if offset >= end and offset % 8 == 0 and (frame := decode(buffer, offset, salt)) is not None:
             yield offset, frame
             end = offset + frame.size
-        found = buffer.find(salted, max(found + 1, end))
+        index = buffer.find(salted, max(index + 1, end))
 
 
-def _refuse_damage(folder: Path, recorder: bytes, kept: ValidPrefix) -> None:
-    """Raises if anything behind the cut says that something in the hole was safe."""
-    for number in kept.numbers:
-        if number < kept.cut.number:
+def _refuse_damage(folder: Path, recorder: bytes, prefix: ValidPrefix) -> None:
+    """Raise `SpoolDamaged` if a commit frame behind the cut covers a record that is missing."""
+    for number in prefix.numbers:
+        if number < prefix.cut.number:
             continue
         path = segment_path(folder, number)
-        start = kept.cut.offset if number == kept.cut.number else 0
+        start = prefix.cut.offset if number == prefix.cut.number else 0
         for offset, frame in whole_frames(read_segment(path), start, salt_of(recorder, number)):
-            if frame.kind == COMMIT and frame.position > kept.cut.position:
+            if frame.kind == COMMIT and frame.position > prefix.cut.position:
                 raise SpoolDamaged(
-                    segment_path(folder, kept.cut.number),
-                    kept.cut.offset,
-                    f"position {kept.cut.position + 1} is missing, and {path.name} says at byte {offset} that all up"
-                    f" to position {frame.position} was safe",
+                    segment_path(folder, prefix.cut.number),
+                    prefix.cut.offset,
+                    f"position {prefix.cut.position + 1} is missing, although the commit frame at byte {offset} of"
+                    f" {path.name} covers all records up to position {frame.position}",
                 )
 
 
-def seal(folder: Path, kept: ValidPrefix) -> None:
-    """Cuts the files where the records end; what is cut off is copied aside first, to `<segment>.tail`.
+def seal(folder: Path, prefix: ValidPrefix) -> None:
+    """Truncate the files at the cut; first copy the bytes behind it to `<segment>.tail`.
 
-    Twice is once, and killed at any point it can be done again. Raises `OSError`.
+    Idempotent, and can be repeated after a kill at any point. Raises `OSError`.
     """
-    for path, tail in tails(folder, kept):
+    for path, tail in tails(folder, prefix):
         if tail:
-            write_safely(path.with_name(f"{path.name}{TAIL}"), tail)
-    for number in kept.numbers:
+            write_durably(path.with_name(f"{path.name}{TAIL}"), tail)
+    for number in prefix.numbers:
         path = segment_path(folder, number)
-        if number > kept.cut.number:
+        if number > prefix.cut.number:
             path.unlink(missing_ok=True)
-        elif number == kept.cut.number:
+        elif number == prefix.cut.number:
             with path.open("rb+") as file:
-                file.truncate(kept.cut.offset)
+                file.truncate(prefix.cut.offset)
                 os.fsync(file.fileno())
     sync_folder(folder)
 
 
-def make_safe(folder: Path, numbers: Iterable[int]) -> None:
-    """These segments are on the disk, the first of them first. Raises `OSError`.
+def sync_segments(folder: Path, numbers: Iterable[int]) -> None:
+    """Sync these segments to the disk, in this order. Raises `OSError`.
 
-    A killed process' last records are there for all who read, and yet may be nowhere but in the page cache. If they
-    were given away like this and lost in a power cut, the log would hold events that the next computed ends replace.
+    The last records of a killed process are readable but may exist only in the page cache. If such records were stored
+    and then lost in a power cut, the next recovery would compute ends with the sequences of events in the log.
     """
     for number in numbers:
         descriptor = os.open(segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
@@ -367,11 +387,11 @@ def make_safe(folder: Path, numbers: Iterable[int]) -> None:
     sync_folder(folder)
 
 
-def tails(folder: Path, kept: ValidPrefix) -> list[tuple[Path, bytes]]:
-    """For each file that reaches behind the cut what is there, without the zeros at its end. Raises `OSError`."""
-    cut = kept.cut
+def tails(folder: Path, prefix: ValidPrefix) -> list[tuple[Path, bytes]]:
+    """Return each file that extends behind the cut and its bytes there, without trailing zeros. Raises `OSError`."""
+    cut = prefix.cut
     return [
         (path, read_segment(path)[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
-        for number in kept.numbers
+        for number in prefix.numbers
         if number >= cut.number and (path := segment_path(folder, number)).exists()
     ]

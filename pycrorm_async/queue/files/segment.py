@@ -1,7 +1,7 @@
-"""One segment file: its header, and the file itself, allocated ahead and mapped.
+"""Encode and decode a segment's header; allocate, map and sync the segment file.
 
-The whole file has its blocks before anything is mapped, so a full disk is an `OSError` while allocating and never a
-SIGBUS while writing. It gets its name only when that is safe on the disk.
+A file gets all its blocks before it is mapped, so that a full disk raises `OSError` during allocation and never a
+SIGBUS during a write. It gets its name only after its allocation is on the disk.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from pycrorm_async.queue.files.locks import FileIdentity
 
 __all__ = [
     "FORMAT",
-    "OPENS",
-    "CLOSES",
+    "EPISODE_STARTED",
+    "EPISODE_ENDED",
     "SEGMENT_BYTES_MAX",
-    "Last",
+    "LastRecord",
     "SegmentHeader",
     "Segment",
     "header_bytes",
@@ -45,19 +45,19 @@ __all__ = [
 MAGIC: Final = b"PYCRQSEG"
 FORMAT: Final = 1
 SUFFIX: Final = ".segment"
-OPENS: Final = "EpisodeStarted"
-CLOSES: Final = "EpisodeEnded"
+EPISODE_STARTED: Final = "EpisodeStarted"
+EPISODE_ENDED: Final = "EpisodeEnded"
 SEGMENT_BYTES_MAX: Final = 2**30
-"""No segment is larger, so that reading one never takes more memory than this: 128 times the default."""
+"""Bounds the memory needed to read a segment: 128 times the default size."""
 _HEADER: Final = Struct("<8sII16sQQI")
 _CHECKSUM: Final = Struct("<I")
 _POSITION_MAX: Final = 2**62
-"""No recorder gets so far; a header that says so was changed."""
+"""Bounds the position in a header: no recorder reaches it, so a header above it was changed."""
 _FIXED: Final = _HEADER.size + _CHECKSUM.size
 _OPEN: Final = Struct("<16sQqq")
 
 
-class Last(NamedTuple):
+class LastRecord(NamedTuple):
     """The last record of an open episode."""
 
     sequence: int
@@ -66,26 +66,26 @@ class Last(NamedTuple):
 
 
 class SegmentHeader(NamedTuple):
-    """Where a segment belongs: `base` is the position of its first record, `open` the episodes open before it."""
+    """The header: `base` is the position of the segment's first record, `open` the episodes open before it."""
 
     recorder: bytes
     number: int
     base: int
-    open: Mapping[EpisodeId, Last]
+    open: Mapping[EpisodeId, LastRecord]
 
 
 def header_bytes(episodes: int) -> int:
-    """The size of a header that names so many open episodes."""
+    """Return the size of a header that lists this many open episodes."""
     return _FIXED + episodes * _OPEN.size
 
 
 def salt_of(recorder: bytes, number: int) -> int:
-    """What every frame of this segment carries, and no frame of another."""
+    """Return the salt of a segment: each of its frames carries it, and no frame of another segment does."""
     return crc32(number.to_bytes(8, "little"), crc32(recorder))
 
 
 def encode_header(header: SegmentHeader) -> bytes:
-    """The bytes at the begin of a segment."""
+    """Encode a segment's header."""
     episodes = b"".join(_OPEN.pack(episode, *last) for episode, last in header.open.items())
     fixed = _HEADER.pack(
         MAGIC,
@@ -100,14 +100,14 @@ def encode_header(header: SegmentHeader) -> bytes:
 
 
 def format_of(buffer: Buffer) -> int | None:
-    """The format this segment was written in, or None where no header of any format begins."""
+    """Return the format in the header, or None if the buffer begins with no header of any format."""
     if len(buffer) < _FIXED or buffer[: len(MAGIC)] != MAGIC:
         return None
     return int.from_bytes(buffer[8:12], "little")
 
 
 def decode_header(buffer: Buffer) -> SegmentHeader | None:
-    """The header, or None: made ahead and never begun, torn, or changed."""
+    """Decode the header; None for a preallocated segment and for a torn or changed header."""
     if format_of(buffer) != FORMAT:
         return None
     fixed = buffer[: _HEADER.size]
@@ -119,26 +119,26 @@ def decode_header(buffer: Buffer) -> SegmentHeader | None:
     (checksum,) = _CHECKSUM.unpack_from(buffer, _HEADER.size)
     if crc32(fixed, crc32(episodes)) != checksum or salt != salt_of(recorder, number):
         return None
-    opened = {EpisodeId(episode): Last(*last) for episode, *last in _OPEN.iter_unpack(episodes)}
+    opened = {EpisodeId(episode): LastRecord(*last) for episode, *last in _OPEN.iter_unpack(episodes)}
     if not 0 < base <= _POSITION_MAX or any(not 0 < last.sequence <= SEQUENCE_MAX for last in opened.values()):
         return None
     return SegmentHeader(recorder, number, base, opened)
 
 
 def segment_path(folder: Path, number: int) -> Path:
-    """The file of this number; names sort as numbers do up to 10⁸ segments."""
+    """Return the path of a segment; names sort as numbers do up to 10⁸ segments."""
     return folder / f"{number:08d}{SUFFIX}"
 
 
 def segment_numbers(folder: Path) -> list[int]:
-    """The numbers of the segments in this folder, in order. Files of other names are not ours to judge."""
+    """Return the numbers of the segments in this folder, in order. Files of other names are ignored."""
     stems = (path.name.removesuffix(SUFFIX) for path in folder.iterdir() if path.suffix == SUFFIX)
     numbers = ((stem, int(stem)) for stem in stems if stem.isascii() and stem.isdigit())
     return sorted(number for stem, number in numbers if 0 < number < 2**64 and stem == f"{number:08d}")
 
 
 def read_segment(path: Path) -> bytes:
-    """The bytes of a segment that no process writes any more.
+    """Read a segment that no process writes any more.
 
     Raises `SpoolDamaged` for a file larger than any segment, and `OSError`.
     """
@@ -148,7 +148,7 @@ def read_segment(path: Path) -> bytes:
 
 
 def map_segment(path: Path) -> mmap.mmap:
-    """The bytes of a segment, shared with the process that writes it. Raises as `read_segment` does."""
+    """Map a segment read-only, shared with the process that writes it. Raises as `read_segment` does."""
     descriptor, size = _open_segment(path)
     try:
         if size == 0:
@@ -159,7 +159,7 @@ def map_segment(path: Path) -> mmap.mmap:
 
 
 def _open_segment(path: Path) -> tuple[int, int]:
-    """The descriptor and the size of a regular file; opening a pipe of that name must not wait for its writer."""
+    """Open a regular file; return descriptor and size. O_NONBLOCK keeps a FIFO from blocking the caller."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     status = os.fstat(descriptor)
     if stat.S_ISREG(status.st_mode) and status.st_size <= SEGMENT_BYTES_MAX:
@@ -170,12 +170,12 @@ def _open_segment(path: Path) -> tuple[int, int]:
     if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "is not a regular file", str(path))
     raise SpoolDamaged(
-        path, SEGMENT_BYTES_MAX, f"it takes {status.st_size:,} bytes, and a segment at most {SEGMENT_BYTES_MAX:,}"
+        path, SEGMENT_BYTES_MAX, f"it has {status.st_size:,} bytes; a segment has at most {SEGMENT_BYTES_MAX:,}"
     )
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes the names in a folder safe. Raises `OSError`."""
+    """Sync the directory entries of a folder. Raises `OSError`."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -184,7 +184,7 @@ def sync_folder(folder: Path) -> None:
 
 
 class Segment:
-    """A segment this process writes: `buffer` is its bytes, shared with the file."""
+    """A segment that this process writes: `buffer` is its mapping."""
 
     __slots__ = ("buffer", "descriptor", "identity", "number", "path")
 
@@ -197,7 +197,7 @@ class Segment:
 
     @classmethod
     def allocate(cls, folder: Path, *, number: int, size: int) -> Segment:
-        """A new file of zeros, safe on the disk under its name. Raises `OSError` and leaves nothing behind."""
+        """Create a file of zeros, synced together with its name. Raises `OSError` and then leaves no file behind."""
         path = segment_path(folder, number)
         unfinished = path.with_suffix(".making")
         descriptor = open_file(unfinished, os.O_RDWR | os.O_TRUNC)
@@ -215,22 +215,22 @@ class Segment:
         return cls(number=number, path=path, descriptor=descriptor, buffer=buffer)
 
     def begin(self, header: SegmentHeader) -> int:
-        """Writes the header and returns where the first frame goes."""
+        """Write the header; return the offset of the first frame."""
         encoded = encode_header(header)
         self.buffer[: len(encoded)] = encoded
         return len(encoded)
 
     def sync(self) -> None:
-        """Everything in the mapping is on the disk. Raises `OSError`, after which nothing about it is known."""
+        """Write the mapping to the disk. Raises `OSError`; then the content on the disk is unknown."""
         os.fdatasync(self.descriptor)
 
     @property
     def is_in_place(self) -> bool:
-        """Whether the file still has its name: syncing one that was deleted succeeds."""
+        """Return whether the file still has its name; a sync does not show it, because a deleted file syncs too."""
         return self.identity.is_at(self.path)
 
     def close(self) -> None:
-        """Gives up the mapping and the file; what was written stays. Twice is once."""
+        """Close the mapping and the file. Idempotent."""
         if self.descriptor >= 0:
             self.buffer.close()
             os.close(self.descriptor)

@@ -34,14 +34,21 @@ from pycrorm_async.queue.files.frame import (
     encode_commit,
     encode_header,
 )
-from pycrorm_async.queue.files.segment import CLOSES, OPENS, Last, Segment, SegmentHeader, salt_of
+from pycrorm_async.queue.files.segment import (
+    EPISODE_ENDED,
+    EPISODE_STARTED,
+    LastRecord,
+    Segment,
+    SegmentHeader,
+    salt_of,
+)
 from pycrorm_async.queue.live.capacity import Capacity
-from pycrorm_async.queue.live.declarations import Declarations, Repeated
+from pycrorm_async.queue.live.declarations import AppendState, Declarations
 from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
 
-__all__ = ["Appender", "Span", "Begun"]
+__all__ = ["Appender", "Span", "SegmentStart"]
 
-NOTHING_OPEN: Final[Mapping[EpisodeId, Last]] = MappingProxyType({})
+NOTHING_OPEN: Final[Mapping[EpisodeId, LastRecord]] = MappingProxyType({})
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _NOT_NOW = _FULL | frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
 
@@ -55,13 +62,13 @@ class Span(NamedTuple):
     segments: tuple[Segment, ...]
 
 
-class Begun(NamedTuple):
+class SegmentStart(NamedTuple):
     """A segment that holds records from position `base` on; `opened` are the episodes open before them."""
 
     number: int
     base: int
     path: Path
-    opened: Mapping[EpisodeId, Last]
+    opened: Mapping[EpisodeId, LastRecord]
 
 
 class Appender:
@@ -82,7 +89,7 @@ class Appender:
         hurry: Callable[[], None],
         make_room: Callable[[int], bool],
         after: int = 0,
-        opened: Mapping[EpisodeId, Last] = NOTHING_OPEN,
+        opened: Mapping[EpisodeId, LastRecord] = NOTHING_OPEN,
     ) -> None:
         self._folder = folder
         self._recorder = recorder
@@ -92,14 +99,14 @@ class Appender:
         self._wake = wake
         self._hurry = hurry
         self._make_room = make_room
-        self._alone = GcSafeLock()
+        self._gc_lock = GcSafeLock()
         self._making = threading.Lock()
         self._type_names: dict[str, bytes] = {}
 
         self.position = after
         self.declarations = Declarations()
         self.open: dict[EpisodeId, tuple[int, int, int]] = dict(opened)
-        self.begun: list[Begun] = []
+        self.begun: list[SegmentStart] = []
         self._refusal: Callable[[], PycrormError] | None = None
         self.stuck: str | None = None  # why nothing will be trimmed any more
         self._span_count = 0
@@ -123,7 +130,7 @@ class Appender:
         body = encode_body(name, payload)
         body_checksum = crc32(body)
         kind, owner, sequence = EVENT, episode or NO_EPISODE, 0
-        alone, me = self._alone, get_ident()
+        alone, me = self._gc_lock, get_ident()
         if alone.owner == me:
             raise alone.reentered()
         try:
@@ -139,7 +146,7 @@ class Appender:
                         self._declare(body, len(name), version, len(payload))
                     elif (last := self.open.get(episode)) is not None:
                         sequence = last[0] + 1
-                    elif type_name == OPENS:
+                    elif type_name == EPISODE_STARTED:
                         self._refuse_one_too_many()
                         sequence = 1
                     else:
@@ -177,7 +184,7 @@ class Appender:
                     self._span_checksum = span_checksum
                     if episode is not None:
                         self.open[episode] = (sequence, wall_ns, monotonic_ns)
-                        if type_name == CLOSES:
+                        if type_name == EPISODE_ENDED:
                             del self.open[episode]
 
                     if self._quiet:
@@ -215,7 +222,7 @@ class Appender:
             raise InternalError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
         if not self._admits(frame_bytes, reserved=reserved):
             self._refused_bytes = max(self._refused_bytes, frame_bytes)
-            raise self.fullness(self._disk_refused or "spool_bytes_max is reached")
+            raise self.full_error(self._disk_refused or "spool_bytes_max is reached")
         if self._offset + frame_bytes > self._end:
             self._roll()
 
@@ -234,12 +241,12 @@ class Appender:
     def _begin(self, segment: Segment) -> None:
         """This segment is the current one from now on."""
         base = self.position + 1
-        open_before = {episode: Last(*last) for episode, last in self.open.items()}
+        open_before = {episode: LastRecord(*last) for episode, last in self.open.items()}
         offset = segment.begin(SegmentHeader(self._recorder, segment.number, base, open_before))
         salt = salt_of(self._recorder, segment.number)
-        before = Repeated(offset, self.position, self._span_count, self._span_checksum)
+        before = AppendState(offset, self.position, self._span_count, self._span_checksum)
         repeated = self.declarations.write(segment.buffer, before, salt=salt, clock=self._clock)
-        begun = [*self.begun, Begun(segment.number, base, segment.path, open_before)]
+        begun = [*self.begun, SegmentStart(segment.number, base, segment.path, open_before)]
         sealed = [*self._sealed, self._current] if self.begun else []
         # As in `put`: nothing is called between these steps.
         self._current = segment
@@ -256,7 +263,7 @@ class Appender:
 
     def begin_sync(self) -> Span:
         """What is there now; the next record begins a new span and wakes the sync thread again."""
-        return self._alone.run(self._begin_sync)
+        return self._gc_lock.run(self._begin_sync)
 
     def _begin_sync(self) -> Span:
         span = Span(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
@@ -266,7 +273,7 @@ class Appender:
 
     def append_commit(self, span: Span) -> Segment:
         """Appends the frame that says the span is on the disk; returns the segment that holds it, to be synced."""
-        return self._alone.run(partial(self._append_commit, span))
+        return self._gc_lock.run(partial(self._append_commit, span))
 
     def _append_commit(self, span: Span) -> Segment:
         frame = encode_commit(
@@ -285,7 +292,7 @@ class Appender:
 
     def end_sync(self, span: Span) -> None:
         """The files that were full when the span was taken are safe, whole, and need not be open any more."""
-        for segment in self._alone.run(partial(self._end_sync, span)):
+        for segment in self._gc_lock.run(partial(self._end_sync, span)):
             segment.close()
 
     def _end_sync(self, span: Span) -> list[Segment]:
@@ -301,12 +308,12 @@ class Appender:
             return False
         try:
             # Nothing may be put in this thread while it holds `_making`, and it must not hold the other lock so long.
-            self._alone.hold_off()
+            self._gc_lock.hold_off()
             with self._making:
                 refused = self._prepare()
         finally:
-            self._alone.go_on()
-        self._alone.run(partial(self._prepared_or, refused))
+            self._gc_lock.go_on()
+        self._gc_lock.run(partial(self._prepared_or, refused))
         return refused is not None
 
     def _prepare(self) -> str | None:
@@ -325,7 +332,7 @@ class Appender:
         self._set_limits()
         self._forget_refused()
 
-    def trimmable(self, *, stored: int, safe_number: int) -> list[Begun]:
+    def trimmable(self, *, stored: int, safe_number: int) -> list[SegmentStart]:
         """The segments that may go: all in them is stored, and the header after them is safe on the disk."""
         begun = self.begun
         return [
@@ -334,11 +341,11 @@ class Appender:
             if following.base - 1 <= stored and following.number <= safe_number
         ]
 
-    def trimmed(self, gone: list[Begun]) -> None:
+    def trimmed(self, gone: list[SegmentStart]) -> None:
         """These segments are deleted."""
-        self._alone.run(partial(self._trimmed, gone))
+        self._gc_lock.run(partial(self._trimmed, gone))
 
-    def _trimmed(self, gone: list[Begun]) -> None:
+    def _trimmed(self, gone: list[SegmentStart]) -> None:
         self.begun = [segment for segment in self.begun if segment not in gone]
         self._set_limits()
         self._forget_refused()
@@ -348,7 +355,7 @@ class Appender:
         frame_bytes = max(self._refused_bytes, HEADER_BYTES)
         if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
             return True
-        return self._alone.run(partial(self._admits, frame_bytes, reserved=reserved))
+        return self._gc_lock.run(partial(self._admits, frame_bytes, reserved=reserved))
 
     @property
     def end(self) -> int:
@@ -358,9 +365,9 @@ class Appender:
     @property
     def bytes_held(self) -> int:
         """Bytes of segments with records in them; the last one counts as far as it is written."""
-        return self._alone.run(lambda: (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset)
+        return self._gc_lock.run(lambda: (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset)
 
-    def fullness(self, reason: str) -> PycrormError:
+    def full_error(self, reason: str) -> PycrormError:
         """What a put into a full spool raises."""
         if self.stuck is None:
             return SpoolFull(f"spool {self._folder} is full: {reason}")
@@ -405,20 +412,20 @@ class Appender:
         self._disk_refused = reason
         self._set_limits()
         self._hurry()  # the sync thread tries again until there is room
-        return self.fullness(reason)
+        return self.full_error(reason)
 
     # --- ending ------------------------------------------------------------------------------------------------
 
     def refuse(self, refusal: Callable[[], PycrormError]) -> None:
         """No record is taken from now on; the first reason stays."""
-        self._alone.run(partial(self._refuse, refusal))
+        self._gc_lock.run(partial(self._refuse, refusal))
 
     def _refuse(self, refusal: Callable[[], PycrormError]) -> None:
         self._refusal = self._refusal or refusal
 
     def close(self) -> None:
         """Gives up mappings and files, when refusing already."""
-        self._alone.run(self._close)
+        self._gc_lock.run(self._close)
 
     def _close(self) -> None:
         for segment in (*self._sealed, self._current, self._prepared):
@@ -427,7 +434,7 @@ class Appender:
 
     def abandon(self, refusal: Callable[[], PycrormError]) -> None:
         """In a forked child: nothing here is this process's; the locks may be held by threads it does not have."""
-        self._alone.abandon()
-        self._alone, self._making = GcSafeLock(), threading.Lock()
+        self._gc_lock.abandon()
+        self._gc_lock, self._making = GcSafeLock(), threading.Lock()
         self._refusal = refusal
         self.close()

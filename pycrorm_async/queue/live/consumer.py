@@ -20,12 +20,12 @@ from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.names import DRAIN
 from pycrorm_async.queue.files.reader import Batch, Cursor, Reader
-from pycrorm_async.queue.files.recorder_folder import available
+from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
 from pycrorm_async.queue.files.segment import map_segment, segment_path
 from pycrorm_async.queue.live.notifier import Notifier
-from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
-__all__ = ["Consumer", "Place", "Written"]
+__all__ = ["Consumer", "Place", "QueueView"]
 
 
 class Place(NamedTuple):
@@ -36,7 +36,7 @@ class Place(NamedTuple):
     start: Cursor
 
 
-class Written(Protocol):
+class QueueView(Protocol):
     """The queue, as its consumer sees it. All of it is another thread's and may change between two steps."""
 
     @property
@@ -60,13 +60,13 @@ class Written(Protocol):
 class Consumer:
     """Reads, and holds the lock `drain` from its first batch on."""
 
-    def __init__(self, queue: Written, bell: Notifier) -> None:
+    def __init__(self, queue: QueueView, bell: Notifier) -> None:
         self._queue = queue
         self._notifier = bell
         self._place = queue.place
         self._drain: FileLock | None = None
         self._released = False
-        self._refused = RefusedRecords(self._place.folder)
+        self._refused = DeadLetters(self._place.folder)
         self.reader = _reader(self._place)
 
     @property
@@ -105,13 +105,13 @@ class Consumer:
         if place is self._place:
             return
         reader = _reader(place)
-        with available(place.folder):
+        with wrap_os_errors(place.folder):
             reader.skip_to(self.reader.cursor.position)
         self.reader.close()
         self._refused.release()
         if self._drain is not None:
             self._drain.release()
-        self._drain, self._refused = None, RefusedRecords(place.folder)
+        self._drain, self._refused = None, DeadLetters(place.folder)
         self.reader, self._place = reader, place
 
     async def _batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
@@ -134,13 +134,13 @@ class Consumer:
     def _read(self, begun: Batch | None, events_max: int, bytes_max: int) -> Batch:
         if self._queue.place is not self._place:
             raise SpoolUnavailable(self._place.folder, "is not used any more")
-        with available(self._place.folder):
+        with wrap_os_errors(self._place.folder):
             last = self._queue.synced
-            return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, begun=begun)
+            return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, partial=begun)
 
     def _take_drain(self) -> None:
         if self._drain is None and not self._released:
-            with available(self._place.folder):
+            with wrap_os_errors(self._place.folder):
                 self._drain = FileLock.take(self._place.folder / DRAIN)
             if self._drain is None:
                 raise SpoolUnavailable(self._place.folder, "is being drained by another process")

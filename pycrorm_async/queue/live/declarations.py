@@ -12,10 +12,10 @@ from zlib import crc32
 from pycrorm_async.clock import Clock
 from pycrorm_async.queue.files.frame import CHECKSUM_START, DECLARATION, HEADER_BYTES, NO_EPISODE, encode_header
 
-__all__ = ["Declarations", "Repeated"]
+__all__ = ["Declarations", "AppendState"]
 
 
-class Repeated(NamedTuple):
+class AppendState(NamedTuple):
     """What the frames of a segment's beginning come to: where they end, the last position, and of the span that is
     not synced yet how many records it has and their checksum."""
 
@@ -44,7 +44,7 @@ class Declarations:
         self._bodies[body] = name_bytes, version, payload_bytes
         self.bytes += size
 
-    def write(self, buffer: mmap.mmap, begun: Repeated, *, salt: int, clock: Clock) -> Repeated:
+    def write(self, buffer: mmap.mmap, begun: AppendState, *, salt: int, clock: Clock) -> AppendState:
         """Writes their frames from `begun` on, which stands before the first."""
         offset, position, records, checksum = begun
         for body, (name_bytes, version, payload_bytes) in self._bodies.items():
@@ -68,4 +68,4 @@ class Declarations:
             buffer[offset + HEADER_BYTES : end] = body
             offset = end
             checksum = crc32(header[CHECKSUM_START:], checksum)
-        return Repeated(offset, position, records, checksum)
+        return AppendState(offset, position, records, checksum)

@@ -19,8 +19,8 @@ from pycrorm_async.queue.files.drain_status import DrainStatus, DrainStatusReade
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
 from pycrorm_async.queue.files.names import ALIVE
 from pycrorm_async.queue.files.reader import Cursor
-from pycrorm_async.queue.files.recorder_folder import available
-from pycrorm_async.queue.files.segment import Last, Segment, header_bytes
+from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
+from pycrorm_async.queue.files.segment import LastRecord, Segment, header_bytes
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.appender import NOTHING_OPEN
 from pycrorm_async.queue.live.capacity import Capacity
@@ -28,7 +28,7 @@ from pycrorm_async.queue.live.consumer import Place
 from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.live.relocatable_appender import RelocatableAppender
 from pycrorm_async.queue.live.relocation import Home, move
-from pycrorm_async.queue.live.sync_thread import Syncer
+from pycrorm_async.queue.live.sync_thread import SyncThread
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.settings import Settings
 
@@ -72,8 +72,8 @@ class QueueFiles:
         self._safe_number = 0
         self._sync_interval_s = settings.sync_interval_ms / 1000
         self._kept = StoredSegments(folder.parent, settings, wall_ns=clock.wall_ns)
-        self._syncer = Syncer(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
-        with available(folder):
+        self._sync_thread = SyncThread(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
+        with wrap_os_errors(folder):
             self._appender = self._appender_in(folder, recorder)
             self._disk_was_full = self._appender.prepare()
             self._outside = DrainStatusReader(folder) if offered else None
@@ -124,12 +124,12 @@ class QueueFiles:
         """All up to this position are acknowledged."""
         if self._outside is None:
             return self._stored
-        return max(self._stored, self._outside.believed(synced=self._synced).stored)
+        return max(self._stored, self._outside.read(synced=self._synced).stored)
 
     @property
-    def drained_outside(self) -> DrainStatus | None:
+    def external_drain_status(self) -> DrainStatus | None:
         """What the process that drains this queue says, as far as it can be true; None if it is this one."""
-        return None if self._outside is None else self._outside.believed(synced=self._synced)
+        return None if self._outside is None else self._outside.read(synced=self._synced)
 
     @property
     def _over(self) -> bool:
@@ -169,7 +169,7 @@ class QueueFiles:
     def _exchange(self, outside: DrainStatusReader) -> bool:
         """Tells whoever drains this queue what is synced, hears what is stored; False if it could not be told."""
         told = self._tell(outside)
-        said = outside.believed(synced=self._synced)
+        said = outside.read(synced=self._synced)
         self._stored = max(self._stored, said.stored)
         if said.note.given_up != self._appender.stuck:
             self._appender.stuck = said.note.given_up
@@ -230,7 +230,7 @@ class QueueFiles:
         displaced = self._displaced
         assert displaced is not None
         try:
-            with available(self._spool):
+            with wrap_os_errors(self._spool):
                 self._stored = max(self._stored, self.stored)
                 move(
                     self._home,
@@ -274,22 +274,22 @@ class QueueFiles:
         self._safe_number = 0
 
     def _appender_in(
-        self, folder: Path, recorder: bytes, after: int = 0, opened: Mapping[EpisodeId, Last] = NOTHING_OPEN
+        self, folder: Path, recorder: bytes, after: int = 0, opened: Mapping[EpisodeId, LastRecord] = NOTHING_OPEN
     ) -> RelocatableAppender:
         return RelocatableAppender(
             folder=folder,
             recorder=recorder,
             capacity=Capacity.of(self._settings),
             clock=self._clock,
-            wake=self._syncer.wake,
-            hurry=self._syncer.hurry,
+            wake=self._sync_thread.wake,
+            hurry=self._sync_thread.hurry,
             make_room=self._kept.make_room,
             after=after,
             opened=opened,
         )
 
     def _tell(self, outside: DrainStatusReader) -> bool:
-        return outside.tell(synced=self._synced, closed=self._closed and self._synced == self.written)
+        return outside.publish(synced=self._synced, closed=self._closed and self._synced == self.written)
 
     def _trimmable(self) -> bool:
         return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))

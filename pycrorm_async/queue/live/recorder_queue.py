@@ -23,9 +23,9 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.errors import FilesError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.queue.files.locks import FileLock, in_forked_child, is_locked
+from pycrorm_async.queue.files.locks import FileLock, call_in_forked_child, is_locked
 from pycrorm_async.queue.files.names import DRAIN
-from pycrorm_async.queue.files.recorder_folder import available, make_folder, remove_folder, remove_made_ahead
+from pycrorm_async.queue.files.recorder_folder import make_folder, remove_folder, remove_made_ahead, wrap_os_errors
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.consumer import Consumer
@@ -56,8 +56,8 @@ class RecorderQueue(QueueFiles):
         """Used by `create`, which made and locked the folder. Raises `SpoolUnavailable`."""
         super().__init__(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
         self._consumer = Consumer(self, self._notifier)
-        in_forked_child(self._forked)
-        self._syncer.start()
+        call_in_forked_child(self._forked)
+        self._sync_thread.start()
 
     @classmethod
     def create(
@@ -125,7 +125,7 @@ class RecorderQueue(QueueFiles):
 
         False at once in the sync thread, which makes the room: the collector may have closed a plan there.
         """
-        if self._syncer.is_this_thread:
+        if self._sync_thread.is_this_thread:
             return False
         end_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
         decided = self._room_notifier.block_until(
@@ -139,19 +139,19 @@ class RecorderQueue(QueueFiles):
         if self._over or self._appender.stuck is not None or self._appender.admits_again(reserved=reserved):
             return True
         if self._outside is not None:
-            self._syncer.call_in(LOOK_S)
+            self._sync_thread.call_in(LOOK_S)
         return False
 
     def _refuse_to_wait(self, *, reserved: bool) -> None:
         if self._appender.stuck is not None and not self._over and not self._appender.admits_again(reserved=reserved):
-            raise self._appender.fullness("spool_bytes_max is reached")
+            raise self._appender.full_error("spool_bytes_max is reached")
 
     # --- positions ---------------------------------------------------------------------------------------------
 
     @property
     def is_drained(self) -> bool:
         """Whether somebody, here or elsewhere, drains it at this moment."""
-        with available(self.folder):
+        with wrap_os_errors(self.folder):
             return self._consumer.drains or is_locked(self.folder / DRAIN)
 
     @property
@@ -179,7 +179,7 @@ class RecorderQueue(QueueFiles):
             looking = self._displaced is not None
         if self._synced < target or looking:
             self._asked = self._asked or looking
-            self._syncer.hurry()
+            self._sync_thread.hurry()
             await self._notifier.until(
                 lambda: (
                     self._failure is not None
@@ -200,7 +200,7 @@ class RecorderQueue(QueueFiles):
         if self._gone:
             return
         answers, self._asked = self._answers, True
-        self._syncer.hurry()
+        self._sync_thread.hurry()
         await self._notifier.until(
             lambda: self._failure is not None or (self._answers > answers and self._displaced is None)
         )
@@ -225,7 +225,7 @@ class RecorderQueue(QueueFiles):
                 self._log_id = Spool(self._spool).log_id()
         self._stored = max(self._stored, position)
         if self._trimmable():
-            self._syncer.hurry()
+            self._sync_thread.hurry()
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
         """These are refused, and kept in a folder of their episode's own when it returns (`refused.py`): True.
@@ -258,7 +258,7 @@ class RecorderQueue(QueueFiles):
             appender = self._appender
             appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
         self._closed = True
-        self._syncer.hurry()
+        self._sync_thread.hurry()
         self._notifier.notify_all()
         self._room_notifier.notify_all()
 
@@ -271,14 +271,14 @@ class RecorderQueue(QueueFiles):
         if self._gone:
             return
         self.close()
-        if not self._syncer.stop(timeout_s=_LAST_SYNC_S):
+        if not self._sync_thread.stop(timeout_s=_LAST_SYNC_S):
             raise SpoolUnavailable(self.folder, f"the last sync took more than {_LAST_SYNC_S:.0f} s")
         self._gone = True
         self._appender.close()
         try:
             all_stored = self._failure is None and self.stored == self.written and not self._appender.open
             if all_stored and self._home.is_in_place:
-                with available(self.folder):
+                with wrap_os_errors(self.folder):
                     remove_made_ahead(self.folder)
                     self._keep_rest()
                     remove_folder(self.folder)

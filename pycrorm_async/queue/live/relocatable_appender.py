@@ -20,12 +20,12 @@ from pycrorm_async.queue.files.frame import (
     encode_body,
     encode_header,
 )
-from pycrorm_async.queue.files.segment import CLOSES, Segment
+from pycrorm_async.queue.files.segment import EPISODE_ENDED, Segment
 from pycrorm_async.queue.live.appender import Appender
 
 __all__ = ["RelocatableAppender", "Relocated"]
 
-_CLOSES: Final = CLOSES.encode()
+_EPISODE_ENDED: Final = EPISODE_ENDED.encode()
 _LATE_BYTES: Final = 2**16
 """What is carried while the lock is held, at most: half a millisecond's work."""
 
@@ -40,11 +40,11 @@ class RelocatableAppender(Appender):
     @property
     def segments(self) -> tuple[Segment, ...]:
         """Those that are mapped: full ones that no sync covers yet, and the current one."""
-        return self._alone.run(lambda: (*self._sealed, self._current))
+        return self._gc_lock.run(lambda: (*self._sealed, self._current))
 
     def carry(self, record: Fields) -> None:
         """Append a record of another appender with its own position, sequence and times."""
-        self._alone.run(partial(self._carry, record))
+        self._gc_lock.run(partial(self._carry, record))
 
     def hand_over(
         self, successor: RelocatableAppender, segment: Segment, offset: int, *, switch: Callable[[], None]
@@ -54,11 +54,11 @@ class RelocatableAppender(Appender):
         All of it is one step for the threads that put. False, with nothing done, when that would take them longer than
         a moment. Raises `SpoolUnavailable` when the mapping does not hold what was put.
         """
-        return self._alone.run(partial(self._hand_over, successor, segment, offset, switch))
+        return self._gc_lock.run(partial(self._hand_over, successor, segment, offset, switch))
 
     def settle(self, folder: Path) -> None:
         """The folder was renamed to this."""
-        self._alone.run(partial(self._settle, folder))
+        self._gc_lock.run(partial(self._settle, folder))
 
     @property
     def free_bytes(self) -> int:
@@ -94,7 +94,7 @@ class RelocatableAppender(Appender):
         self._span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
         if kind == EVENT:
             self.open[EpisodeId(episode)] = (sequence, wall_ns, monotonic_ns)
-            if name == _CLOSES:
+            if name == _EPISODE_ENDED:
                 del self.open[EpisodeId(episode)]
 
     def _hand_over(

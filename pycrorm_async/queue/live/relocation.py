@@ -36,8 +36,8 @@ from pycrorm_async.queue.files.frame import COMMIT, Buffer, decode_each
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
 from pycrorm_async.queue.files.reader import Cursor
 from pycrorm_async.queue.files.recorder_folder import begin_folder, finish_folder, remove_folder
-from pycrorm_async.queue.files.segment import Last, Segment, decode_header, header_bytes, read_segment, salt_of
-from pycrorm_async.queue.live.appender import Begun
+from pycrorm_async.queue.files.segment import LastRecord, Segment, decode_header, header_bytes, read_segment, salt_of
+from pycrorm_async.queue.live.appender import SegmentStart
 from pycrorm_async.queue.live.consumer import Place
 from pycrorm_async.queue.live.relocatable_appender import RelocatableAppender
 from pycrorm_async.settings import FileAccess
@@ -78,7 +78,7 @@ class Remains(NamedTuple):
 
     contents: list[tuple[int, Buffer]]
     after: int
-    opened: Mapping[EpisodeId, Last]
+    opened: Mapping[EpisodeId, LastRecord]
     lost: tuple[str, ...]
     left: bool
 
@@ -90,7 +90,7 @@ def move(
     access: FileAccess,
     recorder: EpisodeId,
     stored: int,
-    appender_in: Callable[[Path, bytes, int, Mapping[EpisodeId, Last]], RelocatableAppender],
+    appender_in: Callable[[Path, bytes, int, Mapping[EpisodeId, LastRecord]], RelocatableAppender],
     settle: Callable[[Home, tuple[str, ...]], None],
 ) -> None:
     """Make a folder for this recorder below the spool, and go on in it.
@@ -126,7 +126,7 @@ def move(
     try:
         for segment in appender.segments:  # before anything of the old folder goes
             segment.sync()
-        folder = finish_folder(unfinished, instead_of=goes)
+        folder = finish_folder(unfinished, replaced=goes)
         appender.settle(folder)
         settle(moved._replace(place=place._replace(folder=folder)), ())
     except BaseException:
@@ -223,7 +223,7 @@ def _carry_from(content: Buffer, offset: int, salt: int, new: RelocatableAppende
     return offset
 
 
-def _readable(begun: Begun, recorder: bytes, *, last: int) -> bytes | None:
+def _readable(begun: SegmentStart, recorder: bytes, *, last: int) -> bytes | None:
     """The content of a segment that is not mapped any more; None if it is not all there."""
     try:
         content = read_segment(begun.path)
@@ -239,7 +239,7 @@ def _readable(begun: Begun, recorder: bytes, *, last: int) -> bytes | None:
     return content if position == last else None
 
 
-def _named(first: int, last: int, before: Mapping[EpisodeId, Last], after: Mapping[EpisodeId, Last]) -> str:
+def _named(first: int, last: int, before: Mapping[EpisodeId, LastRecord], after: Mapping[EpisodeId, LastRecord]) -> str:
     """The records of one segment that is gone: by position, and by event as far as an episode was open around it."""
     events = []
     for episode in dict.fromkeys((*before, *after)):

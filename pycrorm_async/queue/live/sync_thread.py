@@ -17,10 +17,10 @@ from queue import Empty, SimpleQueue
 
 from pycrorm_async.clock import monotonic_ns
 
-__all__ = ["Syncer"]
+__all__ = ["SyncThread"]
 
 
-class Syncer:
+class SyncThread:
     """Takes turns until stopped; a last one after that. `turn` says in how many seconds it wants another, or None."""
 
     def __init__(self, *, name: str, interval_s: float, turn: Callable[[], float | None]) -> None:

@@ -1,1 +1,1 @@
-"""Inspection, repair and salvage of a recorder's folder."""
+"""Inspect a spool, and repair a damaged recorder's folder."""

@@ -1,7 +1,7 @@
-"""What is in a spool, told from its files alone: changes nothing, waits for nobody, needs no database.
+"""Report the content of a spool from its files alone: without changing them, taking locks or opening a database.
 
-A live recorder is looked at while it writes: its segments may go and grow meanwhile. So what looks like damage there
-counts only if a second look finds it at the same place.
+A live recorder deletes and extends its segments while this reads them. Therefore apparent damage there counts only if a
+second scan meets it at the same place.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.files.locks import is_locked
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, MENDED, PROGRESS, TAIL
-from pycrorm_async.queue.files.recorder_folder import available, fault_in, held_by
+from pycrorm_async.queue.files.recorder_folder import folder_error, parse_folder_name, wrap_os_errors
 from pycrorm_async.queue.files.scan import Survey, ValidPrefix, survey
 from pycrorm_async.queue.files.segment import read_segment, segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 
 __all__ = [
-    "SET_ASIDE",
+    "DAMAGED_SUFFIX",
     "SpoolReport",
     "RecorderReport",
     "SegmentReport",
@@ -32,16 +32,15 @@ __all__ = [
     "inspect_spool",
 ]
 
-SET_ASIDE: Final = ".damaged"
-"""What `repair` adds to the name of a folder it has put aside."""
-
-"""How far another process has drained a living recorder's folder."""
-_LOOKS = 20
+DAMAGED_SUFFIX: Final = ".damaged"
+"""Suffix that `repair` appends to the name of the damaged folder it replaces."""
+_SURVEYS = 20
+"""Bounds the scans of a folder that changes meanwhile, before apparent damage is reported."""
 
 
 @dataclass(frozen=True)
 class SegmentReport:
-    """One file. `base` is the position of its first record; None where its header cannot be read or is not begun."""
+    """One segment. `base` is the position of its first record; None if its header is unreadable or not written yet."""
 
     file: str
     bytes: int
@@ -60,7 +59,7 @@ class OpenEpisode:
 
 @dataclass(frozen=True)
 class Damage:
-    """Where what was safe once is not what was written."""
+    """Synced bytes that differ from the bytes that were written: the file and the offset where they begin."""
 
     file: str
     offset: int
@@ -69,24 +68,24 @@ class Damage:
 
 @dataclass(frozen=True)
 class RecorderReport:
-    """One recorder's folder, or what was refused of it.
+    """One recorder's folder, or a folder of dead letters.
 
     Attributes:
-        name: of the folder: the recorder's id, and for what was refused of it the episode's.
-        path: its folder.
-        alive: its process lives; of what was refused: more may be put into it.
-        being_drained: somebody holds the right to drain it.
+        name: the folder's name: the recorder's id, followed by the episode's id for dead letters.
+        path: the folder.
+        alive: the recorder's process lives; for dead letters, a drainer may add more.
+        being_drained: a process holds `drain`.
         first, last: positions of the first and the last whole record; last is first - 1 if there is none.
-        safe: position up to which a sync said that all is on the disk.
+        safe: the last position that a commit frame covers.
         segments: the files, in order.
-        types: how many records there are of each event type.
-        episodes: how many episodes have records here.
-        open: those without an end.
-        tail_bytes: what lies behind the last whole record: written, never synced, and torn.
-        cut_off: files with what a recovery cut off before.
+        types: number of records of each event type.
+        episodes: number of episodes with records here.
+        open: the episodes without an end.
+        tail_bytes: size of the torn tail behind the last whole record, which no sync covered.
+        cut_off: files with the tails that earlier recoveries cut off.
         foreign: files that are not ours.
-        damage: where the damage begins; the records before it are counted, those behind it are not.
-        refused: why it could not be looked at: another recorder's file, a newer format, the operating system.
+        damage: where the damage begins; only records before it are counted.
+        refused: why the folder could not be examined: another recorder's file, a newer format, an OS error.
     """
 
     name: str
@@ -113,15 +112,15 @@ class RecorderReport:
 
 @dataclass(frozen=True)
 class SpoolReport:
-    """A spool.
+    """The content of a spool.
 
     Attributes:
         path: the spool's folder.
-        log_id: id of the log of the database it belongs to; None if nobody drained it yet.
-        recorders: oldest first.
-        set_aside: folders that `repair` put aside.
-        unfinished: folders that were being made or removed when a process was killed; nothing is in them.
-        strangers: what lies here and is not ours.
+        log_id: id of the log that the spool is bound to; None before the first drain.
+        recorders: the recorders' folders, oldest first.
+        set_aside: damaged folders that `repair` replaced.
+        unfinished: empty folders left by a process that was killed while it created or removed them.
+        strangers: entries that are not ours.
     """
 
     path: str
@@ -133,40 +132,42 @@ class SpoolReport:
 
 
 def inspect_spool(path: Path) -> SpoolReport:
-    """Raises `SpoolUnavailable` for what is not there, cannot be read or is no spool."""
+    """Report the content of a spool. Raises `SpoolUnavailable` if it is missing, unreadable or not a spool."""
     spool = Spool(path)
-    with available(path):
+    with wrap_os_errors(path):
         if not path.exists():
             raise SpoolUnavailable(path, "does not exist")
     recorders, log_id = spool.recorders(), spool.log_id()
     others = spool.strangers()
-    aside = [each for each in others if is_set_aside(each)]
+    replaced = [each for each in others if is_damaged_copy(each)]
     unfinished = [each for each in others if _is_unfinished(each)]
-    if log_id is None and not recorders and not aside:
-        raise SpoolUnavailable(path, "is not a spool: no recorder's folder is in it, and no note of a database")
+    if log_id is None and not recorders and not replaced:
+        raise SpoolUnavailable(
+            path, "is not a spool: it contains neither a recorder's folder nor the note of a database"
+        )
     return SpoolReport(
         str(path),
         log_id,
         tuple(inspect_recorder(each) for each in recorders),
-        tuple(each.name for each in aside),
+        tuple(each.name for each in replaced),
         tuple(each.name for each in unfinished),
-        tuple(_text(each.name) for each in others if each not in [*aside, *unfinished]),
+        tuple(_text(each.name) for each in others if each not in [*replaced, *unfinished]),
     )
 
 
 def _text(name: str) -> str:
-    """A file's name that can be printed: bytes in it that are not UTF-8 are escaped."""
+    """Return a printable file name: bytes that are not UTF-8 are escaped."""
     return os.fsencode(name).decode(errors="backslashreplace")
 
 
-def is_set_aside(path: Path) -> bool:
-    """Whether `repair` put this folder aside."""
-    name, suffix, number = path.name.partition(SET_ASIDE)
+def is_damaged_copy(path: Path) -> bool:
+    """Return whether this is a damaged folder that `repair` replaced."""
+    name, suffix, number = path.name.partition(DAMAGED_SUFFIX)
     return _is_name(name) and bool(suffix) and (not number or number[1:].isdigit()) and path.is_dir()
 
 
 def _is_unfinished(path: Path) -> bool:
-    """A recorder's folder without its `alive`, the last file to go, or under the name it has before it is whole."""
+    """Return whether this is an empty recorder's folder without `alive`, or one that has its unfinished name."""
     name = path.name.removesuffix(MENDED).removesuffix(MAKING)
     if not _is_name(name) or not path.is_dir():
         return False
@@ -175,38 +176,38 @@ def _is_unfinished(path: Path) -> bool:
 
 def _is_name(name: str) -> bool:
     try:
-        held_by(name)
+        parse_folder_name(name)
     except ValueError:
         return False
     return True
 
 
 def inspect_recorder(recorder: RecorderFolder) -> RecorderReport:
-    """What is in one recorder's folder; what keeps it from being looked at is in `refused`."""
+    """Report the content of one recorder's folder; an error that prevents it is in `refused`."""
     name, path = recorder.name, str(recorder.path)
     try:
-        with available(recorder.path):
+        with wrap_os_errors(recorder.path):
             draining = is_locked(recorder.path / DRAIN)
             try:
-                return _looked_at(recorder, being_drained=draining)
+                return _examine(recorder, being_drained=draining)
             except SpoolForeign as foreign:
                 return RecorderReport(name, path, recorder.alive, draining, refused=str(foreign))
-    except Exception as error:  # noqa: BLE001 - reported; the other folders are looked at
+    except Exception as error:  # noqa: BLE001 - reported; must not prevent the report on the others
         return RecorderReport(
-            name, path, recorder.alive, being_drained=False, refused=str(fault_in(recorder.path, error))
+            name, path, recorder.alive, being_drained=False, refused=str(folder_error(recorder.path, error))
         )
 
 
 @dataclass
 class _Count:
-    """What the walk over the whole frames counts."""
+    """Counts of the whole frames that a scan meets."""
 
     types: Counter[str] = field(default_factory=Counter)
     episodes: set[bytes] = field(default_factory=set)
     segments: Counter[int] = field(default_factory=Counter)
     safe: int = 0
 
-    def seen(self, number: int, frame: Frame) -> None:
+    def count_frame(self, number: int, frame: Frame) -> None:
         if frame.kind == COMMIT:
             self.safe = frame.position
             return
@@ -216,75 +217,77 @@ class _Count:
             self.episodes.add(frame.episode)
 
 
-def _looked_at(recorder: RecorderFolder, *, being_drained: bool) -> RecorderReport:
+def _examine(recorder: RecorderFolder, *, being_drained: bool) -> RecorderReport:
     folder = recorder.path
-    count, (kept, damage, _) = _surveyed(folder, changing=recorder.alive or being_drained)
-    ours = {ALIVE, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in kept.numbers)}
+    count, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or being_drained)
+    ours = {ALIVE, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in prefix.numbers)}
     others = sorted(_text(each.name) for each in folder.iterdir() if each.name not in ours)
     return RecorderReport(
         recorder.name,
         str(folder),
         recorder.alive,
         being_drained,
-        first=kept.start.position + 1,
-        last=kept.cut.position,
-        safe=max(count.safe, kept.start.position),
-        segments=tuple(_segment(folder, number, kept, count) for number in kept.numbers),
+        first=prefix.start.position + 1,
+        last=prefix.cut.position,
+        safe=max(count.safe, prefix.start.position),
+        segments=tuple(_segment(folder, number, prefix, count) for number in prefix.numbers),
         types=dict(sorted(count.types.items())),
-        episodes=len(count.episodes | set(kept.open)),
-        open=tuple(_open(kept)),
-        tail_bytes=0 if recorder.alive or damage else _tail_bytes(folder, kept),
+        episodes=len(count.episodes | set(prefix.open)),
+        open=tuple(_open(prefix)),
+        tail_bytes=0 if recorder.alive or damage else _tail_bytes(folder, prefix),
         cut_off=tuple(each for each in others if each.endswith(TAIL)),
-        foreign=tuple(each for each in others if not each.endswith((TAIL, MAKING)) and each not in _late(folder)),
+        foreign=tuple(
+            each for each in others if not each.endswith((TAIL, MAKING)) and each not in _new_segments(folder)
+        ),
         damage=None if damage is None else Damage(str(damage.path), damage.offset, damage.reason),
     )
 
 
-def _surveyed(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
-    """A look that is good for something: of a folder that changes meanwhile, the first that contradicts nobody."""
-    recorder = held_by(folder.name).recorder
+def _survey_stable(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
+    """Scan a folder; repeat the scan of a changing one until it meets no damage, or the same damage twice in a row."""
+    recorder = parse_folder_name(folder.name).recorder
     before: SpoolDamaged | None = None
-    looks = _LOOKS if changing else 1
-    for look in range(1, looks + 1):
+    attempts = _SURVEYS if changing else 1
+    for attempt in range(1, attempts + 1):
         count = _Count()
         try:
-            found = survey(folder, recorder, seen=count.seen)
+            result = survey(folder, recorder, on_frame=count.count_frame)
         except FileNotFoundError:  # stored and deleted between the listing and the reading
-            if look == looks:
+            if attempt == attempts:
                 raise
             continue
-        damage = found.damage
+        damage = result.damage
         if damage is None or not changing:
             break
         if before is not None and (before.path, before.offset) == (damage.path, damage.offset):
             break
         before = damage
-    return count, found
+    return count, result
 
 
-def _segment(folder: Path, number: int, kept: ValidPrefix, count: _Count) -> SegmentReport:
+def _segment(folder: Path, number: int, prefix: ValidPrefix, count: _Count) -> SegmentReport:
     path = segment_path(folder, number)
     size = path.stat().st_size if path.exists() else 0
-    return SegmentReport(path.name, size, kept.bases.get(number), count.segments[number])
+    return SegmentReport(path.name, size, prefix.bases.get(number), count.segments[number])
 
 
-def _open(kept: ValidPrefix) -> list[OpenEpisode]:
+def _open(prefix: ValidPrefix) -> list[OpenEpisode]:
     return [
         OpenEpisode(episode_text(EpisodeId(episode)), last.sequence, last.wall_ns)
-        for episode, last in sorted(kept.open.items())
+        for episode, last in sorted(prefix.open.items())
     ]
 
 
-def _late(folder: Path) -> set[str]:
-    """Segments that were made after the survey listed them."""
+def _new_segments(folder: Path) -> set[str]:
+    """Name the segments that exist now, including those created after the scan."""
     return {segment_path(folder, number).name for number in segment_numbers(folder)}
 
 
-def _tail_bytes(folder: Path, kept: ValidPrefix) -> int:
-    """What is not zero behind the last whole record."""
+def _tail_bytes(folder: Path, prefix: ValidPrefix) -> int:
+    """Return the bytes behind the last whole record, without trailing zeros."""
     size = 0
-    for number in kept.numbers:
-        if number >= kept.cut.number:
+    for number in prefix.numbers:
+        if number >= prefix.cut.number:
             content = read_segment(segment_path(folder, number))
-            size += len(content[kept.cut.offset if number == kept.cut.number else 0 :].rstrip(b"\0"))
+            size += len(content[prefix.cut.offset if number == prefix.cut.number else 0 :].rstrip(b"\0"))
     return size

@@ -1,11 +1,10 @@
-"""Mends a dead recorder's damaged folder, so that all that is whole in it can be drained, and tells what is given up.
+"""Repair a dead recorder's damaged folder, so that its whole records can be drained, and report the records dropped.
 
-The folder is put aside as it was, `<recorder>.damaged`, and a new one takes its name: the segments before the damage,
-then new ones with the whole records from behind it. An episode's records are kept as long as none of its own is
-missing: the log takes no episode with a gap. Records get new positions, for positions have no gaps either.
+The damaged folder is renamed unchanged to `<recorder>.damaged`, and a new folder takes its name. The new folder holds
+the segments before the damage and new segments with the whole records behind it, as far as `salvage.py` can keep them.
 
-The new folder is made beside the old one, read again and safe on the disk before either is renamed. Killed anywhere,
-the next repair goes on: what is unfinished is made anew, what is finished gets its name.
+The new folder is built beside the old one, scanned and synced before either is renamed. After a kill at any point the
+next repair continues: it builds an unfinished folder again, and gives a finished one its name.
 """
 
 from __future__ import annotations
@@ -20,24 +19,24 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue.files.file_access import create_folder, open_file
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, MENDED
-from pycrorm_async.queue.files.recorder_folder import available, held_by
+from pycrorm_async.queue.files.recorder_folder import parse_folder_name, wrap_os_errors
 from pycrorm_async.queue.files.scan import Survey, scan, survey
 from pycrorm_async.queue.files.segment import sync_folder
-from pycrorm_async.queue.maintenance.inspection import SET_ASIDE, Damage
-from pycrorm_async.queue.maintenance.salvage import Range, Rescue, ranges
+from pycrorm_async.queue.maintenance.inspection import DAMAGED_SUFFIX, Damage
+from pycrorm_async.queue.maintenance.salvage import Range, Salvage, ranges
 
-__all__ = ["RepairReport", "GivenUp", "repair_folder", "finish_repairs"]
+__all__ = ["RepairReport", "DroppedRecords", "repair_folder", "finish_repairs"]
 
 
 @dataclass(frozen=True)
-class GivenUp:
-    """Whole records of one episode that stand behind a gap in it: the log could not take them.
+class DroppedRecords:
+    """Whole records behind a gap in their episode, dropped because the log accepts no gap.
 
     Attributes:
-        episode: its id.
-        kept_to: sequence of its last record that is kept; 0 if there is none.
-        sequences: of the records given up.
-        positions: where they stand in the folder that was put aside.
+        episode: the episode's id.
+        kept_to: sequence of the episode's last kept record; 0 if none is kept.
+        sequences: sequences of the dropped records.
+        positions: their positions in the damaged folder.
     """
 
     episode: str
@@ -48,18 +47,18 @@ class GivenUp:
 
 @dataclass(frozen=True)
 class RepairReport:
-    """What was done to one folder.
+    """The result of one repair.
 
     Attributes:
         name: the recorder.
-        set_aside: the folder as it was; files named in `damage` are in it.
-        damage: where it began.
-        kept: records before the damage.
-        saved: records from behind it.
+        set_aside: the damaged folder under its new name; it contains the files named in `damage`.
+        damage: where the damage began.
+        kept: number of records before the damage.
+        saved: number of records salvaged behind it.
         unreadable: positions of records that cannot be read any more.
-        given_up: by episode, whole records that are not kept.
-        headless: the oldest file's header was unreadable: an episode that was open in it and has no record behind the
-            damage does not get its end.
+        given_up: by episode, whole records that were dropped.
+        headless: the oldest file's header was unreadable: an episode that it listed as open and that has no record
+            behind the damage does not get its end.
     """
 
     name: str
@@ -68,50 +67,50 @@ class RepairReport:
     kept: int
     saved: int
     unreadable: tuple[Range, ...]
-    given_up: tuple[GivenUp, ...]
+    given_up: tuple[DroppedRecords, ...]
     headless: bool
 
     @property
     def complete(self) -> bool:
-        """Whether nothing at all was given up."""
+        """Return whether no record was lost or dropped."""
         return not (self.unreadable or self.given_up or self.headless)
 
 
 def repair_folder(folder: Path) -> RepairReport | None:
-    """Mends the folder if it is damaged; None if it is whole.
+    """Repair the folder if it is damaged; return None if it is whole.
 
-    Raises `SpoolUnavailable` if its recorder lives, somebody drains it, or it cannot be written; `SpoolForeign` for a
-    newer format or another recorder's file. Then nothing is changed.
+    Raises `SpoolUnavailable` if the recorder lives, a process drains the folder, or it cannot be written, and
+    `SpoolForeign` for a newer format or another recorder's file. Then the folder is unchanged.
     """
-    with available(folder):
-        locks = _locked(folder)
+    with wrap_os_errors(folder):
+        locks = _lock(folder)
         try:
-            found = survey(folder, held_by(folder.name).recorder)
-            if found.damage is None:
+            result = survey(folder, parse_folder_name(folder.name).recorder)
+            if result.damage is None:
                 return None
-            return _replace(folder, found)
+            return _replace(folder, result)
         finally:
             for lock in locks:
                 lock.release()
 
 
 def finish_repairs(spool: Path) -> list[Path]:
-    """Gives finished folders their names when a repair was killed between its last two steps; these folders."""
-    done = []
-    with available(spool):
-        for mended in sorted(spool.glob(f"*{MENDED}")):
-            folder = mended.with_name(mended.name.removesuffix(MENDED))
-            if not folder.exists():  # the old one is put aside only when the new one is whole and safe
-                mended.rename(folder)
+    """Name the finished folders of repairs killed between their last two steps; return these folders."""
+    folders = []
+    with wrap_os_errors(spool):
+        for repaired in sorted(spool.glob(f"*{MENDED}")):
+            folder = repaired.with_name(repaired.name.removesuffix(MENDED))
+            if not folder.exists():  # the damaged folder is renamed only after the new one is whole and synced
+                repaired.rename(folder)
                 sync_folder(spool)
-                done.append(folder)
-    return done
+                folders.append(folder)
+    return folders
 
 
-def _locked(folder: Path) -> list[FileLock]:
+def _lock(folder: Path) -> list[FileLock]:
     alive = FileLock.take(folder / ALIVE, create=False)
     if alive is None:
-        raise SpoolUnavailable(folder, "its recorder is alive, or somebody drains it: stop that first")
+        raise SpoolUnavailable(folder, "its recorder is alive, or another process drains it: stop that process first")
     try:
         drain = FileLock.take(folder / DRAIN)
     except BaseException:
@@ -119,63 +118,66 @@ def _locked(folder: Path) -> list[FileLock]:
         raise
     if drain is None:
         alive.release()
-        raise SpoolUnavailable(folder, "is being drained: stop that first")
+        raise SpoolUnavailable(folder, "another process drains it: stop that process first")
     return [drain, alive]
 
 
-def _replace(folder: Path, found: Survey) -> RepairReport:
-    """The folder is put aside, and a mended one has its name."""
-    damage = found.damage
+def _replace(folder: Path, result: Survey) -> RepairReport:
+    """Build a repaired folder, rename the damaged one, and give its name to the repaired one."""
+    damage = result.damage
     assert damage is not None
-    mended = folder.with_name(f"{folder.name}{MENDED}")
-    if mended.exists():  # of a repair that was killed
-        shutil.rmtree(mended)
-    create_folder(mended)
+    repaired = folder.with_name(f"{folder.name}{MENDED}")
+    if repaired.exists():  # left by a killed repair
+        shutil.rmtree(repaired)
+    create_folder(repaired)
     try:
-        rescue = _filled(mended, folder, found)
-        aside = _free_name(folder)
-        folder.rename(aside)
+        salvage = _fill(repaired, folder, result)
+        damaged = _free_name(folder)
+        folder.rename(damaged)
     except BaseException:
-        shutil.rmtree(mended, ignore_errors=True)
+        shutil.rmtree(repaired, ignore_errors=True)
         raise
-    mended.rename(folder)
+    repaired.rename(folder)
     sync_folder(folder.parent)
     return RepairReport(
         name=folder.name,
-        set_aside=str(aside),
-        damage=Damage(str(aside / damage.path.name), damage.offset, damage.reason),
-        kept=found.kept.cut.position - found.kept.start.position,
-        saved=rescue.saved,
-        unreadable=tuple(rescue.unreadable),
+        set_aside=str(damaged),
+        damage=Damage(str(damaged / damage.path.name), damage.offset, damage.reason),
+        kept=result.prefix.cut.position - result.prefix.start.position,
+        saved=salvage.saved,
+        unreadable=tuple(salvage.unreadable),
         given_up=tuple(
-            GivenUp(
+            DroppedRecords(
                 episode_text(episode),
-                rescue.kept_to(episode),
+                salvage.kept_to(episode),
                 ranges(frame.sequence for frame in frames),
                 ranges(frame.position for frame in frames),
             )
-            for episode, frames in sorted(rescue.given_up.items())
+            for episode, frames in sorted(salvage.dropped.items())
         ),
-        headless=rescue.headless,
+        headless=salvage.headless,
     )
 
 
-def _filled(mended: Path, folder: Path, found: Survey) -> Rescue:
-    """What was written into the new folder, read again and safe on the disk."""
-    os.close(open_file(mended / ALIVE, os.O_WRONLY))
-    rescue = Rescue(folder, mended, found)
-    rescue.run()
-    written = scan(mended, held_by(folder.name).recorder).cut.position
-    if written != rescue.position:
-        raise InternalError(f"{mended} holds records up to {written} and not up to {rescue.position}")
-    sync_folder(mended)
-    return rescue
+def _fill(repaired: Path, folder: Path, result: Survey) -> Salvage:
+    """Write the new folder, scan it again and sync it."""
+    os.close(open_file(repaired / ALIVE, os.O_WRONLY))
+    salvage = Salvage(folder, repaired, result)
+    salvage.run()
+    written = scan(repaired, parse_folder_name(folder.name).recorder).cut.position
+    if written != salvage.position:
+        raise InternalError(
+            f"{repaired} holds records up to position {written} instead of {salvage.position};"
+            " the damaged folder is unchanged"
+        )
+    sync_folder(repaired)
+    return salvage
 
 
 def _free_name(folder: Path) -> Path:
-    aside = folder.with_name(f"{folder.name}{SET_ASIDE}")
+    name = folder.with_name(f"{folder.name}{DAMAGED_SUFFIX}")
     number = 1
-    while aside.exists():
+    while name.exists():
         number += 1
-        aside = folder.with_name(f"{folder.name}{SET_ASIDE}.{number}")
-    return aside
+        name = folder.with_name(f"{folder.name}{DAMAGED_SUFFIX}.{number}")
+    return name

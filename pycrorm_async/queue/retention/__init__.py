@@ -1,1 +1,1 @@
-"""Stored segments, kept so that a log that went back can be offered them again."""
+"""Keep stored segments and acknowledged heads, to refill a log that went back."""

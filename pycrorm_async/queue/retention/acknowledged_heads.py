@@ -1,24 +1,22 @@
-"""Remembers how far each episode was stored, below the spool, so that a log that went back is noticed.
+"""Remember how far each episode is stored, in a file below the spool, to detect a log that went back.
 
-    spool/stored/<log id>/heads        one line for each episode of each batch that was stored
-    0192f3c0-…-9ab0 17 4002 1763845200 + 9f3c2a1b      id, number, head, UTC in seconds, mark, crc32 of all that
+    spool/stored/<log id>/heads        one line for each episode of each stored batch
+    0192f3c0-…-9ab0 17 4002 1763845200 + 9f3c2a1b      id, number, head, UTC in seconds, mark, crc32 of the rest
 
-The number is 0 in lines that were taken along from another log (`forget_numbers`), because a number belongs to one log.
+The number is 0 in lines moved from another log (`forget_numbers`), because a number belongs to one log. Of an episode's
+lines the highest head counts (mark `+`), because compacting may reorder lines. A line with the mark `=` lowers the
+head, where the log holds less and no segment has the missing records.
 
-Of the lines of an episode the highest head counts (mark `+`), for compacting may change their order; one with the mark
-`=` lowers it, where the log holds less and no segment has the rest.
+All processes of a spool append to one file. Each batch is one write, after the log committed it and before the queue
+is acknowledged, so every line states a committed fact. Readers skip torn and changed lines. The file is not synced: a
+power cut may lose its last lines, and with them only the ability to detect that the log lost these events.
 
-All processes of a spool append to one file, each batch by one write after the log committed it and before the queue is
-acknowledged: so what a process reads here was stored, by itself or by another. Lines that are torn or changed are left
-out. The file is not synced: with a machine that loses power the last lines may go, and with them only what they could
-prove.
-
-Theory of operation. `refresh` reads what was appended since the last time; a file of another inode, or one that begins
-differently, is read from its beginning. The inode alone does not tell: a file system gives the number of a file that
-was replaced to the next one, so each compacted file begins with a random line. `note` appends, and appends again if the
-file was replaced meanwhile. `_compact` writes what is still of use to a new file, gives it the name, and then copies
-what was appended to the old one while it did: a writer that appended before the renaming is copied, one that appends
-after it sees the new file and repeats. One process compacts at a time.
+**Theory of operation.** `refresh` reads the lines appended since the last call. It reads a file with another inode or
+another beginning from the start. The inode alone is not enough, because a file system reuses the inode number of a
+replaced file; therefore each compacted file begins with a random line. `note` appends, and appends again if the file
+was replaced meanwhile. `_compact` writes the useful lines to a new file, renames it, and then copies the lines appended
+to the old file during that time: a line appended before the renaming is copied, and a writer that appends after it sees
+the new file and repeats. A lock file admits one compacting process at a time.
 """
 
 from __future__ import annotations
@@ -34,22 +32,22 @@ from zlib import crc32
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
 from pycrorm_async.queue.files.file_access import create_folders, open_file
 from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.recorder_folder import write_safely
+from pycrorm_async.queue.files.recorder_folder import write_durably
 
 __all__ = ["AcknowledgedHeads", "Head", "forget_numbers"]
 
 _NAME: Final = "heads"
 _FILE_BYTES_MAX: Final = 2**20
-"""A larger file is compacted: reading one takes some 20 ms at a start."""
+"""Bounds the file before it is compacted: reading this much takes some 20 ms at every start."""
 _EPISODES_MAX: Final = 4_096
-"""So many episodes are remembered, the latest; a third of what a file may hold, so that compacting is rare."""
-_TRIES: Final = 5
+"""Bounds the episodes that compacting keeps, the latest ones; a third of a file, so that compacting is rare."""
+_ATTEMPTS: Final = 5
 _BEGINNING_BYTES: Final = 80
-"""What tells a file from one that was given its inode: a compacted file's random line, or its first head."""
+"""Length of the beginning that identifies a file with a reused inode: a random line, or the first head."""
 
 
 class Head(NamedTuple):
-    """How far an episode was stored, under which number (0: that of another log), and when that was noted."""
+    """An episode's number (0 if that of another log), its stored head, and the time of the note."""
 
     number: int
     head: int
@@ -57,9 +55,9 @@ class Head(NamedTuple):
 
 
 class AcknowledgedHeads:
-    """One process' view of the file. Raises nothing for a file that cannot be read or written: it proves nothing then.
+    """One process' view of the file.
 
-    `faults` counts how often that was so.
+    An operating system error raises no exception, because losing the file only weakens detection; `faults` counts them.
     """
 
     def __init__(self, folder: Path, *, keep_s: float, wall_ns: Callable[[], int]) -> None:
@@ -76,21 +74,21 @@ class AcknowledgedHeads:
 
     @property
     def all(self) -> Mapping[EpisodeId, Head]:
-        """By episode, as read at the last refresh."""
+        """The heads by episode, as of the last refresh."""
         return self._heads
 
     @property
     def last(self) -> tuple[EpisodeId, int] | None:
-        """The episode that was stored last, and how far."""
+        """The episode stored last, and its head."""
         return None if self._last is None else (self._last, self._heads[self._last].head)
 
     @property
     def number_max(self) -> int:
-        """The highest number that an episode of this spool was given."""
+        """The highest number of an episode of this spool."""
         return self._number_max
 
     def refresh(self) -> None:
-        """Read what was appended since, by whatever process."""
+        """Read the lines that any process appended since the last call."""
         try:
             with self.path.open("rb") as file:
                 status = os.fstat(file.fileno())
@@ -105,18 +103,18 @@ class AcknowledgedHeads:
                     whole = content[: content.rfind(b"\n") + 1]
                     self._read_to += len(whole)
                     for line in whole.splitlines():
-                        self._take(line)
+                        self._add_line(line)
         except FileNotFoundError:
             return
         except OSError:
             self.faults += 1
 
     def note(self, heads: Mapping[EpisodeId, tuple[int, int]], *, lowered: bool = False) -> None:
-        """These episodes, by id, have this number and are stored up to this sequence, and no further if `lowered`."""
+        """Append number and stored head of these episodes; with `lowered` the head counts even if it is lower."""
         now_s, mark = self._wall_ns() // 10**9, "=" if lowered else "+"
-        lines = b"".join(_line(each, Head(number, head, now_s), mark) for each, (number, head) in heads.items())
+        lines = b"".join(_line(episode, Head(number, head, now_s), mark) for episode, (number, head) in heads.items())
         try:
-            for _ in range(_TRIES):
+            for _ in range(_ATTEMPTS):
                 size = self._append(lines)
                 if size is not None:
                     break
@@ -129,14 +127,14 @@ class AcknowledgedHeads:
             self.faults += 1
 
     def _append(self, lines: bytes) -> int | None:
-        """The size of the file afterwards; None if it was replaced meanwhile."""
+        """Append the lines; return the file's new size, or None if the file was replaced meanwhile."""
         try:
             descriptor = open_file(self.path, os.O_WRONLY | os.O_APPEND)
-        except FileNotFoundError:  # of the folder, or the file was replaced at this moment
+        except FileNotFoundError:  # the folder is missing, or the file was replaced just now
             create_folders(self.path.parents[2], self.path.parent)
             descriptor = open_file(self.path, os.O_WRONLY | os.O_APPEND)
         try:
-            os.write(descriptor, b"\n" + lines)  # behind whatever a process that was killed left torn
+            os.write(descriptor, b"\n" + lines)  # "\n" ends a line that a killed process left torn
             status = os.fstat(descriptor)
         finally:
             os.close(descriptor)
@@ -147,23 +145,23 @@ class AcknowledgedHeads:
 
     def _compact(self) -> None:
         lock = FileLock.take(self.path.with_name(f"{_NAME}.lock"))
-        if lock is None:  # another process does it
+        if lock is None:  # another process compacts
             return
         try:
             with self.path.open("rb") as old:
                 self.refresh()
                 old.seek(self._read_to)
-                kept = self._of_use()
-                write_safely(self.path, _content(kept))
+                useful = self._useful_heads()
+                write_durably(self.path, _content(useful))
                 late = old.read()
             if late:
                 self._append(late)
-            self._heads = kept
+            self._heads = useful
         finally:
             lock.release()
 
-    def _of_use(self) -> dict[EpisodeId, Head]:
-        """The latest, in the order in which they were noted, and the one with the highest number."""
+    def _useful_heads(self) -> dict[EpisodeId, Head]:
+        """Return the latest heads in the order of their notes, the last one, and the one with the highest number."""
         oldest_s = self._wall_ns() // 10**9 - self._keep_s
         latest = dict(list(self._heads.items())[-_EPISODES_MAX:])
         return {
@@ -174,7 +172,7 @@ class AcknowledgedHeads:
             or (episode in latest and head.wall_s >= oldest_s)
         }
 
-    def _take(self, line: bytes) -> None:
+    def _add_line(self, line: bytes) -> None:
         parts = line.split()
         if len(parts) != len(Head._fields) + 3:
             return
@@ -189,27 +187,27 @@ class AcknowledgedHeads:
         before = self._heads.pop(episode, None)
         if before is not None and before.head > head.head and mark != b"=":
             head = before
-        self._heads[episode] = head  # the latest last
+        self._heads[episode] = head  # a dict keeps the order of the notes
         self._last = episode
         self._number_max = max(self._number_max, head.number)
 
 
 def forget_numbers(folder: Path) -> None:
-    """Replace every number in the file of this folder, which is taken along to another log, by 0. Raises `OSError`.
+    """Set every number in the file of this folder to 0, before it moves to another log. Raises `OSError`.
 
-    No process may append meanwhile.
+    No process may append during this call.
     """
     heads = AcknowledgedHeads(folder, keep_s=0, wall_ns=lambda: 0)
     heads.refresh()
     if heads.all:
-        write_safely(heads.path, _content({each: head._replace(number=0) for each, head in heads.all.items()}))
+        write_durably(heads.path, _content({episode: head._replace(number=0) for episode, head in heads.all.items()}))
 
 
 def _content(heads: Mapping[EpisodeId, Head]) -> bytes:
-    """A whole file; its first line is random, so that no other file begins as it does."""
-    return secrets.token_hex(16).encode() + b"\n" + b"".join(_line(each, head) for each, head in heads.items())
+    """Encode a whole file; its first line is random, so that no other file begins like it."""
+    return secrets.token_hex(16).encode() + b"\n" + b"".join(_line(episode, head) for episode, head in heads.items())
 
 
 def _line(episode: EpisodeId, head: Head, mark: str = "+") -> bytes:
-    said = f"{episode_text(episode)} {head.number} {head.head} {head.wall_s} {mark}".encode()
-    return said + b" %08x\n" % crc32(said)
+    fields = f"{episode_text(episode)} {head.number} {head.head} {head.wall_s} {mark}".encode()
+    return fields + b" %08x\n" % crc32(fields)

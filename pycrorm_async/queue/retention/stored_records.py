@@ -1,7 +1,7 @@
-"""Reads again what was stored: of each recorder the segments that are kept, and those that are still in its folder.
+"""Read stored records again: each recorder's kept segments and those still in its folder.
 
-Nothing is given that no commit frame covers, for it may be lost with the machine. Files may go meanwhile: what cannot
-be read any more cannot be offered.
+Yields only records that a commit frame covers, because others may be lost with the machine. Files may be deleted during
+the reading; their records are left out.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from pycrorm_async.errors import FilesError, SpoolDamaged
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.queue.files.recorder_folder import held_by
+from pycrorm_async.queue.files.recorder_folder import parse_folder_name
 from pycrorm_async.queue.files.scan import SegmentScanner
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import Spool
@@ -23,7 +23,7 @@ __all__ = ["StoredRecorder", "stored_recorders", "stored_records"]
 
 
 class StoredRecorder(NamedTuple):
-    """A recorder's segments by number. `over` when its own folder is gone: all that it ever wrote was stored."""
+    """A recorder's segments by number. `over` if its own folder is deleted, because all its records are stored."""
 
     name: str
     segments: dict[int, Path]
@@ -31,42 +31,44 @@ class StoredRecorder(NamedTuple):
 
 
 def stored_recorders(spool: Path, log_id: str) -> list[StoredRecorder]:
-    """Every recorder of which something may have been stored in this log, the oldest first. Raises `FilesError`."""
+    """List every recorder with records that may be stored in this log, oldest first. Raises `FilesError`."""
     kept = stored_in(spool, log_id)
     present = {each.name for each in Spool(spool).recorders()}
     names = set(present)
     if kept is not None and kept.is_dir():
         names |= {each.name for each in kept.iterdir() if _is_recorder(each)}
-    found = []
+    recorders = []
     for name in sorted(names):
-        # First where they come from: one that is moved meanwhile is found twice and not missed.
+        # List the source folder first, so that a segment moved meanwhile is listed twice rather than missed.
         segments = _segments(spool / name)
         if kept is not None:
             segments |= _segments(kept / name)
-        found.append(StoredRecorder(name, dict(sorted(segments.items())), over=name not in present))
-    return found
+        recorders.append(StoredRecorder(name, dict(sorted(segments.items())), over=name not in present))
+    return recorders
 
 
 def stored_records(recorder: StoredRecorder) -> Iterator[list[Record]]:
-    """Its records, a segment at a time, then the computed ends of a recorder that is over.
+    """Yield a recorder's records, one segment at a time, then the computed ends if the recorder is over.
 
-    Ends early where a file is gone or damaged.
+    Stops at a file that is missing or damaged.
     """
     ready: list[Record] = []
-    walk = SegmentScanner(Path(), held_by(recorder.name).recorder, found=ready.append, segments=recorder.segments)
-    given = 0
+    scanner = SegmentScanner(
+        Path(), parse_folder_name(recorder.name).recorder, on_record=ready.append, segments=recorder.segments
+    )
+    yielded = 0
     more = True
     try:
         while more:
-            more = walk.step()
+            more = scanner.step()
             if more or not recorder.over:
-                whole = walk.kept.cut.position - len(walk.unsaid) - walk.kept.start.position - given
+                count = scanner.prefix.cut.position - len(scanner.uncommitted) - scanner.prefix.start.position - yielded
             else:
-                ready += computed_ends(walk.kept)
-                whole = len(ready)
-            yield ready[:whole]
-            del ready[:whole]
-            given += whole
+                ready += computed_ends(scanner.prefix)
+                count = len(ready)
+            yield ready[:count]
+            del ready[:count]
+            yielded += count
     except (FileNotFoundError, SpoolDamaged, FilesError):
         return
 
@@ -80,7 +82,7 @@ def _segments(folder: Path) -> dict[int, Path]:
 
 def _is_recorder(path: Path) -> bool:
     try:
-        held_by(path.name)
+        parse_folder_name(path.name)
     except ValueError:
         return False
     return path.is_dir()

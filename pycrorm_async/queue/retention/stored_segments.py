@@ -1,12 +1,12 @@
-"""Keeps segments after all their records are stored, so that a log that went back can be offered them again.
+"""Keep segments after all their records are stored, to refill a log that went back.
 
     spool/stored/<log id>/<recorder>/00000001.segment
 
-A segment gets here by one rename, when it would otherwise be deleted, and is never written again. What was stored in
-another log, before an empty spool was bound to this one, stays apart from what was stored in this one.
+One rename moves a segment here instead of deleting it; it is not written again. Segments stored in another log, before
+an empty spool was bound to this one, are in that log's folder.
 
-Kept segments are a copy of what a database holds: they take no room from what is still to be stored. They are deleted
-the oldest first: after `keep_stored_s`, above `keep_stored_bytes`, above `FILES_MAX`, and when the disk is full.
+Kept segments duplicate records of the database, so they must not compete with records still to be stored. They are
+deleted, oldest first, after `keep_stored_s`, above `keep_stored_bytes`, above `FILES_MAX`, and when the disk is full.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from pycrorm_async.settings import Settings
 __all__ = ["StoredSegments", "KeptSegment", "FILES_MAX", "kept_segments", "stored_in"]
 
 FILES_MAX: Final = 4_096
-"""Bounds how many segments are kept: to list so many takes some 20 ms, which every recorder that ends waits for."""
+"""Bounds the number of kept segments: every recorder that ends lists them, which takes some 20 ms for this many."""
 
-_LOOK_NS: Final = 60 * 10**9
-"""How often a process that keeps segments looks for those that are too old."""
+_PRUNE_INTERVAL_NS: Final = 60 * 10**9
+"""Interval at which a process that keeps segments deletes those that are too old."""
 _BLOCK_BYTES: Final = 4_096
-_TRIES: Final = 5
+_ATTEMPTS: Final = 5
 
 _log = logging.getLogger("pycrorm_async")
 
 
 class KeptSegment(NamedTuple):
-    """A segment that is kept. `stored_ns` is the wall time at which all in it was stored, or later."""
+    """A kept segment. `stored_ns` is the wall time at which its records were all stored, or later."""
 
     stored_ns: int
     bytes: int
@@ -47,16 +47,16 @@ class KeptSegment(NamedTuple):
 
 
 def stored_in(spool: Path, log_id: str | None) -> Path | None:
-    """The folder for what was stored in this log; None for an id that cannot name a folder."""
+    """Return the folder for segments stored in this log; None for an id that cannot name a folder."""
     if not log_id or "/" in log_id or log_id.startswith("."):
         return None
     return spool / STORED / log_id
 
 
 def kept_segments(spool: Path) -> list[KeptSegment]:
-    """All that are kept, in the order in which they go; of one recorder always the lowest number first.
+    """List all kept segments in the order of deletion; of one recorder the lowest number comes first.
 
-    What is deleted or moved meanwhile is left out. Raises other `OSError`.
+    Leaves out files deleted or moved during the listing. Raises other `OSError`.
     """
     return sorted(segment for folder in _folders(spool / STORED) for segment in _segments(folder))
 
@@ -81,57 +81,61 @@ def _segments(folder: Path) -> Iterator[KeptSegment]:
             path = segment_path(folder, number)
             with suppress(FileNotFoundError):
                 status = path.stat()
-                after_ns = max(after_ns, status.st_mtime_ns)  # a clock that was set back makes no hole
+                after_ns = max(after_ns, status.st_mtime_ns)  # keeps the order by number if the clock was set back
                 yield KeptSegment(after_ns, -(-status.st_size // _BLOCK_BYTES) * _BLOCK_BYTES, path)
 
 
 class StoredSegments:
-    """What one process does to the kept segments of a spool. Any number of processes may do so at once."""
+    """One process' access to the kept segments of a spool. Any number of processes may use it at once."""
 
     def __init__(self, spool: Path, settings: Settings, *, wall_ns: Callable[[], int]) -> None:
         self._spool = spool
         self._keep_ns = round(settings.keep_stored_s * 1e9)
         self._keep_bytes = settings.keep_stored_bytes
         self._wall_ns = wall_ns
-        self._looked_ns: int | None = None
+        self._pruned_ns: int | None = None
         self._bytes = 0
 
     def keep(self, segment: Path, *, length: int | None = None) -> None:
-        """Move this segment away, cut to `length`, or delete it where nothing is kept. Raises `OSError`.
+        """Move a segment here, truncated to `length`; delete it if it cannot be kept. Raises `OSError`.
 
-        Nobody may have the part of it mapped that is cut off.
+        No process may have the truncated part mapped, because reading it would raise SIGBUS.
         """
-        kept = self._moved(segment, length) if self._keep_ns and self._keep_bytes else 0
-        if not kept:
+        kept_bytes = self._move(segment, length) if self._keep_ns and self._keep_bytes else 0
+        if not kept_bytes:
             segment.unlink(missing_ok=True)
             return
-        self._bytes += kept
+        self._bytes += kept_bytes
         now_ns = self._wall_ns()
-        if self._looked_ns is None or self._bytes > self._keep_bytes or abs(now_ns - self._looked_ns) > _LOOK_NS:
+        if (
+            self._pruned_ns is None
+            or self._bytes > self._keep_bytes
+            or abs(now_ns - self._pruned_ns) > _PRUNE_INTERVAL_NS
+        ):
             try:
                 self.prune()
             except OSError as error:
-                _log.warning("kept segments cannot be looked through: %s", error)
+                _log.warning("kept segments cannot be listed, so old ones are not deleted: %s", error)
 
     def prune(self) -> None:
-        """Delete what is too old or too much. Raises `OSError`."""
-        now_ns = self._looked_ns = self._wall_ns()
+        """Delete the segments beyond the limits of age, bytes and number. Raises `OSError`."""
+        now_ns = self._pruned_ns = self._wall_ns()
         segments = kept_segments(self._spool)
         self._bytes = sum(each.bytes for each in segments)
-        for place, each in enumerate(segments):
+        for index, each in enumerate(segments):
             if (
                 each.stored_ns > now_ns - self._keep_ns
                 and self._bytes <= self._keep_bytes
-                and len(segments) - place <= FILES_MAX
+                and len(segments) - index <= FILES_MAX
             ):
                 break
             self._bytes -= each.bytes
             _delete(each.path)
 
     def make_room(self, size: int) -> bool:
-        """Delete the oldest ones, of so many bytes together; False if nothing is kept any more."""
+        """Delete the oldest kept segments, at least `size` bytes; False if there is none to delete."""
         freed = 0
-        with suppress(OSError):  # the caller names the full disk
+        with suppress(OSError):  # the caller reports the full disk
             for each in kept_segments(self._spool):
                 if freed >= size:
                     break
@@ -139,8 +143,8 @@ class StoredSegments:
                 freed += each.bytes
         return freed > 0
 
-    def _moved(self, segment: Path, length: int | None) -> int:
-        """How many bytes are kept of it now; 0 if it cannot be kept."""
+    def _move(self, segment: Path, length: int | None) -> int:
+        """Move a segment; return its size in bytes, or 0 if it cannot be kept."""
         try:
             folder = stored_in(self._spool, Spool(self._spool).log_id())
             if folder is None:
@@ -150,19 +154,23 @@ class StoredSegments:
             now_ns = self._wall_ns()
             os.utime(segment, ns=(now_ns, now_ns))
             target = folder / segment.parent.name / segment.name
-            for _ in range(_TRIES):
+            for _ in range(_ATTEMPTS):
                 create_folders(self._spool, target.parent)
                 with suppress(FileNotFoundError):  # another process deleted the folder, which was empty
                     segment.rename(target)
                     return target.stat().st_size
-        except FileNotFoundError:  # a process that was killed had moved it before
+        except FileNotFoundError:  # a process that was then killed has moved it already
             return 0
         except (OSError, SpoolUnavailable) as error:
-            _log.warning("%s is stored and cannot be kept: %s", segment, getattr(error, "strerror", None) or error)
+            _log.warning(
+                "stored segment %s cannot be kept, so it is deleted: %s",
+                segment,
+                getattr(error, "strerror", None) or error,
+            )
         return 0
 
 
 def _delete(segment: Path) -> None:
     segment.unlink(missing_ok=True)
-    with suppress(OSError):  # more segments are in it
+    with suppress(OSError):  # it contains more segments
         segment.parent.rmdir()

@@ -1,1 +1,1 @@
-"""Sources of records for a drain, and the dead letters it leaves."""
+"""Supply a drain with records, and keep the dead letters it leaves."""

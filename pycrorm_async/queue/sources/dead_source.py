@@ -1,11 +1,22 @@
-"""A dead recorder's folder, recovered: a source of everything that is whole in it, and its deletion afterwards.
+"""Drain a dead recorder's folder: supply its whole records and the computed ends, then delete the folder.
 
-It is looked at segment by segment, while what was found is given away already: nothing before a commit frame says that
-it was safe, or all was looked at. So a folder that is damaged further on gives what was safe before the damage, and
-then raises; what a repair keeps of it begins with the same records.
+**Theory of operation.** `open_dead` takes `alive`, which proves that the recorder is dead, and `drain`, which excludes
+other drainers; `release` or `remove` gives both back. No process writes the segments any more, so the only races are
+with other recoverers, which the locks exclude, and with a kill of this process.
 
-Each episode left open gets an end of status LOST behind the last record, computed from that episode's last record and
-never written: recovering again, also after being killed in between, gives the same records.
+The source scans one segment at a time (`files/scan.py`) and syncs it before it supplies any of its records: a killed
+process' last pages may exist only in the page cache. `get_batch` supplies records up to the scanner's `confirmed`
+position, that is records covered by a commit frame, and the rest only when the whole folder is scanned. So a folder
+that is damaged further on supplies its records before the damage and then raises `SpoolDamaged`. A repair of that
+folder keeps the same records at its beginning, so draining again continues with the same positions and sequences.
+
+When the scan has finished, each open episode gets a computed end: an EpisodeEnded of status LOST behind the last
+record, derived from the episode's last record and never written to the folder. A recovery that is killed and repeated
+computes the same bytes, and the log stores them once.
+
+`acknowledge` deletes segments whose records are all stored, oldest first, but keeps the last scanned one: the ends are
+computed from its header and records, and the next segment's header, which lists the open episodes too, may be damaged.
+The folder loses its last segment only in `remove`, after all records and ends are acknowledged.
 """
 
 from __future__ import annotations
@@ -22,29 +33,29 @@ from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, MENDED
 from pycrorm_async.queue.files.recorder_folder import (
-    available,
-    held_by,
+    parse_folder_name,
     remove_folder,
     remove_made_ahead,
+    wrap_os_errors,
 )
-from pycrorm_async.queue.files.scan import SegmentScanner, ValidPrefix, make_safe, scan
-from pycrorm_async.queue.files.segment import CLOSES, segment_path
+from pycrorm_async.queue.files.scan import SegmentScanner, ValidPrefix, scan, sync_segments
+from pycrorm_async.queue.files.segment import EPISODE_ENDED, segment_path
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
-from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
 __all__ = ["RecoveredQueue", "computed_ends", "open_dead"]
 
 
 def open_dead(folder: Path, *, stored: StoredSegments | None = None) -> RecoveredQueue | None:
-    """The folder as a source, or None if its recorder lives, somebody drains it, or it is gone.
+    """Open a dead folder as a source; None if its recorder lives, another process drains it, or it is missing.
 
-    None also for what was refused of a recorder whose own folder is still there: whoever drains that may put more in.
+    Also None for dead letters of a recorder whose own folder still exists, because its drainer may add more.
 
-    Takes `alive`, which proves the death, and `drain`, until `release` or `remove`. Looks at as much of it as it takes
-    to give something. Segments whose records are all stored go to `stored`, if given. Raises `SpoolDamaged`,
-    `SpoolForeign` and `SpoolUnavailable`, holding nothing.
+    Holds `alive` and `drain` until `release` or `remove`. Scans until there are records to supply. Moves segments whose
+    records are all stored to `stored`, or deletes them without it. Raises `SpoolDamaged`, `SpoolForeign` and
+    `SpoolUnavailable`; then it holds no lock.
     """
-    with available(folder):
+    with wrap_os_errors(folder):
         own = folder.with_name(folder.name.partition(".")[0])
         if own != folder and ((own / ALIVE).exists() or own.with_name(f"{own.name}{MENDED}").exists()):
             return None
@@ -57,7 +68,7 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None) -> Recovere
                 alive.release()
                 return None
             try:
-                recorder = held_by(folder.name).recorder
+                recorder = parse_folder_name(folder.name).recorder
                 return RecoveredQueue(folder, recorder, (drain, alive), stored)
             except BaseException:
                 drain.release()
@@ -68,10 +79,10 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None) -> Recovere
 
 
 class RecoveredQueue:
-    """The records of a dead recorder, in order, then the computed ends. Made by `open_dead`.
+    """The records of a dead recorder, in order, then the computed ends. Constructed by `open_dead`.
 
-    `lost` are these ends, one for each episode left open, and empty until all of the folder was looked at; `stored` is
-    the position acknowledged last.
+    `lost` holds these ends, one per open episode; it is empty until the scan has finished. `stored` is the last
+    acknowledged position.
     """
 
     def __init__(
@@ -82,127 +93,126 @@ class RecoveredQueue:
         self.lost: tuple[Record, ...] = ()
         self._recorder = recorder
         self._ready: list[Record] = []
-        """What was found and not given yet. Given is what `_settled` covers."""
-        self._settled = 0
-        self._walk = SegmentScanner(folder, recorder, found=self._ready.append)
-        while self._look_further() and self._settled == self._walk.kept.start.position:
+        """Records scanned but not supplied yet; those beyond position `_confirmed` must wait."""
+        self._confirmed = 0
+        self._scanner = SegmentScanner(folder, recorder, on_record=self._ready.append)
+        while self._scan_further() and self._confirmed == self._scanner.prefix.start.position:
             pass
         self._locks = locks
-        self._kept = stored
-        self._refused = RefusedRecords(folder)
-        self._given = self.stored = self._walk.kept.start.position
+        self._stored_segments = stored
+        self._dead_letters = DeadLetters(folder)
+        self._supplied = self.stored = self._scanner.prefix.start.position
 
     @property
     def all_stored(self) -> bool:
-        """Whether everything that is in it was looked at, given and acknowledged, with the computed ends."""
-        return self._walk.over and self.stored == self._settled
+        """Whether all records and computed ends are supplied and acknowledged."""
+        return self._scanner.finished and self.stored == self._confirmed
 
     @property
     def holds_refused(self) -> bool:
-        """Whether all of it was refused before."""
-        return held_by(self.name).episode is not None
+        """Whether this is a folder of dead letters."""
+        return parse_folder_name(self.name).episode is not None
 
     @property
     def damage(self) -> SpoolDamaged | None:
-        """What was met; nothing is given that may stand behind it."""
-        return self._walk.damage
+        """The damage met by the scan, if any; no record behind it is supplied."""
+        return self._scanner.damage
 
     def check(self) -> None:
-        """Looks at all of it, and gives nothing. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`."""
-        with available(self.folder):
+        """Scan the whole folder, supply nothing. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`."""
+        with wrap_os_errors(self.folder):
             scan(self.folder, self._recorder)
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
-        """The next records in order, at least one, at most the limits; empty when all are given.
+        """Return the next records in order, at least one, within the limits; an empty list after the last.
 
-        Raises `SpoolDamaged` where that begins which may not be kept, and `SpoolUnavailable`.
+        Raises `SpoolDamaged` when only records that damage may affect remain, and `SpoolUnavailable`.
         """
         batch = self._next(events_max, bytes_max)
-        while not (batch.complete or self._walk.over):
+        while not (batch.complete or self._scanner.finished):
             try:
-                await asyncio.to_thread(self._look_further)
+                await asyncio.to_thread(self._scan_further)
             except SpoolDamaged:
                 if not batch.records:
                     raise
                 break  # the next call raises
             batch = self._next(events_max, bytes_max)
         del self._ready[: len(batch.records)]
-        self._given += len(batch.records)
+        self._supplied += len(batch.records)
         return batch.records
 
     async def acknowledge(self, position: int) -> None:
-        """Everything up to this position is stored for good: segments that hold no more go, oldest first.
+        """Note that records up to this position are durable in the database; delete segments without others.
 
-        The last one that was looked at stays: the ends are computed from it, and the header of the next one, which says
-        what is open there too, may be damaged. Raises `SpoolUnavailable`.
+        Raises `SpoolUnavailable`.
         """
-        assert position <= self._given, "only what was given can be acknowledged"
+        assert position <= self._supplied, "only supplied records can be acknowledged"
         self.stored = max(self.stored, position)
-        bases = self._walk.kept.bases
-        with available(self.folder):
+        bases = self._scanner.prefix.bases
+        with wrap_os_errors(self.folder):
             for number in sorted(bases):
                 following = bases.get(number + 1)
                 if following is None or following - 1 > position:
                     break
-                self._forget(segment_path(self.folder, number))
+                self._delete_segment(segment_path(self.folder, number))
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
-        """As `RecorderQueue.dead_letter`; what was refused before stays where it is."""
+        """As `RecorderQueue.dead_letter`; False for records that are dead letters already, which stay here."""
         if self.holds_refused:
             return False
-        self._refused.put(records)
+        self._dead_letters.put(records)
         return True
 
     def fail(self, reason: str) -> None:
-        """Nobody puts into it, so nobody waits for room."""
+        """Do nothing: no producer waits for space in a dead folder."""
 
     def remove(self) -> None:
-        """Deletes the folder, all of which is stored, and gives up the locks. Raises `SpoolUnavailable`."""
-        assert self.all_stored, "what is not acknowledged is not deleted"
+        """Delete the folder, all of whose records are stored, and release the locks. Raises `SpoolUnavailable`."""
+        assert self.all_stored, "records that are not acknowledged must not be deleted"
         try:
-            with available(self.folder):
+            with wrap_os_errors(self.folder):
                 remove_made_ahead(self.folder)
-                self._forget_rest()
+                self._keep_last_segments()
                 remove_folder(self.folder)
         finally:
             self.release()
 
     def release(self) -> None:
-        """Gives up the locks; what was not acknowledged is given again by whoever recovers next. Twice is once."""
-        self._refused.release()
+        """Release the locks; the next recovery supplies the unacknowledged records again. Idempotent."""
+        self._dead_letters.release()
         for lock in self._locks:
             lock.release()
 
-    def _forget(self, segment: Path, *, length: int | None = None) -> None:
-        if self._kept is None:
+    def _delete_segment(self, segment: Path, *, length: int | None = None) -> None:
+        if self._stored_segments is None:
             segment.unlink(missing_ok=True)
         else:
-            self._kept.keep(segment, length=length)
+            self._stored_segments.keep(segment, length=length)
 
-    def _forget_rest(self) -> None:
-        """Of the last segment what stands before the cut; one without a record is not kept."""
-        cut = self._walk.kept.cut
-        for number, base in sorted(self._walk.kept.bases.items()):
+    def _keep_last_segments(self) -> None:
+        """Move the remaining segments to the stored ones, truncated at the cut; one without a record is not kept."""
+        cut = self._scanner.prefix.cut
+        for number, base in sorted(self._scanner.prefix.bases.items()):
             if base <= cut.position:
                 length = cut.offset if number == cut.number else None
-                self._forget(segment_path(self.folder, number), length=length)
+                self._delete_segment(segment_path(self.folder, number), length=length)
 
-    def _look_further(self) -> bool:
-        """At the next segment, which is on the disk then; False if there is no more."""
-        with available(self.folder):
-            if self._walk.over:
+    def _scan_further(self) -> bool:
+        """Scan and sync the next segment; False if there is none."""
+        with wrap_os_errors(self.folder):
+            if self._scanner.finished:
                 return False
-            more = self._walk.step()
+            more = self._scanner.step()
             if more:
-                make_safe(self.folder, [self._walk.kept.cut.number])
+                sync_segments(self.folder, [self._scanner.prefix.cut.number])
         if not more:
-            self.lost = computed_ends(self._walk.kept)
+            self.lost = computed_ends(self._scanner.prefix)
             self._ready += self.lost
-        self._settled = self._walk.settled + len(self.lost)
+        self._confirmed = self._scanner.confirmed + len(self.lost)
         return more
 
     def _next(self, events_max: int, bytes_max: int) -> _Batch:
-        records = self._ready[: min(events_max, self._settled - self._given)]
+        records = self._ready[: min(events_max, self._confirmed - self._supplied)]
         sizes = [len(record.payload) for record in records]
         total = sum(sizes)
         if total < bytes_max:
@@ -212,24 +222,24 @@ class RecoveredQueue:
 
 
 class _Batch(NamedTuple):
-    """`complete`: one more would pass a limit."""
+    """Records to supply. `complete`: one more would exceed a limit."""
 
     records: list[Record]
     complete: bool
 
 
-def computed_ends(kept: ValidPrefix) -> tuple[Record, ...]:
-    """An end of status LOST for each episode that is open, behind the last record."""
+def computed_ends(prefix: ValidPrefix) -> tuple[Record, ...]:
+    """Compute an EpisodeEnded of status LOST for each open episode, positioned behind the last record."""
     return tuple(
         Record(
-            position=kept.cut.position + 1 + index,
+            position=prefix.cut.position + 1 + index,
             episode=episode,
             sequence=last.sequence + 1,
-            type=CLOSES,
+            type=EPISODE_ENDED,
             version=1,
             wall_ns=last.wall_ns,
             monotonic_ns=last.monotonic_ns,
             payload=LOST,
         )
-        for index, (episode, last) in enumerate(sorted(kept.open.items()))
+        for index, (episode, last) in enumerate(sorted(prefix.open.items()))
     )

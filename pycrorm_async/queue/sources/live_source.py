@@ -1,9 +1,9 @@
-"""The folder of a recorder that lives in another process, as a source: what it has synced, as it comes.
+"""Drain the folder of a recorder that lives in another process: supply its records as soon as they are synced.
 
-Whoever holds `drain` reads; the recorder alone deletes segments, when it sees in `progress` that they are stored. So
-either side may be killed at any moment. A drainer that is killed is followed by one that starts behind what is stored,
-and what was appended and not yet said is appended again, which stores it once. A recorder that is killed leaves a dead
-folder: this source ends, and recovery gives all of it once more, `progress` ignored.
+The holder of `drain` reads; only the recorder deletes segments, after it reads in `progress` that they are stored. So
+either process may be killed at any time. After a killed drainer the next one starts behind the stored position and
+appends the records in between again, which the log stores once. After a killed recorder this source ends, and recovery
+supplies the whole folder again without regard to `progress`.
 """
 
 from __future__ import annotations
@@ -23,58 +23,60 @@ from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileLock, is_locked
 from pycrorm_async.queue.files.names import ALIVE, DRAIN
 from pycrorm_async.queue.files.reader import Cursor, Reader
-from pycrorm_async.queue.files.recorder_folder import available
-from pycrorm_async.queue.files.scan import checked_header
+from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
+from pycrorm_async.queue.files.scan import read_header
 from pycrorm_async.queue.files.segment import header_bytes, map_segment, segment_numbers, segment_path
-from pycrorm_async.queue.sources.dead_letters import RefusedRecords
+from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
 __all__ = ["LiveQueue"]
 
 _PAUSE_S_MIN = 0.002
 _PAUSE_S_MAX = 0.02
-_LOOK_ALIVE_S = 0.25
+"""Bounds the pause between two reads of `progress`, and with it the delay until a synced record is supplied."""
+_ALIVE_CHECK_S = 0.25
+"""Interval between two tests of the recorder's `alive`."""
 
 
 class LiveQueue:
-    """Made by `take`; used by one task, and let go of with `release`."""
+    """A live recorder's folder as a source. Constructed by `take`, used by one task, ended by `release`."""
 
     def __init__(self, folder: Path, recorder: EpisodeId, drain: FileLock, progress: Progress) -> None:
-        """Used by `take`, which holds the lock. Raises as that does."""
+        """For `take`, which holds the lock. Raises as `take` does."""
         self.folder = folder
         self.name = folder.name
         self._recorder = recorder
         self._drain = drain
         self._progress = progress
-        self._refused = RefusedRecords(folder)
+        self._dead_letters = DeadLetters(folder)
         before = progress.drained()
-        self._said = before._replace(note=DrainNote())  # what a drainer before said in words is not ours to repeat
-        self._reader = Reader(recorder=recorder, start=self._segment_of(before.stored), load=self._load)
+        self._status = before._replace(note=DrainNote())  # drops the note of an earlier drainer
+        self._reader = Reader(recorder=recorder, start=self._start_of(before.stored), load=self._load)
         self._reader.skip_to(min(before.stored, progress.recorded().synced))
         self._until: int | None = None
-        self._alive_looked_s = 0.0
-        progress.tell_drained(self._said)
+        self._alive_checked_s = 0.0
+        progress.write_drain_status(self._status)
 
     @classmethod
     def take(cls, folder: Path) -> Self | None:
-        """The folder as a source, or None: it is not offered, somebody drains it, it is all drained, or its recorder
-        is dead.
+        """Open the folder as a source; None if it is not offered, drained by another process, closed and drained, or
+        its recorder is dead.
 
-        Reads up to a segment to find where to go on. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`,
-        holding nothing.
+        Reads at most one segment to find the first record that is not stored. Raises `SpoolDamaged`, `SpoolForeign` and
+        `SpoolUnavailable`; then it holds no lock.
         """
-        with available(folder):
+        with wrap_os_errors(folder):
             progress = Progress.open(folder, writing=True)
             if progress is None:
                 return None
-            taken: Self | None = None
+            source: Self | None = None
             try:
-                taken = cls._take(folder, progress)
-            except FileNotFoundError:  # a segment that was stored and deleted while this looked: the next look finds on
-                taken = None
+                source = cls._take(folder, progress)
+            except FileNotFoundError:  # the recorder deleted a stored segment meanwhile: the next attempt succeeds
+                source = None
             finally:
-                if taken is None:
+                if source is None:
                     progress.close()
-            return taken
+            return source
 
     @classmethod
     def _take(cls, folder: Path, progress: Progress) -> Self | None:
@@ -94,23 +96,23 @@ class LiveQueue:
         return None
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
-        """The next synced records in order, at least one, at most the limits (a single larger record comes alone).
+        """Return the next synced records in order, at least one, within the limits (a larger record comes alone).
 
-        Waits until one is there, but not for more: what one sync covers comes together. Empty when the recorder is dead
-        or has closed its queue, or after `finish`, and then for ever.
+        Waits for the first record but not for more, because the records of one sync arrive together. Returns an empty
+        list, now and in every later call, when the recorder is dead or has closed its queue, or after `finish`.
         """
         pause_s = _PAUSE_S_MIN
-        while not self._ended():
+        while not self._has_ended():
             synced = self._progress.recorded().synced
             last = synced if self._until is None else min(synced, self._until)
-            if last > self.given:
+            if last > self.supplied:
                 try:
-                    with available(self.folder):
+                    with wrap_os_errors(self.folder):
                         batch = self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
                 except (SpoolDamaged, SpoolUnavailable):
                     if self.is_alive:
                         raise
-                    return []  # its recorder went on in another folder (`relocation.py`), or it is dead
+                    return []  # the recorder moved to another folder (`relocation.py`), or it is dead
                 self._reader.cursor = batch.after
                 return batch.records
             await asyncio.sleep(pause_s)
@@ -118,108 +120,108 @@ class LiveQueue:
         return []
 
     async def acknowledge(self, position: int) -> None:
-        """Everything up to this position is stored for good: the recorder may delete it. Raises `SpoolUnavailable`."""
-        assert position <= self.given, "only what was given can be acknowledged"
-        if position > self._said.stored:
-            self._say(self._said._replace(stored=position))
+        """Publish that records up to this position are durable in the database. Raises `SpoolUnavailable`."""
+        assert position <= self.supplied, "only supplied records can be acknowledged"
+        if position > self._status.stored:
+            self._write_status(self._status._replace(stored=position))
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
         """As `RecorderQueue.dead_letter`."""
-        self._refused.put(records)
+        self._dead_letters.put(records)
         return True
 
     def fail(self, reason: str) -> None:
-        """Whoever waits for room there is told; the first reason stays."""
-        if self._said.note.given_up is None:
-            self._say_in_words(given_up=reason)
+        """Publish why no more records will be acknowledged, so that waiting producers fail. The first reason stays."""
+        if self._status.note.given_up is None:
+            self._update_note(given_up=reason)
 
     def finish(self) -> None:
-        """Nothing is given any more beyond what is synced now."""
+        """End this source behind the records that are synced now."""
         self._until = self._progress.recorded().synced
 
     def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None:
-        """Everything up to this position shows in the tables, or never will: of the episodes that are `stopped`, by id.
+        """Publish that records up to this position are visible in the tables, except those of `stopped` episodes.
 
-        Raises `SpoolUnavailable`.
+        `stopped` maps episode id to reason. Raises `SpoolUnavailable`.
         """
-        assert position <= self.given, "only what was given can be shown"
-        note = msgspec.structs.replace(self._said.note, stopped=dict(stopped))
-        said = self._said._replace(folded=max(position, self._said.folded), note=note)
-        if said != self._said:
-            self._say(said)
+        assert position <= self.supplied, "only supplied records can be visible"
+        note = msgspec.structs.replace(self._status.note, stopped=dict(stopped))
+        status = self._status._replace(folded=max(position, self._status.folded), note=note)
+        if status != self._status:
+            self._write_status(status)
 
     def mark_unavailable(self, reason: str | None) -> None:
-        """Why the database takes nothing now; None when it does again. Raises `SpoolUnavailable`."""
-        self._say_in_words(away=reason)
+        """Publish why the database is unavailable; None when it is available again. Raises `SpoolUnavailable`."""
+        self._update_note(away=reason)
 
     @property
-    def given(self) -> int:
-        """Position of the last record that was given."""
+    def supplied(self) -> int:
+        """Position of the last supplied record."""
         return self._reader.cursor.position
 
     @property
     def stored(self) -> int:
-        """Position acknowledged last, by this drainer or one before."""
-        return self._said.stored
+        """Position last acknowledged by this drainer or an earlier one."""
+        return self._status.stored
 
     @property
     def is_alive(self) -> bool:
-        """Whether the recorder lives, and does not delete its folder. Raises `SpoolUnavailable`."""
-        with available(self.folder):
+        """Whether the recorder lives and has not deleted its folder. Raises `SpoolUnavailable`."""
+        with wrap_os_errors(self.folder):
             return is_locked(self.folder / ALIVE)
 
     @property
     def is_closed(self) -> bool:
-        """Whether the recorder will put nothing more."""
+        """Whether the recorder has closed its queue."""
         return self._progress.recorded().closed
 
     def release(self) -> None:
-        """Another may drain it. Twice is once."""
+        """Close the files and release `drain`. Idempotent."""
         self._reader.close()
         self._progress.close()
-        self._refused.release()
+        self._dead_letters.release()
         self._drain.release()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _ended(self) -> bool:
-        if self._until is not None and self.given >= self._until:
+    def _has_ended(self) -> bool:
+        if self._until is not None and self.supplied >= self._until:
             return True
         recorded = self._progress.recorded()
-        if recorded.closed and self.given >= recorded.synced:
+        if recorded.closed and self.supplied >= recorded.synced:
             return True
-        # Looked at also while there is much to give: recovery gives it all again, so what is given now is given twice.
+        # Test this also under load: once the recorder is dead, recovery supplies all records again.
         now_s = asyncio.get_running_loop().time()
-        if now_s - self._alive_looked_s < _LOOK_ALIVE_S:
+        if now_s - self._alive_checked_s < _ALIVE_CHECK_S:
             return False
-        self._alive_looked_s = now_s
+        self._alive_checked_s = now_s
         return not self.is_alive
 
-    def _say_in_words(self, **words: object) -> None:
-        said = self._said._replace(note=msgspec.structs.replace(self._said.note, **words))
-        if said != self._said:
-            self._say(said)
+    def _update_note(self, **fields: object) -> None:
+        status = self._status._replace(note=msgspec.structs.replace(self._status.note, **fields))
+        if status != self._status:
+            self._write_status(status)
 
-    def _say(self, said: DrainStatus) -> None:
-        with available(self.folder):
-            self._progress.tell_drained(said)
-        self._said = said
+    def _write_status(self, status: DrainStatus) -> None:
+        with wrap_os_errors(self.folder):
+            self._progress.write_drain_status(status)
+        self._status = status
 
-    def _segment_of(self, stored: int) -> Cursor:
-        """Before the first record of the segment that holds what follows this position, or of the oldest there is."""
-        found: Cursor | None = None
+    def _start_of(self, stored: int) -> Cursor:
+        """Return the beginning of the segment with the record behind this position, or of the oldest segment."""
+        start: Cursor | None = None
         for number in segment_numbers(self.folder):
             path = segment_path(self.folder, number)
             try:
                 buffer = map_segment(path)
-            except FileNotFoundError:  # stored, and deleted since it was listed
+            except FileNotFoundError:  # stored and deleted since the listing
                 continue
             with buffer:
-                header = checked_header(path, buffer, recorder=self._recorder, number=number)
-            if header is None or (found is not None and header.base - 1 > stored):
+                header = read_header(path, buffer, recorder=self._recorder, number=number)
+            if header is None or (start is not None and header.base - 1 > stored):
                 break
-            found = Cursor(number, header_bytes(len(header.open)), header.base - 1)
-        return found or Cursor(1, header_bytes(0), 0)
+            start = Cursor(number, header_bytes(len(header.open)), header.base - 1)
+        return start or Cursor(1, header_bytes(0), 0)
 
     def _load(self, number: int) -> tuple[Path, Buffer]:
         path = segment_path(self.folder, number)
