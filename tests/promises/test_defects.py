@@ -1,4 +1,4 @@
-"""Every defect the README names has its test, and every test of a defect is named in the README."""
+"""Every defect that tests/README.md names has its test, and every test of a defect is named there."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 HERE = Path(__file__).parent
 ROWS = re.findall(
-    r"^\| (\w+) \| ([^|]+) \| ([^|]+) \| `(test_\w+)` \|$", (HERE.parent.parent / "README.md").read_text(), re.MULTILINE
+    r"^\| (\w+) \| ([^|]+) \| ([^|]+) \| `(test_\w+)` \|$", (HERE.parent / "README.md").read_text(), re.MULTILINE
 )
 
 

@@ -1,6 +1,6 @@
 """Measured defects of the system the thesis describes, each beside what this one keeps true: what is recorded.
 
-Numbers are those of the table in the README. Every test goes the whole way: a plan in a Bullet world, a memory in a
+Numbers as in tests/README.md. Every test goes the whole way: a plan in a Bullet world, a memory in a
 SQLite file, the mapped classes.
 """
 

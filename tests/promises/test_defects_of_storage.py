@@ -1,6 +1,6 @@
 """Measured defects of the system the thesis describes, each beside what this one keeps true: how it is stored.
 
-Numbers are those of the table in the README. Every test goes the whole way: a plan, a memory in a SQLite file, and what
+Numbers as in tests/README.md. Every test goes the whole way: a plan, a memory in a SQLite file, and what
 the mapped classes, the file itself or another process then say.
 """
 

@@ -1,6 +1,6 @@
 """Gaps of the systems that came after the thesis' one, read in their code, each beside what this one keeps true.
 
-Numbers are those of the table in the README; they follow the order in which the gaps were noted.
+Numbers are those of the table in tests/README.md; they follow the order in which the gaps were noted.
 """
 
 from __future__ import annotations

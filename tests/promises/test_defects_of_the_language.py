@@ -1,6 +1,6 @@
 """Measured defects of the plan language of the thesis' time, each beside what ours keeps true, in the memory as well.
 
-Numbers are those of the table in the README.
+Numbers are those of the table in tests/README.md.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""What README.md shows does what it says: its plan runs, its questions are answered, its commands exist."""
+"""The pages of documentation do what they say: plans run, queries are answered, commands and links exist."""
 
 import asyncio
 import contextlib
 import re
+import shlex
 import sqlite3
 import textwrap
 from pathlib import Path
@@ -15,8 +16,40 @@ from pycrorm_async.cli.main import app
 from pycrorm_async.learning import load_policy
 from tests.commands import answer, pycrorm
 
-README = (Path(__file__).parent.parent.parent / "README.md").read_text()
-PLAN, QUESTIONS, CELLS, TIDY, THEN, RATE, BETTER = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+ROOT = Path(__file__).parent.parent.parent
+PAGES = {
+    str(path.relative_to(ROOT)): path.read_text()
+    for path in (ROOT / "README.md", *sorted(ROOT.glob("*/README.md")), *sorted(ROOT.glob("pycrorm_async/*/README.md")))
+}
+README = PAGES["README.md"]
+
+
+def python_of(page: str) -> list[str]:
+    """The blocks of Python on a page."""
+    return re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL)
+
+
+PLAN, QUESTIONS, CELLS = python_of("README.md")
+[TIDY] = python_of("pycrorm_async/plan/README.md")
+THEN, RATE = python_of("pycrorm_async/query/README.md")
+[BETTER] = python_of("pycrorm_async/learning/README.md")
+
+
+def test_the_readme_is_short_and_every_link_of_a_page_leads_to_a_file() -> None:
+    assert len(README.splitlines()) <= 200
+    for page, content in PAGES.items():
+        for link in re.findall(r"\]\((?!https?:)([^)#]+)\)", content):
+            assert (ROOT / page).parent.joinpath(link).exists(), f"{page} links to {link}"
+
+
+def test_the_commands_after_the_plan_run_one_after_the_other(tmp_path: Path) -> None:
+    (tmp_path / "hello.py").write_text(PLAN)
+    [commands] = re.findall(r"<!-- run: own plan -->\n```sh\n(.*?)```", README, re.DOTALL)
+    lines = [shlex.split(line, comments=True) for line in commands.splitlines()]
+    assert [words[:2] for words in lines] == [["pycrorm", verb] for verb in ("run", "episodes", "show", "verify")]
+    for _, *words in lines:
+        done = pycrorm(*words, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
