@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.databases import Server, server_in
+from tests.soak_turns import TURN_S_MAX, current_commit, place_of, turn_of
+
+_BEGAN = pytest.StashKey[float]()
 
 
 @pytest.fixture(scope="session")
@@ -30,20 +34,49 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str
     running.drop(url)  # some hundred files, which would be written to the disk and deleted at the end of all
 
 
-_LONG = """
-test_verify test_verify_damage test_custom_projections test_cancelled test_rebuild_kill test_copy test_dynamic_classes
-test_contradictions test_session_views
-""".split()
-"""Modules whose tests take long on a server; there they run on demand, and the others show that it answers alike."""
-_LONGER = "test_bad_server test_bad_spool test_dead_letters_killed cli/test_custom_projections".split()
-"""Modules that walk through many processes, each started anew: all of them run on demand."""
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--soak-turn",
+        nargs="?",
+        const="",
+        metavar="COMMIT",
+        help="of the tests marked soak, run the tenth whose turn COMMIT is (without one: the commit checked out), with "
+        "loops shortened, and start none after ten minutes; use with -m soak",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.stash[_BEGAN] = time.monotonic()
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes long is left to `-m soak`."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark the variants that `soak_on` names as soak, and leave of the soak only the turn that was asked for."""
     for item in items:
-        stem = item.path.stem
-        is_longer = stem in _LONGER or f"{item.path.parent.name}/{stem}" in _LONGER
-        if is_longer or (stem in _LONG and "[postgresql" in item.name):
+        variants = (
+            item.callspec.params.values() if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ()
+        )
+        if any(variant in mark.args for mark in item.iter_markers("soak_on") for variant in variants):
             item.add_marker(pytest.mark.soak)
+    commit = config.getoption("--soak-turn")
+    if commit is None:
+        return
+    turn = turn_of(commit or current_commit(config.rootpath))
+    others = [each for each in items if each.get_closest_marker("soak") and place_of(each.nodeid) != turn]
+    left_out = set(others)
+    config.hook.pytest_deselected(items=others)
+    items[:] = [each for each in items if each not in left_out]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Start no test of a turn after its time is up."""
+    is_in_turn = item.config.getoption("--soak-turn") is not None and item.get_closest_marker("soak")
+    if is_in_turn and time.monotonic() - item.config.stash[_BEGAN] > TURN_S_MAX:
+        pytest.skip("the time of this turn is up")
+
+
+@pytest.fixture
+def in_turn(request: pytest.FixtureRequest) -> bool:
+    """True in a turn of the soak, where loops of thousands of rounds are shortened."""
+    return request.config.getoption("--soak-turn") is not None

@@ -11,6 +11,9 @@ from tests.databases import Server, ask
 from tests.proxy import proxy_before
 from tests.store.test_postgresql_refusals import WRITTEN, guarded_in
 
+pytestmark = pytest.mark.soak
+"""Each test starts many processes anew."""
+
 PLAN = '''
 from dataclasses import dataclass
 from pycrorm_async.plan import ActionAbstract

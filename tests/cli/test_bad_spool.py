@@ -13,6 +13,9 @@ from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, environment, one_line_of, pycrorm
 from tests.databases import ask
 
+pytestmark = pytest.mark.soak
+"""Each test starts many processes anew."""
+
 NOTES = "SELECT text FROM note_action ORDER BY id"
 EVENTS = 11
 """Of the plan, with the declaration."""

@@ -13,6 +13,9 @@ import pytest
 
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 
+pytestmark = pytest.mark.soak
+"""Each test starts many processes anew."""
+
 PLAN = '''
 from dataclasses import dataclass
 from pycrorm_async.plan import ActionAbstract

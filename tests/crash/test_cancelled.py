@@ -14,6 +14,8 @@ from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import episode_text
@@ -31,6 +33,9 @@ from tests.databases import ask
 from tests.projections.event_script import SAYING, Script, declarations, name_of
 from tests.queue.factories import make
 from tests.writer.fakes import KeptSource
+
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 SETTINGS = Settings(batch_events_max=10, idle_ms=1, batch_age_ms=1)
 CLOSING = {"AsyncAdapt_aiosqlite_connection._terminate_graceful_close", "Connection._cancel"}

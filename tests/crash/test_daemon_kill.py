@@ -44,10 +44,12 @@ def test_daemons_and_plans_are_killed_and_every_step_is_there_once(database_url:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("round_", range(5))
-def test_daemons_and_plans_are_killed_a_hundred_times(database_url: str, tmp_path: Path, round_: int) -> None:
+def test_daemons_and_plans_are_killed_a_hundred_times(
+    database_url: str, tmp_path: Path, round_: int, in_turn: bool
+) -> None:
     lab = Lab(tmp_path, database_url, random.randrange(2**31))
     try:
-        kill_again_and_again(lab, robots=5, kills=20)
+        kill_again_and_again(lab, robots=5, kills=5 if in_turn else 20)
     finally:
         lab.clear()
 

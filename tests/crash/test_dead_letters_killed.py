@@ -21,6 +21,9 @@ from tests.crash.test_crash_points import LIVE, _made, drained, in_a_child, stor
 from tests.queue.factories import RECORDER, STILL, drain, ended, episode, node, started
 from tests.writer.fakes import CountingFold
 
+pytestmark = pytest.mark.soak
+"""Each test starts many processes anew."""
+
 NO_TEXT = b'"\xff"'  # no database holds it
 LOST = '{"status":"LOST"}'
 

@@ -16,6 +16,9 @@ from tests.databases import ask
 from tests.projections.rebuild_cases import TYPES, folded_elsewhere, picking, store, traces
 from tests.table_comparison import differences, tables_of
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+
 EPISODES = 30
 BATCH_EVENTS = 60
 
@@ -64,8 +67,8 @@ async def test_so_it_is_when_workers_fold(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("workers", [1, 2])
-async def test_killed_at_fifty_points_people_see_the_same(database_url: str, workers: int) -> None:
-    await kill_again_and_again(database_url, 50, workers=workers)
+async def test_killed_at_fifty_points_people_see_the_same(database_url: str, workers: int, in_turn: bool) -> None:
+    await kill_again_and_again(database_url, 8 if in_turn else 50, workers=workers)
 
 
 async def test_a_worker_that_is_killed_costs_time_and_no_event(
@@ -121,5 +124,7 @@ async def test_processes_that_record_and_read_meanwhile_see_nothing_of_it(databa
 
 
 @pytest.mark.soak
-async def test_processes_that_record_and_read_for_long_see_nothing_of_it(database_url: str, tmp_path: Path) -> None:
-    await beside_others(database_url, tmp_path, episodes=10_000, rebuilds=5, readers=4)
+async def test_processes_that_record_and_read_for_long_see_nothing_of_it(
+    database_url: str, tmp_path: Path, in_turn: bool
+) -> None:
+    await beside_others(database_url, tmp_path, episodes=1_000 if in_turn else 10_000, rebuilds=5, readers=4)

@@ -35,6 +35,9 @@ from tests.commands import environment
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+
 CAREFUL = declared(
     "CarefulPickUpAction",
     "careful_pick_up_action",

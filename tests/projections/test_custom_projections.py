@@ -32,6 +32,9 @@ from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, mixed, name_of, row
 from tests.projections.sql_queries import ask, names
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+
 _TRIES = table("grasp_try", column("arm"), column("status"))
 _RATE = select(_TRIES.c.arm, func.count().label("tries")).group_by(_TRIES.c.arm)
 

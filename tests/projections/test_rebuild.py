@@ -150,8 +150,10 @@ async def test_what_is_folded_beside_rebuilds_is_in_the_tables_and_no_reader_mis
 
 
 @pytest.mark.soak
-async def test_what_is_folded_beside_many_rebuilds_is_in_the_tables(database_url: str, tmp_path: Path) -> None:
-    await beside(database_url, tmp_path, rebuilds=50)
+async def test_what_is_folded_beside_many_rebuilds_is_in_the_tables(
+    database_url: str, tmp_path: Path, in_turn: bool
+) -> None:
+    await beside(database_url, tmp_path, rebuilds=8 if in_turn else 50)
 
 
 async def beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:

@@ -47,6 +47,9 @@ from tests.projections.verify_cases import (
 )
 from tests.promises.test_random_plans import play
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+
 
 @pytest.fixture
 async def log(database_url: str) -> AsyncIterator[EventLog]:

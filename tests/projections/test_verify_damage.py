@@ -29,6 +29,9 @@ from tests.projections.verify_cases import (
     shown,
 )
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+
 TRIGGERS = "SELECT name FROM sqlite_master WHERE type = 'trigger'"
 
 

@@ -16,6 +16,9 @@ from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, name_of
 from tests.projections.sql_queries import stored_and_folded
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+
 WAVE = declared("Wave", "wave", field("times", "integer", 2))
 WAVE_MOTION = declared("Wave", "wave", field("times", "integer", 2), kind="motion")
 WAVE_AS_POSE = declared("Wave", "pose", field("times", "integer", 2))

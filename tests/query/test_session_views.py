@@ -53,6 +53,9 @@ from tests.projections.event_script import (
 )
 from tests.projections.sql_queries import ask, names
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+
 CAREFUL = declared(
     "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5),
     field("via", "list", 6, item="pose"), bases=("PickUpAction",),

@@ -1,0 +1,43 @@
+"""Chooses the turn of the soak that a commit runs: a tenth of the tests marked `soak`, another one at another commit.
+
+    python -m pytest -m soak --soak-turn              the turn of the commit that is checked out, as .ci/run does
+    python -m pytest -m soak --soak-turn=4f1c2ab      the turn of that commit, again
+    python -m pytest -m soak                          every test, in full length
+
+A test's place is the hash of its node id, so that it stays where it is when others come or go. Outside of a git
+checkout the turn is that of `FIXED`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+from pathlib import Path
+from typing import Final
+
+TURNS: Final = 10
+"""Ten turns keep one within ten minutes of two cores."""
+TURN_S_MAX: Final = 600.0
+"""No test of a turn begins later than this; what a turn leaves over is reported as skipped."""
+FIXED: Final = "0"
+
+
+def turn_of(commit: str) -> int:
+    """Return the turn of a commit. The first seven digits of its id count, so that the short id gives the same."""
+    return int(commit[:7], 16) % TURNS
+
+
+def place_of(node_id: str) -> int:
+    """Return the turn in which the test with this node id runs."""
+    return int.from_bytes(hashlib.sha256(node_id.encode()).digest()[:8], "big") % TURNS
+
+
+def current_commit(folder: Path) -> str:
+    """Return the id of the commit checked out in `folder`, or `FIXED` where there is no git or no repository."""
+    try:
+        done = subprocess.run(
+            ["git", "rev-parse", "HEAD"], cwd=folder, capture_output=True, text=True, check=True, timeout=10
+        )
+    except (OSError, subprocess.SubprocessError):
+        return FIXED
+    return done.stdout.strip()
