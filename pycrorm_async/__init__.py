@@ -1,4 +1,4 @@
-"""Episodic memory for robots: plans remembered as events, asked about as tables.
+"""pycrorm-async records robot plans as events and offers them as relational tables.
 
 >>> async with Memory.open("sqlite:///memory.db") as memory:
 ...     async with memory.episode(description="Tutorial"):
@@ -7,8 +7,9 @@
 ...     async with memory.session() as session:
 ...         actions = (await session.scalars(select(Action))).all()
 
-The parts a user meets: `pycrorm_async.plan` (designators), `pycrorm_async.world` (where they act), `pycrorm_async.orm`
-(the classes to ask for). Importing this loads nothing else.
+Users also import from `pycrorm_async.plan` (designators), `pycrorm_async.world` (the simulated world) and
+`pycrorm_async.orm` (the mapped classes to query). Importing this package loads no other module; each public name loads
+its module on first use.
 """
 
 from importlib import import_module
@@ -27,7 +28,7 @@ __version__ = "0.1.0"
 
 __all__ = ["Memory", "MemoryStatus", "Projection", "PycrormError", "Reading", "Settings", "UserView", "recover"]
 
-_HOMES = {
+_MODULES = {
     "Memory": "memory",
     "MemoryStatus": "memory",
     "Projection": "projections.custom.projection",
@@ -40,6 +41,6 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

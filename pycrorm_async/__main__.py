@@ -1,4 +1,4 @@
-"""`python -m pycrorm_async`: the same as the command `pycrorm`."""
+"""`python -m pycrorm_async` runs the command `pycrorm`."""
 
 from pycrorm_async.cli.main import main
 

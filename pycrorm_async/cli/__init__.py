@@ -1,1 +1,1 @@
-"""The command `pycrorm`: one file a verb. Answers on stdout, everything else on stderr."""
+"""This package implements the command `pycrorm`, one file per verb; results go to stdout, other output to stderr."""

@@ -1,7 +1,7 @@
-"""`pycrorm demo`: the demonstration of the thesis (5.1): a plan in a kitchen, remembered and asked about.
+"""`pycrorm demo` runs the demonstration of the thesis (5.1): it records a plan in a kitchen and queries it.
 
-The robot parks its arms, raises its torso, finds a place to stand, picks up the cereal, finds a place on the kitchen
-island and puts the cereal there. Then five questions are asked of the memory in plain Python.
+The robot parks its arms, raises its torso, finds a base pose, picks up the cereal, finds a place on the kitchen island
+and puts the cereal there. The demo then runs five queries on the memory in plain Python.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ __all__ = ["demo", "kitchen_world", "breakfast"]
 
 
 def kitchen_world() -> None:
-    """The scene of the thesis: kitchen, robot, milk and cereal, in the world of this context."""
+    """Add the scene of the thesis (kitchen, robot, milk and cereal) to the world of this context."""
     WorldObject("kitchen", ObjectType.ENVIRONMENT)
     WorldObject("pr2", ObjectType.ROBOT)
     WorldObject("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))
@@ -57,7 +57,7 @@ def kitchen_world() -> None:
 
 
 async def breakfast() -> None:
-    """Brings the cereal from the counter to the kitchen island."""
+    """Bring the cereal from the counter to the kitchen island."""
     cereal = ObjectDesignatorDescription(names=["cereal"])
     kitchen = ObjectDesignatorDescription(names=["kitchen"]).resolve()
     robot = ObjectDesignatorDescription(names=["pr2"]).resolve()
@@ -65,43 +65,44 @@ async def breakfast() -> None:
         await ParkArmsActionPerformable(Arms.BOTH).perform()
         await MoveTorsoAction([0.3]).resolve().perform()
 
-        stand = CostmapLocation(target=cereal.resolve(), reachable_for=robot).resolve()
-        arm = stand.reachable_arms[0]
-        await Navigate([stand.pose]).resolve().perform()
+        base_pose = CostmapLocation(target=cereal.resolve(), reachable_for=robot).resolve()
+        arm = base_pose.reachable_arms[0]
+        await Navigate([base_pose.pose]).resolve().perform()
         await PickUp(cereal, [arm], [Grasp.FRONT]).resolve().perform()
         await ParkArmsAction([Arms.BOTH]).resolve().perform()
 
         place = SemanticCostmapLocation("kitchen_island_surface", kitchen, cereal.resolve()).resolve()
-        stand = CostmapLocation(place.pose, reachable_for=robot, reachable_arm=arm).resolve()
-        await Navigate([stand.pose]).resolve().perform()
+        base_pose = CostmapLocation(place.pose, reachable_for=robot, reachable_arm=arm).resolve()
+        await Navigate([base_pose.pose]).resolve().perform()
         await Place(cereal, [place.pose], [arm]).resolve().perform()
         await ParkArmsActionPerformable(Arms.BOTH).perform()
 
 
 def demo(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> None:
-    """The thesis' plan, remembered and asked about."""
-    answers = asyncio.run(_remembered(url, spool))
+    """Run and record the thesis' example plan, then query it."""
+    answers = asyncio.run(_run_and_query(url, spool))
     if as_json:
         print_json(answers.document())
         return
     answers.print()
     address = DatabaseAddress.parse(url)
-    where = "" if url == DEFAULT_URL else f" --url {shlex.quote(address.to_type)}"
-    note(
-        f"The database is {address}. Look further with: pycrorm episodes{where} | pycrorm show {answers.episode}{where}"
-    )
+    option = "" if url == DEFAULT_URL else f" --url {shlex.quote(address.to_type)}"
+    note(f"The database is {address}. Next: pycrorm episodes{option} | pycrorm show {answers.episode}{option}")
 
 
 @dataclass
 class Answers:
-    """What the demo asked, and what it was told."""
+    """The recorded task tree, and title, column names and rows of each query.
+
+    The titles are keys of the `--json` document, so they stay as they are.
+    """
 
     episode: int
     tree: list[NodeSummary]
     questions: list[tuple[str, Sequence[str], list[tuple[Any, ...]]]]
 
     def print(self) -> None:
-        stdout.print("[bold]The task tree, as it was remembered[/]")
+        stdout.print("[bold]The recorded task tree[/]")
         print_tree(self.tree)
         for title, columns, rows in self.questions:
             stdout.print()
@@ -117,38 +118,38 @@ class Answers:
         }
 
 
-async def _remembered(url: str, spool: Path | None) -> Answers:
+async def _run_and_query(url: str, spool: Path | None) -> Answers:
     async with Memory.open(url, spool=spool) as memory:
         async with memory.episode(description="Tutorial for getting familiar with the memory", plan="demo") as episode:
             with BulletWorld():
                 kitchen_world()
                 await breakfast()
 
-        # A new action is a dataclass and nothing else.
+        # A dataclass is enough to define a new action.
         @dataclass
         class SayingActionPerformable(ActionAbstract):
             text: str
 
             async def perform(self) -> None:
-                """Says it (to the log alone: a robot would use its voice)."""
+                """Do nothing; the text is recorded as a parameter."""
 
         await SayingActionPerformable("Patchie, Patchie; Where is my Patchie?").perform()
 
         await memory.flush()
         number = await memory.number_of(episode)
         tree = await memory.reading.tree(number)
-        return Answers(number, tree, await _asked(memory, number, memory.mapped(SayingActionPerformable)))
+        return Answers(number, tree, await _query(memory, number, memory.mapped(SayingActionPerformable)))
 
 
-async def _asked(memory: Memory, number: int, saying: Any) -> list[tuple[str, Sequence[str], list[Any]]]:
-    """The thesis' five questions: four about this episode, one about what was said last."""
+async def _query(memory: Memory, number: int, saying: Any) -> list[tuple[str, Sequence[str], list[Any]]]:
+    """Run the thesis' five queries: four about this episode, one about the latest SayingAction."""
     async with memory.session() as session:
         metadata = (await session.scalars(select(ProcessMetaData).where(ProcessMetaData.id == number))).all()
         navigations = (
             await session.scalars(select(NavigateAction).where(NavigateAction.process_metadata_id == number))
         ).all()
         actions = (await session.scalars(select(Action).where(Action.process_metadata_id == number))).all()
-        picked = (
+        object_poses = (
             await session.scalars(
                 select(PoseRow)
                 .join(PickUpAction.object)
@@ -184,7 +185,7 @@ async def _asked(memory: Memory, number: int, saying: Any) -> list[tuple[str, Se
         (
             "Where were the objects that were picked up?  select(Pose).join(PickUpAction.object).join(Object.pose)",
             ("id", "x", "y", "z", "frame"),
-            [(p.id, p.position.x, p.position.y, p.position.z, p.frame) for p in picked],
+            [(p.id, p.position.x, p.position.y, p.position.z, p.frame) for p in object_poses],
         ),
         (
             "What did the robot say?  select(memory.mapped(SayingActionPerformable))",

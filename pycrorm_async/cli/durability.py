@@ -1,4 +1,4 @@
-"""How safe it is what the database confirmed: on how many machines it is, and since when a loss could be healed."""
+"""This module reports durability: the machines that hold stored events, and the period that could be stored again."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Incarnation
 
-__all__ = ["Durability", "KeptSegments", "durability", "kept_in", "print_durability"]
+__all__ = ["Durability", "KeptSegments", "durability", "summarise_kept_segments", "print_durability"]
 
 
 @dataclass(frozen=True)
@@ -21,8 +21,9 @@ class KeptSegments:
     """Segments kept below `spool/stored` after all their records were stored.
 
     Attributes:
-        segments, bytes: how many, and what they take.
-        since: all that was stored after this moment can be offered to the database again; None if nothing is kept.
+        segments: number of segments.
+        bytes: their size.
+        since: events stored after this moment can be stored again from the segments; None without segments.
     """
 
     segments: int
@@ -32,14 +33,17 @@ class KeptSegments:
 
 @dataclass(frozen=True)
 class Durability:
-    """What the database says: on how many machines an event is once it is stored, and each time that it went back."""
+    """The database's report: the machines that hold each stored event, and each time it lost stored events.
+
+    The database loses stored events, or "goes back", after a failover or when a backup is restored.
+    """
 
     stored_on: StoredOn
     went_back: list[Incarnation]
 
 
-def kept_in(spool: Path) -> KeptSegments:
-    """Raises `SpoolUnavailable`."""
+def summarise_kept_segments(spool: Path) -> KeptSegments:
+    """Summarise the stored segments kept in a spool. Raises `SpoolUnavailable`."""
     with wrap_os_errors(spool):
         segments = kept_segments(spool)
     return KeptSegments(
@@ -48,24 +52,32 @@ def kept_in(spool: Path) -> KeptSegments:
 
 
 async def durability(log: EventLog) -> Durability:
-    """Raises `DatabaseUnavailable`."""
+    """Query the durability of a log. Raises `DatabaseUnavailable`."""
     return Durability(await log.stored_on(), await log.incarnations())
 
 
-def print_durability(kept: KeptSegments, known: Durability | None) -> None:
-    """In sentences; `known` is None where the database did not answer."""
-    if known is not None:
-        machines, standbys = known.stored_on
-        also = f" (synchronous standby {', '.join(standbys)})" if standbys else ""
-        stdout.print(f"stored = on {machines} machine{'s' * (machines > 1)}{also}", markup=False)
+def print_durability(kept: KeptSegments, durability: Durability | None) -> None:
+    """Print the durability in sentences; `durability` is None if the database did not answer."""
+    if durability is not None:
+        machines, standbys = durability.stored_on
+        replicas = f" (synchronous standby {', '.join(standbys)})" if standbys else ""
+        stdout.print(f"A stored event is on {machines} machine{'s' * (machines > 1)}{replicas}.", markup=False)
     if kept.since is None:
-        stdout.print("A loss could be healed from what living recorders hold; no stored segment is kept.", markup=False)
+        stdout.print(
+            "No stored segments are kept; after a data loss, only events of living recorders can be stored again.",
+            markup=False,
+        )
     else:
-        held = f"{kept.segments:,} segment{'s' * (kept.segments != 1)}, {kept.bytes / 2**20:,.1f} MiB"
-        stdout.print(f"A loss could be healed since {_text(kept.since)} ({held} kept).", markup=False)
-    for each in known.went_back if known is not None else ():
+        size = f"{kept.segments:,} segment{'s' * (kept.segments != 1)}, {kept.bytes / 2**20:,.1f} MiB"
+        stdout.print(
+            f"After a data loss, events stored since {_text(kept.since)} can be stored again ({size} kept).",
+            markup=False,
+        )
+    for each in durability.went_back if durability is not None else ():
         when = _text(_moment(each.noticed_wall_ns))
-        stdout.print(f"The database went back, noticed {when} by {each.noticed_by}: {each.reason}", markup=False)
+        stdout.print(
+            f"The database lost stored events, noticed {when} by {each.noticed_by}: {each.reason}", markup=False
+        )
 
 
 def _moment(wall_ns: int) -> datetime:

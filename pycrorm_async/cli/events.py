@@ -1,4 +1,4 @@
-"""`pycrorm events EPISODE`: the log of an episode, a line of JSON for each event."""
+"""`pycrorm events EPISODE` prints the log of an episode, one JSON object per line."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import msgspec
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.pending_events import note_what_waits
+from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError, LogDamaged
 from pycrorm_async.events.types import EVENT_TYPES
 from pycrorm_async.operations.destination import shared_address
@@ -24,27 +24,27 @@ __all__ = ["events"]
 
 
 def events(
-    episode: Annotated[str, typer.Argument(help="Its number, its id, or the first digits of its id; `last`.")],
-    after: Annotated[int, typer.Option(min=0, metavar="SEQUENCE", help="Only what follows this event.")] = 0,
+    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    after: Annotated[int, typer.Option(min=0, metavar="SEQUENCE", help="Print only events after this one.")] = 0,
     kind: Annotated[
-        list[str] | None, typer.Option("--type", help="Only events of this type; again for another.")
+        list[str] | None, typer.Option("--type", help="Print only events of this type; repeatable.")
     ] = None,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
-    as_json: JsonOption = False,  # noqa: ARG001  it is JSON anyway
+    as_json: JsonOption = False,  # noqa: ARG001  the output is always JSON
 ) -> None:
-    """Print what is in the log of an episode, a JSON object a line, in the order it happened."""
+    """Print the events of an episode in their order, one JSON object per line."""
     kinds = frozenset(kind or EVENT_TYPES)
     unknown = sorted(kinds - EVENT_TYPES.keys())
     if unknown:
-        raise CallerError(f"there is no event {unknown[0]!r}; there are {', '.join(sorted(EVENT_TYPES))}")
+        raise CallerError(f"unknown event type {unknown[0]!r}; known types: {', '.join(sorted(EVENT_TYPES))}")
     try:
         asyncio.run(_print(url, episode, after, kinds if kind else None))
         sys.stdout.flush()
-    except BrokenPipeError:  # who reads has enough, as `head` has
+    except BrokenPipeError:  # the reader closed the pipe, as `head` does; Python's final flush would raise again
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return
-    note_what_waits(url, spool)
+    note_pending_events(url, spool)
 
 
 async def _print(url: str, episode: str, after: int, kinds: frozenset[str] | None) -> None:

@@ -1,4 +1,13 @@
-"""Ctrl-C, or SIGTERM, while a plan runs, and while what it recorded is being stored."""
+"""This module handles Ctrl-C and SIGTERM while a plan runs and while its events are being stored.
+
+Theory of operation. The first signal cancels the plan's task, as asyncio does; the plan ends and its events are stored.
+If the plan does not end, the second signal raises `KeyboardInterrupt` in it. The next signal, and any signal once the
+plan has ended, terminates the process with exit code 130. That loses no event: all of them are in the spool, and the
+next start stores them.
+
+Signal handlers run in the main thread between two bytecodes, so the handler may interrupt a write to stderr. It
+therefore writes its last line with one system call (`write_last`) and leaves with `os._exit`.
+"""
 
 from __future__ import annotations
 
@@ -11,45 +20,50 @@ from types import FrameType
 
 from pycrorm_async.cli.output import note, write_last
 
-__all__ = ["Interrupting"]
+__all__ = ["Interruption"]
 
-_SAY_S = 1.0
-_PATIENCE = 2
-"""A plan that is interrupted may have to wait for room to say so, or to be broken off."""
+_NOTE_DELAY_S = 1.0
+"""Delays the note that events are being stored, so that it appears only if storing takes noticeably long."""
+_PLAN_SIGNALS_MAX = 2
+"""Bounds the signals passed to a plan: one cancels it, one breaks off a plan that cannot be cancelled."""
 
 
-class Interrupting:
-    """Once ends the plan, as asyncio does; then what it recorded is stored. Once more leaves at once.
+class Interruption:
+    """Handles SIGINT and SIGTERM for one plan. Use it in the thread of the event loop, the main thread.
 
-    To be used in the loop's own thread. Nothing is lost by leaving: what is not in the database is in the spool.
-    With a `patience` of 1 there is no plan to break off: what is asked for the second time is to leave.
+    With `plan_signals_max=1` there is no plan to break off, and the second signal terminates the process.
     """
 
-    def __init__(self, *, patience: int = _PATIENCE) -> None:
-        self._patience = patience
+    def __init__(self, *, plan_signals_max: int = _PLAN_SIGNALS_MAX) -> None:
+        self._plan_signals_max = plan_signals_max
         self._count = 0
         self._storing = False
 
     @contextmanager
-    def heeded(self) -> Iterator[None]:
-        """While the plan runs, and after it."""
+    def handled(self) -> Iterator[None]:
+        """Install the signal handlers while the plan runs and its events are stored, then restore the former ones.
+
+        Raises `KeyboardInterrupt` if a signal cancelled the plan. A handler that the program itself installed, and an
+        ignored signal, stay as they are.
+        """
         task, loop = asyncio.current_task(), asyncio.get_running_loop()
         assert task is not None
 
-        def told(_number: int, _frame: FrameType | None) -> None:
+        def handle_signal(_number: int, _frame: FrameType | None) -> None:
             self._count += 1
-            if self._storing or self._count > self._patience:
-                write_last("interrupted; what is not stored yet is safe in the spool, and the next start brings it in")
+            if self._storing or self._count > self._plan_signals_max:
+                write_last("interrupted; events not stored yet are safe in the spool, and the next start stores them")
                 os._exit(130)
-            if self._count > 1:  # a plan that never suspends, or does not let itself be cancelled
+            if self._count > 1:  # the plan never suspends, or suppresses its cancellation
                 raise KeyboardInterrupt
             task.cancel()
-            loop.call_soon_threadsafe(self.ended if self._patience == 1 else lambda: None)  # it may be asleep
+            # The loop may be waiting for I/O; without this call it would not notice the cancellation.
+            loop.call_soon_threadsafe(self.plan_ended if self._plan_signals_max == 1 else lambda: None)
 
-        before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        ours = [number for number, handler in before.items() if _is_nobodys(handler)]
-        for number in ours:
-            signal.signal(number, told)
+        former_handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = [number for number, handler in former_handlers.items() if _is_default(handler)]
+        for number in numbers:
+            signal.signal(number, handle_signal)
         try:
             yield
         except asyncio.CancelledError:
@@ -57,25 +71,25 @@ class Interrupting:
                 raise KeyboardInterrupt from None
             raise
         finally:
-            for number in ours:
-                signal.signal(number, before[number])
+            for number in numbers:
+                signal.signal(number, former_handlers[number])
 
     @property
-    def asked(self) -> bool:
-        """Whether somebody asked the plan to end."""
+    def requested(self) -> bool:
+        """Whether a signal arrived."""
         return self._count > 0
 
-    def ended(self) -> None:
-        """The plan is over: from now on there is only storing to interrupt."""
+    def plan_ended(self) -> None:
+        """Note that the plan has ended, so that the next signal terminates the process."""
         if self._count:
             asyncio.get_running_loop().call_later(
-                _SAY_S, note, "what was recorded is being stored. Ctrl-C again leaves at once, and loses nothing"
+                _NOTE_DELAY_S, note, "recorded events are being stored; Ctrl-C again exits at once without losing any"
             )
         self._storing = True
 
 
-def _is_nobodys(handler: object) -> bool:
-    """Whether it is what Python or asyncio does by itself: not ignored, and no handler of somebody else's."""
+def _is_default(handler: object) -> bool:
+    """Return whether Python or asyncio installed the handler, rather than the program or a parent that ignores it."""
     if handler in (signal.default_int_handler, signal.SIG_DFL):
         return True
     return getattr(getattr(handler, "func", handler), "__module__", None) == "asyncio.runners"

@@ -1,4 +1,4 @@
-"""`pycrorm learn`: the robot gets better from what it remembers, the learning experiment of the thesis (5.2)."""
+"""`pycrorm learn` runs the learning experiment of the thesis (5.2): it learns to pick up from recorded rollouts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pycrorm_async.cli.interruption import Interrupting
+from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_facts, print_json, print_table
 from pycrorm_async.errors import CallerError, MissingExtra
@@ -34,55 +34,57 @@ from pycrorm_async.world.robots.robot_description import Limits
 
 __all__ = ["learn"]
 
-_PICTURES = (".png", ".svg", ".pdf")
+_FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def learn(
-    rollouts: Annotated[int, typer.Option(min=1, help="To learn from, in each round.")] = 5_000,
+    rollouts: Annotated[int, typer.Option(min=1, help="Rollouts to learn from in each round.")] = 5_000,
     rounds: Annotated[
-        int, typer.Option(min=1, help="The first tries at random, each further one what was learned so far.")
+        int, typer.Option(min=1, help="Rounds: the first acts at random, each further one by the latest policy.")
     ] = 1,
-    evaluate: Annotated[int, typer.Option(min=1, help="Under the learned policy, to see what it is worth.")] = 2_000,
+    evaluate: Annotated[int, typer.Option(min=1, help="Rollouts that evaluate the learned policy.")] = 2_000,
     held_out: Annotated[
-        int, typer.Option(min=1, help="At random, and not learned from, to see how much of what works is still done.")
+        int, typer.Option(min=1, help="Random rollouts kept out of learning, to measure the policy's coverage.")
     ] = 2_000,
-    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same rollouts.")] = 69,
-    workers: Annotated[int, typer.Option(min=1, help="Processes, each with a world of its own.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers; it determines the rollouts.")] = 69,
+    workers: Annotated[int, typer.Option(min=1, help="Processes, each with its own world.")] = 1,
     min_samples_leaf: Annotated[
-        int, typer.Option(min=2, help="Successes in a leaf of the tree. Fewer repeat more exactly what was seen.")
+        int, typer.Option(min=2, help="Successes in a leaf of the tree; small leaves repeat the successes exactly.")
     ] = 25,
     limits: Annotated[
-        Limits, typer.Option(help="Which ranges of the arms' joints.", case_sensitive=False)
+        Limits, typer.Option(help="Ranges of the arms' joints to use.", case_sensitive=False)
     ] = Limits.SOFT,
     collisions: Annotated[
-        bool, typer.Option("--collisions", help="An arm that would be in something is a failure.")
+        bool, typer.Option("--collisions", help="Count an arm that collides with an object as a failure.")
     ] = False,
     episode_each: Annotated[
-        bool, typer.Option("--episode-each", help="Each rollout is an episode; otherwise some hundred are one.")
+        bool, typer.Option("--episode-each", help="Record one episode per rollout instead of one per some hundred.")
     ] = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with what is remembered of this experiment.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue from this experiment's recorded rollouts.")
+    ] = False,
     study_rollouts: Annotated[
         int,
         typer.Option(
             "--study",
             min=0,
-            help="So many rollouts for each: a learning curve; other places, turns, heights, objects; collisions; and"
-            " the same not remembered. None of these is.",
+            help="Also study, with this many unrecorded rollouts each: the learning curve; other places, orientations,"
+            " heights and objects; collisions; the cost of recording.",
         ),
     ] = 0,
-    policy: Annotated[Path, typer.Option(help="Where the learned policy is saved.")] = Path("policy.json"),
-    figure: Annotated[Path, typer.Option(help="Where both policies are drawn: .png, .svg or .pdf.")] = Path(
+    policy: Annotated[Path, typer.Option(help="File for the learned policy.")] = Path("policy.json"),
+    figure: Annotated[Path, typer.Option(help="File for the figure of both policies: .png, .svg or .pdf.")] = Path(
         "policies.png"
     ),
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Try to pick up at random, remember it all, learn from what went well, and try again.
+    """Record random pick-ups, learn a policy from the successful ones, and evaluate it.
 
-    The thesis tried 50,000 times: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra [learning].
+    The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra [learning].
     """
-    # Now, and not after an hour of rollouts.
+    # These checks come first, so that a missing package or a bad path does not fail after an hour of rollouts.
     _check_extra()
     _check_files(policy, figure)
     experiment = Experiment(
@@ -100,11 +102,11 @@ def learn(
     place = MemoryLocation(url, spool)
     with watched("rollouts", unit="rollouts") as bar:
 
-        def watch(name: str, done: int, total: int, tally: Tally) -> None:
+        def report_progress(name: str, done: int, total: int, tally: Tally) -> None:
             rate = f" ({tally.success_rate:.1%} succeed)" if tally.rollouts else ""
             bar(done, total, f"{name}{rate}")
 
-        learned, in_kitchen, studied = asyncio.run(_learned(experiment, place, study_rollouts, watch))
+        learned, in_kitchen, studied = asyncio.run(_run(experiment, place, study_rollouts, report_progress))
     save_policy(learned.policy, policy)
     titles = {
         f"default policy: {_percent(learned.default.tally)} succeed": default_policy(),
@@ -115,8 +117,8 @@ def learn(
         print_json(_document(experiment, learned, in_kitchen, studied, policy, figure))
         return
     _print(learned, in_kitchen, studied)
-    where = "" if url == DEFAULT_URL else f" --url {shlex.quote(DatabaseAddress.parse(url).to_type)}"
-    note(f"The policy is in {policy}, drawn in {figure}. Look further with: pycrorm episodes{where}")
+    option = "" if url == DEFAULT_URL else f" --url {shlex.quote(DatabaseAddress.parse(url).to_type)}"
+    note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
 
 
 def _check_extra() -> None:
@@ -128,17 +130,17 @@ def _check_extra() -> None:
 
 
 def _check_files(policy: Path, figure: Path) -> None:
-    if figure.suffix not in _PICTURES:
-        raise CallerError(f"--figure {figure} must end in one of {', '.join(_PICTURES)}")
+    if figure.suffix not in _FIGURE_SUFFIXES:
+        raise CallerError(f"--figure {figure} must end in one of {', '.join(_FIGURE_SUFFIXES)}")
     for option, path in (("--policy", policy), ("--figure", figure)):
         if not _can_be_written(path):
-            raise CallerError(f"{option} {path} cannot be written: choose another place")
+            raise CallerError(f"{option} {path} cannot be written: choose another path")
     if policy.resolve() == figure.resolve():
-        raise CallerError(f"--policy and --figure are both {policy}: choose another place for one")
+        raise CallerError(f"--policy and --figure are both {policy}: choose another path for one of them")
 
 
 def _can_be_written(path: Path) -> bool:
-    """Whether files can be made beside it, and it is not in the way. Its name has to be text: it is told as JSON."""
+    """Return whether the file can be created or replaced, and its name can be printed as JSON."""
     try:
         str(path).encode()
         return not path.is_dir() and os.access(path.parent, os.W_OK) and (not path.exists() or os.access(path, os.W_OK))
@@ -146,32 +148,32 @@ def _can_be_written(path: Path) -> bool:
         return False
 
 
-async def _learned(
-    experiment: Experiment, place: MemoryLocation, study_rollouts: int, watch: Callable[..., None]
+async def _run(
+    experiment: Experiment, place: MemoryLocation, study_rollouts: int, report_progress: Callable[..., None]
 ) -> tuple[ExperimentResult, KitchenResult, Study | None]:
-    with Interrupting(patience=1).heeded():
-        learned = await experiments.run(experiment, place, watch)
+    with Interruption(plan_signals_max=1).handled():
+        learned = await experiments.run(experiment, place, report_progress)
         studied = None
         if study_rollouts:
-            studied = await study(experiment, learned, place, rollouts=study_rollouts, watch=watch)
+            studied = await study(experiment, learned, place, rollouts=study_rollouts, watch=report_progress)
         kitchen = replace(KITCHEN, limits=experiment.scene.limits)
         return learned, await pick_up_in_kitchen(learned.policy, place, seed=experiment.seed, scene=kitchen), studied
 
 
-# --- telling it -----------------------------------------------------------------------------------------------
+# --- as tables -----------------------------------------------------------------------------------------------
 
 
 def _print(learned: ExperimentResult, in_kitchen: KitchenResult, studied: Study | None) -> None:
     print_table(
-        "Rollouts, as they are remembered",
-        ("", "rollouts", "succeeded", "95 % interval", "a second", "failed at"),
+        "Recorded rollouts",
+        ("", "rollouts", "succeeded", "95 % interval", "per second", "failed at"),
         [
             (each.name, each.tally.rollouts, _percent(each.tally), _interval(each.tally), _rate(each), _stages(each))
             for each in learned.phases
         ],
     )
     print_table(
-        "How the pick-ups went",
+        "Success rates of the pick-ups",
         ("", *(f"{arm} arm" for arm in learned.default.arms), *(f"{grasp} grasp" for grasp in learned.default.grasps)),
         [
             (each.name, *map(_percent, each.arms.values()), *map(_percent, each.grasps.values()))
@@ -192,7 +194,7 @@ def _print(learned: ExperimentResult, in_kitchen: KitchenResult, studied: Study 
 
 def _print_study(studied: Study) -> None:
     print_table(
-        "What is learned from fewer rollouts",
+        "Policies learned from fewer rollouts",
         ("rollouts", "successes", "succeeded", "95 % interval", "coverage"),
         [
             (each.rollouts, each.successes, _percent(each.tally), _interval(each.tally), _share(each.coverage))
@@ -200,7 +202,7 @@ def _print_study(studied: Study) -> None:
         ],
     )
     print_table(
-        "The same policies elsewhere",
+        "The same policies in other scenes",
         ("scene", "default policy", "learned policy", "95 % interval"),
         [
             (str(each.scene), _percent(each.default), _percent(each.learned), _interval(each.learned))
@@ -208,8 +210,8 @@ def _print_study(studied: Study) -> None:
         ],
     )
     print_table(
-        "What remembering costs",
-        ("", "rollouts", "a second, remembered", "not remembered", "share of the time"),
+        "Cost of recording",
+        ("", "rollouts", "per second, recorded", "not recorded", "share of the time"),
         [
             (each.name, each.rollouts, f"{each.with_memory:,.0f}", f"{each.without:,.0f}", f"{each.share:.0%}")
             for each in studied.costs
@@ -217,17 +219,17 @@ def _print_study(studied: Study) -> None:
     )
 
 
-def _kitchen(found: KitchenResult) -> str:
-    if found.done is None:
-        return f"not picked up in {found.tries} tries: {found.failure}"
-    x, y, _ = found.done.standing_position.position
-    how = f"with the {found.done.arm.name} arm from {found.done.grasp.name}, standing at {x:.2f}, {y:.2f} m"
-    return f"picked up at try {found.tries}, {how}"
+def _kitchen(trial: KitchenResult) -> str:
+    if trial.done is None:
+        return f"not picked up in {trial.tries} attempts: {trial.failure}"
+    x, y, _ = trial.done.standing_position.position
+    how = f"with the {trial.done.arm.name} arm from {trial.done.grasp.name}, robot base at {x:.2f}, {y:.2f} m"
+    return f"picked up at attempt {trial.tries}, {how}"
 
 
 def _coverage(learned: ExperimentResult) -> str:
     if learned.coverage is None:
-        return "unknown: none of the held-out rollouts succeeded; see with a larger --held-out and --resume"
+        return "unknown, because no held-out rollout succeeded; run again with a larger --held-out and --resume"
     return f"{learned.coverage:.1%} of the held-out successes are possible under the learned policy"
 
 
@@ -245,7 +247,7 @@ def _interval(tally: Tally) -> str:
 
 
 def _rate(phase: Phase) -> str:
-    return "remembered" if phase.rate is None else f"{phase.rate:,.0f}"
+    return "from the log" if phase.rate is None else f"{phase.rate:,.0f}"
 
 
 def _stages(phase: Phase) -> str:

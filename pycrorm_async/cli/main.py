@@ -1,11 +1,11 @@
-"""`pycrorm VERB`: runs a verb and turns what it raises into one line and an exit code.
+"""`pycrorm VERB` runs a verb and turns its exceptions into one line on stderr and an exit code.
 
-| code | means |
+| code | meaning |
 |---|---|
 | 0 | ok |
 | 1 | a problem was found; also a plan that failed |
-| 2 | usage: the call, the URL, the plan file, the episode asked for |
-| 3 | database or spool unavailable, or not ours |
+| 2 | usage: wrong arguments, URL, plan file or episode |
+| 3 | database or spool unavailable, or of another program |
 | 4 | damaged data |
 | 130 | interrupted |
 """
@@ -38,7 +38,7 @@ __all__ = ["main", "app", "exit_code"]
 
 
 def exit_code(error: PycrormError) -> int:
-    """The documented code of an error, by who is at fault."""
+    """Return the documented exit code of an error; it depends on the party at fault."""
     match error:
         case CallerError():
             return 2
@@ -51,46 +51,46 @@ def exit_code(error: PycrormError) -> int:
     return 1
 
 
-def _told_in_a_line(verb: Callable[..., int | None]) -> Callable[..., None]:
-    """The verb, with what it raises as one line and an exit code, and with the code it returns."""
+def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
+    """Wrap a verb so that it exits with the code it returns, or with one line and the code of its exception."""
 
     @functools.wraps(verb)
-    def told(*arguments: Any, **options: Any) -> None:
+    def run(*arguments: Any, **options: Any) -> None:
         try:
             code = verb(*arguments, **options) or 0
         except PycrormError as error:
             problem(str(error))
             code = exit_code(error)
         except KeyboardInterrupt:
-            problem("interrupted; what was recorded up to here is kept")
+            problem("interrupted; all events recorded so far are kept")
             code = 130
         except OSError as error:
-            problem(f"the answer cannot be written: {error.strerror or error}")
+            problem(f"the output cannot be written: {error.strerror or error}")
             code = 1
         raise typer.Exit(code)
 
-    return told
+    return run
 
 
-_HELP = "Episodic memory for robots: plans remembered as events, asked about as tables."
+_HELP = "Episodic memory for robots: record plans as events and query them as tables."
 _VERBS = ("demo", "run", "episodes", "show", "events", "copy", "writer", "status", "rebuild", "verify", "learn")
 _GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "spool": (
-        "The write-ahead queue's files: look, mend, store in another database.",
+        "The write-ahead queue's files: inspect, repair, or store them in another database.",
         ("inspect", "repair", "rebind"),
     ),
 }
 
 
-def app(asked: str | None = None) -> typer.Typer:
-    """The command with the verb that is asked for; with all of them if that is none of them.
+def app(requested: str | None = None) -> typer.Typer:
+    """Build the command with the requested verb, or with all verbs if `requested` is not a verb.
 
-    Each verb is a function of its name in a module of its name (those of a group in the group's), loaded when it is
-    needed: all of them take a second, most of them half of it.
+    Each verb is a function in the module of the same name (for a group, of the group's name). Only requested modules
+    are loaded, because loading all takes a second, and most single ones take half of that.
     """
-    known = {*_VERBS, *_GROUPS}
-    chosen = {asked} if asked in known else known
-    made = typer.Typer(
+    names = {*_VERBS, *_GROUPS}
+    chosen = {requested} if requested in names else names
+    command = typer.Typer(
         name="pycrorm",
         help=_HELP,
         no_args_is_help=True,
@@ -98,34 +98,34 @@ def app(asked: str | None = None) -> typer.Typer:
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    made.callback()(lambda: None)  # one verb alone would be taken for the whole command
+    command.callback()(lambda: None)  # without a callback, typer would make a single verb the command itself
     for verb in (each for each in _VERBS if each in chosen):
-        made.command(verb)(_verb(verb, verb))
+        command.command(verb)(_load_verb(verb, verb))
     for group, (text, verbs) in _GROUPS.items():
         if group in chosen:
-            under = typer.Typer(help=text, no_args_is_help=True)
+            subcommand = typer.Typer(help=text, no_args_is_help=True)
             for verb in verbs:
-                under.command(verb)(_verb(group, verb))
-            made.add_typer(under, name=group)
-    return made
+                subcommand.command(verb)(_load_verb(group, verb))
+            command.add_typer(subcommand, name=group)
+    return command
 
 
-def _verb(module: str, name: str) -> Callable[..., None]:
-    return _told_in_a_line(getattr(import_module(f"pycrorm_async.cli.{module}"), name))
+def _load_verb(module: str, name: str) -> Callable[..., None]:
+    return _with_exit_code(getattr(import_module(f"pycrorm_async.cli.{module}"), name))
 
 
 def main() -> None:
-    """The console script."""
+    """Run the console script `pycrorm`."""
     handler = RichHandler(console=stderr, show_time=False, show_path=False)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
-    # An interrupted statement's connection is given up; its loop is gone, which the pool would tell at length.
+    # After an interruption the pool drops a connection whose event loop is closed, and would log a long traceback.
     logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
         command = app(next(iter(sys.argv[1:]), None))
-    except KeyboardInterrupt:  # while it was being loaded
-        problem("interrupted before anything was done")
+    except KeyboardInterrupt:  # while the verb's module was being loaded
+        problem("interrupted before the command started")
         sys.exit(130)
     command()

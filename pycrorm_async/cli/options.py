@@ -1,4 +1,4 @@
-"""The options every verb shares."""
+"""This module defines the command-line options that several verbs share."""
 
 from __future__ import annotations
 
@@ -27,15 +27,14 @@ UrlOption = Annotated[
         "--url",
         envvar="PYCRORM_URL",
         help="The database: sqlite:///memory.db, sqlite:////absolute/path.db, postgresql://user@host/database."
-        " A password given here is visible in the list of processes: put it into the environment variable, or into"
-        " ~/.pgpass.",
+        " The list of processes shows a password in this option; put it into the environment variable or ~/.pgpass.",
         show_envvar=True,
     ),
 ]
 SpoolOption = Annotated[
     Path | None,
     typer.Option(
-        "--spool", envvar="PYCRORM_SPOOL", help="The write-ahead queue's folder; default: beside the database."
+        "--spool", envvar="PYCRORM_SPOOL", help="Folder of the write-ahead queue; default: beside the database."
     ),
 ]
 WriterOption = Annotated[
@@ -43,7 +42,7 @@ WriterOption = Annotated[
     typer.Option(
         "--writer",
         envvar="PYCRORM_WRITER",
-        help="Who moves events to the database: a thread of this process, or the daemon `pycrorm writer`.",
+        help="The writer that moves events to the database: a thread of this process, or the daemon `pycrorm writer`.",
         show_envvar=True,
     ),
 ]
@@ -52,7 +51,7 @@ FileAccessOption = Annotated[
     typer.Option(
         "--file-access",
         envvar="PYCRORM_FILE_ACCESS",
-        help="A new spool and a new SQLite file are for their owner alone (0700, 0600), or for their folder's group.",
+        help="Permissions of a new spool and a new SQLite file: owner only (0700, 0600), or also the folder's group.",
         show_envvar=True,
     ),
 ]
@@ -61,7 +60,7 @@ ProjectionOption = Annotated[
     typer.Option(
         "--projection",
         metavar="MODULE:CLASS",
-        help="A projection of your own, besides those that installed packages offer; may be given again.",
+        help="Custom projection to use, in addition to those of installed packages; repeatable.",
     ),
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Answer with one JSON document.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]

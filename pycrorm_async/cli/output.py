@@ -1,4 +1,4 @@
-"""How a verb speaks: tables and trees on stdout, or one JSON document; problems as one line on stderr."""
+"""This module prints tables, facts or one JSON document on stdout, and problems as single lines on stderr."""
 
 from __future__ import annotations
 
@@ -30,40 +30,40 @@ __all__ = [
 ]
 
 _WIDTH_PIPED = 160
-"""A pipe has no width; tables are then as wide as this, so that lines stay whole."""
+"""Width of tables in characters if stdout is not a terminal; wide enough to keep most rows on one line."""
 
 stdout = Console(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
 
 
 def problem(line: str) -> None:
-    """One line that says what is wrong and what to do."""
+    """Print a problem, and the command that solves it, as one line on stderr."""
     stderr.print(f"[bold red]pycrorm:[/] {escape(' '.join(line.split()))}")
 
 
 def write_last(line: str) -> None:
-    """Write a problem with one system call, in a signal handler that leaves with `os._exit`.
+    """Write a problem with one system call, for a signal handler that then calls `os._exit`.
 
-    The signal may have come while `stderr` was printing: a console prints no second line inside the first, it keeps
-    that line for later, and there is no later.
+    The signal may interrupt a line that `stderr` is printing. The console would buffer a second line until the first
+    is complete, and `os._exit` would discard it.
     """
-    cursor = "\x1b[?25h" if stderr.is_terminal else ""  # a bar had hidden it
+    cursor = "\x1b[?25h" if stderr.is_terminal else ""  # a progress bar may have hidden the cursor
     with suppress(OSError):
         os.write(2, f"{cursor}pycrorm: {line}\n".encode())
 
 
 def note(line: str) -> None:
-    """One line worth knowing, beside the answer."""
+    """Print an additional line of information on stderr."""
     stderr.print(f"[dim]{escape(line)}[/]")
 
 
 def print_json(document: Any) -> None:
-    """The one document of a `--json` call."""
+    """Print the JSON document of a `--json` call on stdout."""
     encoded = msgspec.json.encode(document, enc_hook=str)
     sys.stdout.write(msgspec.json.format(encoded, indent=2).decode() + "\n")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """A table; numbers to the right."""
+    """Print a table; columns of numbers are right-aligned."""
     rows = [tuple(row) for row in rows]
     table = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
     for index, name in enumerate(columns):
@@ -75,7 +75,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
 
 
 def print_facts(title: str, facts: Mapping[str, object]) -> None:
-    """A title, then a line for each fact that is known."""
+    """Print a title, then one line for each fact that is neither None nor empty."""
     stdout.print(f"[bold]{escape(title)}[/]")
     for name, value in facts.items():
         if value not in (None, ""):
@@ -83,7 +83,7 @@ def print_facts(title: str, facts: Mapping[str, object]) -> None:
 
 
 def duration(nanoseconds: int | None) -> str:
-    """As people read it: 12 µs, 3.4 ms, 1.20 s.
+    """Format a duration as 12 µs, 3.4 ms or 1.20 s; None as an empty string.
 
     >>> duration(1_204_000_000), duration(3_400_000), duration(12_000), duration(None)
     ('1.20 s', '3.4 ms', '12 µs', '')
@@ -98,7 +98,7 @@ def duration(nanoseconds: int | None) -> str:
 
 
 def moment(when: datetime) -> str:
-    """A moment in UTC, to the second."""
+    """Format a moment in UTC to the second."""
     return when.strftime("%Y-%m-%d %H:%M:%S")
 
 

@@ -1,4 +1,4 @@
-"""Says when a spool holds what its database does not: reading verbs do not write, so somebody else must."""
+"""This module warns when a spool holds events that its database does not; reading verbs never store them themselves."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pycrorm_async.cli.output import note
 from pycrorm_async.operations.recovery import pending_recorders
 from pycrorm_async.store.address import DatabaseAddress
 
-__all__ = ["note_what_waits"]
+__all__ = ["note_pending_events"]
 
 
-def note_what_waits(url: str, spool: Path | None) -> None:
-    """One line on stderr for each kind of recorder that may hold more than the database shows."""
+def note_pending_events(url: str, spool: Path | None) -> None:
+    """Print one line on stderr for dead recorders with events left to store, and one for living recorders."""
     dead, alive = pending_recorders(url, spool)
     if dead:
         option = f" --spool {spool}" if spool else ""
         note(
             f"{dead} dead recorder{'s' * (dead > 1)} left events that are not in the database:"
-            f" `pycrorm writer --once --url {DatabaseAddress.parse(url).to_type}{option}` brings them in."
+            f" run `pycrorm writer --once --url {DatabaseAddress.parse(url).to_type}{option}` to store them."
         )
     if alive:
-        note(f"{alive} recorder{'s are' if alive > 1 else ' is'} at work: the newest events may not be in yet.")
+        note(f"{alive} recorder{'s are' if alive > 1 else ' is'} running: the latest events may not be stored yet.")

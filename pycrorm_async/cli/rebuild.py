@@ -11,7 +11,7 @@ import typer
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, note, print_json, stdout
-from pycrorm_async.cli.pending_events import note_what_waits
+from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import watched
@@ -72,7 +72,7 @@ def rebuild(
             )
         for episode, reason in each.parked.items():
             note(f"episode {episode} is parked{f' in {name}' if name in known else ''}: {reason}")
-    note_what_waits(url, spool)
+    note_pending_events(url, spool)
     return 1 if any(each.parked for each in done.values()) else 0
 
 

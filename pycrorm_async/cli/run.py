@@ -14,7 +14,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.interruption import Interrupting
+from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.options import (
     DEFAULT_URL,
     FileAccessOption,
@@ -126,8 +126,8 @@ class _Outcome:
 async def _remembered(
     loaded: LoadedPlan, opened: Memory, description: str, seed: int | None, outcome: _Outcome
 ) -> None:
-    interrupting = Interrupting()
-    with interrupting.heeded():
+    interruption = Interruption()
+    with interruption.handled():
         async with opened as memory:
             try:
                 if loaded.takes_memory:
@@ -142,8 +142,8 @@ async def _remembered(
             except BaseException as error:  # noqa: BLE001  a plan may raise anything; it is told in one line
                 outcome.failure = error
             finally:
-                interrupting.ended()
-                if not interrupting.asked:
+                interruption.plan_ended()
+                if not interruption.requested:
                     await _summarise(memory, outcome)
 
 

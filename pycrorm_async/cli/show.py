@@ -1,4 +1,4 @@
-"""`pycrorm show EPISODE`: one episode: what it was, and its task tree; with `--at`, as it was then, and the world."""
+"""`pycrorm show EPISODE` shows one episode and its task tree; with `--at`, tree and world at one moment."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_facts, print_json
-from pycrorm_async.cli.pending_events import note_what_waits
-from pycrorm_async.cli.snapshot_view import asked_moment, print_moment
-from pycrorm_async.cli.tree import print_tree, thinker_text
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.snapshot_view import parse_moment, print_snapshot
+from pycrorm_async.cli.tree import print_tree, simulated_by
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
@@ -21,16 +21,16 @@ __all__ = ["show"]
 
 
 def show(
-    episode: Annotated[str, typer.Argument(help="Its number, its id, or the first digits of its id; `last`.")],
+    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
     at: Annotated[
         str | None,
-        typer.Option(help="Show it as it was then: seconds since its start, or an event as '#300'.", metavar="WHEN"),
+        typer.Option(help="Show this moment: seconds since the start, or an event such as '#300'.", metavar="WHEN"),
     ] = None,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show an episode's task tree, with statuses and durations; or tree and world at any moment of it."""
+    """Show an episode's task tree with statuses and durations; with --at, tree and world at one moment."""
     if at is None:
         _show(episode, url, spool, as_json=as_json)
     else:
@@ -38,42 +38,42 @@ def show(
 
 
 def _show(episode: str, url: str, spool: Path | None, *, as_json: bool) -> None:
-    async def asked() -> tuple[EpisodeSummary, list[NodeSummary]]:
+    async def query() -> tuple[EpisodeSummary, list[NodeSummary]]:
         async with Reading.open(url) as reading:
-            found = await reading.episode(episode)
-            return found, await reading.tree(found.number)
+            summary = await reading.episode(episode)
+            return summary, await reading.tree(summary.number)
 
-    found, tree = asyncio.run(asked())
-    note_what_waits(url, spool)
+    summary, tree = asyncio.run(query())
+    note_pending_events(url, spool)
     if as_json:
-        print_json({"episode": found, "tree": tree})
+        print_json({"episode": summary, "tree": tree})
         return
     print_facts(
-        f"Episode {found.number}: {found.description}",
+        f"Episode {summary.number}: {summary.description}",
         {
-            "id": found.id,
-            "started": f"{moment(found.started_at)} UTC",
-            "by": found.created_by,
-            "took": duration(found.duration_ns),
-            "status": found.status,
-            "continues": f"episode {found.continues}" if found.continues else None,
-            "goes on": f"in episode {found.continued_in}" if found.continued_in else None,
-            "simulated": f"thought through {thinker_text(found)}; nothing of it happened" if found.simulated else None,
+            "id": summary.id,
+            "started": f"{moment(summary.started_at)} UTC",
+            "by": summary.created_by,
+            "took": duration(summary.duration_ns),
+            "status": summary.status,
+            "continues": f"episode {summary.continues}" if summary.continues else None,
+            "continued": f"in episode {summary.continued_in}" if summary.continued_in else None,
+            "simulated": simulated_by(summary) if summary.simulated else None,
         },
     )
     print_tree(tree)
 
 
 def _show_moment(episode: str, at: str, url: str, spool: Path | None, *, as_json: bool) -> None:
-    time, sequence = asked_moment(at)
+    time, sequence = parse_moment(at)
 
-    async def asked() -> Moment:
+    async def query() -> Moment:
         async with Reading.open(url) as reading:
             return await reading.as_of(episode, time=time, sequence=sequence)
 
-    then = asyncio.run(asked())
-    note_what_waits(url, spool)
+    snapshot = asyncio.run(query())
+    note_pending_events(url, spool)
     if as_json:
-        print_json(then)
+        print_json(snapshot)
     else:
-        print_moment(then, at if sequence is not None else f"{time:g} s")
+        print_snapshot(snapshot, at if sequence is not None else f"{time:g} s")

@@ -1,4 +1,4 @@
-"""Shows an episode as it was at one moment: what was being done, where the robot and the things were."""
+"""This module prints the snapshot of an episode at one moment: the running nodes, the robot and the objects."""
 
 from __future__ import annotations
 
@@ -10,51 +10,54 @@ from pycrorm_async.cli.tree import print_tree
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.snapshot import Moment, ObjectThen, RobotThen
 
-__all__ = ["print_moment", "asked_moment"]
+__all__ = ["print_snapshot", "parse_moment"]
 
 _JOINTS_MAX = 3
+"""Bounds the joints listed for an object, so that its row stays short."""
 
 
-def asked_moment(text: str) -> tuple[float | None, int | None]:
-    """What `--at` says: seconds, or the sequence of an event. Raises `CallerError`.
+def parse_moment(text: str) -> tuple[float | None, int | None]:
+    """Parse the value of `--at` as seconds or as the sequence of an event. Raises `CallerError`.
 
-    >>> asked_moment("12.5"), asked_moment("#300")
+    >>> parse_moment("12.5"), parse_moment("#300")
     ((12.5, None), (None, 300))
     """
     try:
         return (None, int(text[1:])) if text.startswith("#") else (float(text), None)
     except ValueError:
         raise CallerError(
-            f"--at takes seconds since the episode's start, or an event as '#300', not {text!r}"
+            f"--at takes seconds since the episode's start, or an event such as '#300', got {text!r}"
         ) from None
 
 
-def print_moment(then: Moment, asked: str) -> None:
-    """The episode's facts, its task tree, and a table of what was in the world."""
-    robot = then.world.robot
+def print_snapshot(snapshot: Moment, requested: str) -> None:
+    """Print the episode's facts, its task tree, and a table of the objects in the world."""
+    robot = snapshot.world.robot
     print_facts(
-        f"Episode {then.number}: {then.description}",
+        f"Episode {snapshot.number}: {snapshot.description}",
         {
-            "id": then.id,
-            "started": f"{wall_clock(then.started_at)} UTC",
-            "by": then.created_by,
-            "at": f"{asked}: after event {then.sequence}, {then.time_s:.6f} s, {wall_clock(then.at)} UTC",
-            "status": then.status,
-            "simulated": "thought through; nothing of it happened" if then.simulated else None,
-            "running": _running_text(then),
+            "id": snapshot.id,
+            "started": f"{wall_clock(snapshot.started_at)} UTC",
+            "by": snapshot.created_by,
+            "at": (
+                f"{requested}: after event {snapshot.sequence}, {snapshot.time_s:.6f} s, {wall_clock(snapshot.at)} UTC"
+            ),
+            "status": snapshot.status,
+            "simulated": "yes" if snapshot.simulated else None,
+            "running": _running_text(snapshot),
             "robot": _robot_text(robot) if robot is not None else None,
         },
     )
-    print_tree(then.tree)
-    if then.world.objects:
+    print_tree(snapshot.tree)
+    if snapshot.world.objects:
         columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
-        print_table("World", columns, [_row(each) for each in then.world.objects])
+        print_table("World", columns, [_row(each) for each in snapshot.world.objects])
 
 
-def _running_text(then: Moment) -> str:
-    """The way down to what was being done; of several ways, what each begins with where they part."""
+def _running_text(snapshot: Moment) -> str:
+    """Join the running nodes from the root down with ` > `; a comma separates parallel branches."""
     text, depth = "", 0
-    for each in then.running:
+    for each in snapshot.running:
         if each.dtype is not None:
             text += f"{' > ' if each.depth > depth else ', '}{each.dtype}" if text else each.dtype
             depth = each.depth
@@ -68,8 +71,8 @@ def _robot_text(robot: RobotThen) -> str:
 
 
 def _row(each: ObjectThen) -> tuple[object, ...]:
-    held = each.attached_to
-    attached = " ".join(filter(None, held)) if held is not None else ""
+    parent = each.attached_to
+    attached = " ".join(filter(None, parent)) if parent is not None else ""
     return each.name, each.object_type, *each.pose.position, _degrees(each.pose.yaw), attached, _joints_text(each)
 
 
@@ -78,7 +81,7 @@ def _degrees(angle: float) -> str:
 
 
 def _joints_text(each: ObjectThen) -> str:
-    """Those that are not at 0."""
-    turned = [f"{joint} {position:.3f}" for joint, position in each.joints.items() if position != 0.0]
-    more = f" and {len(turned) - _JOINTS_MAX} more" if len(turned) > _JOINTS_MAX else ""
-    return ", ".join(turned[:_JOINTS_MAX]) + more
+    """List the joints whose position is not 0."""
+    positions = [f"{joint} {position:.3f}" for joint, position in each.joints.items() if position != 0.0]
+    more = f" and {len(positions) - _JOINTS_MAX} more" if len(positions) > _JOINTS_MAX else ""
+    return ", ".join(positions[:_JOINTS_MAX]) + more

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from pycrorm_async.cli.durability import Durability, durability, kept_in, print_durability
+from pycrorm_async.cli.durability import Durability, durability, print_durability, summarise_kept_segments
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stdout
 from pycrorm_async.clock import SYSTEM_CLOCK
@@ -101,7 +101,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     projections: list[ProjectionState] = []
     limits_near: list[str] = []
     unmade: dict[str, str] = {}
-    kept, known = kept_in(place.path), None
+    kept, known = summarise_kept_segments(place.path), None
     fault: str | None = None
     try:
         episodes, projections, limits_near, unmade, known = asyncio.run(_episodes(address))

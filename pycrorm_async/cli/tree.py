@@ -1,4 +1,4 @@
-"""Draws a remembered task tree: names, statuses, durations, reasons."""
+"""This module draws a recorded task tree with types, statuses, durations and failures."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from rich.tree import Tree
 from pycrorm_async.cli.output import duration, stdout
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 
-__all__ = ["print_tree", "parameters_text", "thinker_text"]
+__all__ = ["print_tree", "parameters_text", "simulated_by"]
 
 _TEXT_MAX = 60
-_THOUGHTS_MAX = 10
+"""Bounds the characters of a text parameter, so that a node fits on one line."""
+_SIMULATIONS_MAX = 10
+"""Bounds the episode numbers listed at a node, because a node may run hundreds of simulations."""
 
 _STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED": "yellow", "INTERRUPTED": "yellow"}
 
 
 def print_tree(nodes: Sequence[NodeSummary]) -> None:
-    """The nodes of one episode, a parent before its children."""
+    """Print the nodes of one episode as a tree; `nodes` lists each parent before its children."""
     drawn: dict[int, Tree] = {}
     root: Tree | None = None
     for node in nodes:
@@ -45,14 +47,14 @@ def _line(node: NodeSummary) -> Text:
         message = " ".join((node.failure_message or "").split())
         line.append(f"  {node.reason}{': ' if message else ''}{message[:100]}", style="red")
     if node.thoughts:
-        numbers = ", ".join(map(str, node.thoughts[:_THOUGHTS_MAX]))
-        more = f" and {len(node.thoughts) - _THOUGHTS_MAX} more" if len(node.thoughts) > _THOUGHTS_MAX else ""
-        line.append(f"  thought through in episode{'s' * (len(node.thoughts) > 1)} {numbers}{more}", style="magenta")
+        numbers = ", ".join(map(str, node.thoughts[:_SIMULATIONS_MAX]))
+        more = f" and {len(node.thoughts) - _SIMULATIONS_MAX} more" if len(node.thoughts) > _SIMULATIONS_MAX else ""
+        line.append(f"  simulated in episode{'s' * (len(node.thoughts) > 1)} {numbers}{more}", style="magenta")
     return line
 
 
-def thinker_text(episode: EpisodeSummary) -> str:
-    """Who thought it through, in a few words."""
+def simulated_by(episode: EpisodeSummary) -> str:
+    """Describe the node that ran a simulated episode, for example `by PickUpAction of episode 3`."""
     by = episode.thought_by
     if by is None:
         return "outside any episode"
@@ -60,7 +62,7 @@ def thinker_text(episode: EpisodeSummary) -> str:
 
 
 def parameters_text(parameters: Mapping[str, Any]) -> str:
-    """Parameters in a few words.
+    """Format parameters on one line.
 
     >>> parameters_text({"arm": "LEFT", "target": {"position": [0.6, 0.4, 0.0], "orientation": [0, 0, 0, 1]}})
     'arm=LEFT target=(0.60, 0.40, 0.00)'

@@ -11,7 +11,7 @@ import typer
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, stdout
-from pycrorm_async.cli.pending_events import note_what_waits
+from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import watched
 from pycrorm_async.projections.custom.discovery import installed_besides, named
@@ -45,7 +45,7 @@ def verify(
     known = [*projections, *installed_besides(projections)]
     collect_seldom()
     found, ids = asyncio.run(_verify(url, episode, known))
-    note_what_waits(url, spool)
+    note_pending_events(url, spool)
     for name, reason in found.not_compared.items():
         note(f"the projection {name} was not looked at: {reason}")
     if as_json:

@@ -161,7 +161,7 @@ def test_a_copy_is_interrupted_at_once_and_the_next_one_takes_the_rest(tmp_path:
     os.close(ours)
     assert process.communicate()[0] == b""
     assert code == 130, shown
-    assert b"interrupted; what was recorded up to here is kept" in shown
+    assert b"interrupted; all events recorded so far are kept" in shown
     assert b"Traceback" not in shown
     assert [len(events) for events in logs_of(target).values()] == [500]
     [done] = answer("copy", "--to", target, cwd=tmp_path)["episodes"]
@@ -174,4 +174,4 @@ def test_what_waits_beside_the_memory_to_copy_is_told(folder: Path) -> None:
     assert pycrorm("run", "notes.py", "--writer", "daemon", "--url", "sqlite:///a.db", cwd=folder).returncode == 0
     done = pycrorm("copy", "--from", "sqlite:///a.db", "--to", "sqlite:///b.db", cwd=folder)
     assert done.returncode == 0
-    assert one_line_of(done).startswith("1 dead recorder left events that are not in the database: `pycrorm writer")
+    assert one_line_of(done).startswith("1 dead recorder left events that are not in the database: run `pycrorm writer")

@@ -27,7 +27,7 @@ main()
 
 SPEAKING = """
 import asyncio, os, signal
-from pycrorm_async.cli.interruption import Interrupting
+from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.output import stderr
 
 class Interrupted:
@@ -36,7 +36,7 @@ class Interrupted:
         yield "the rest of the line"
 
 async def main():
-    with Interrupting(patience=1).heeded():
+    with Interruption(plan_signals_max=1).handled():
         os.kill(os.getpid(), signal.SIGINT)
         stderr.print(Interrupted())
 
@@ -91,7 +91,7 @@ def test_a_plan_whose_database_is_away_at_its_end_is_left_with_ctrl_c_and_stored
     finally:
         running.kill()
     assert running.returncode == 130
-    assert "what is not stored yet is safe in the spool" in told
+    assert "events not stored yet are safe in the spool" in told
     assert pycrorm("writer", "--once", cwd=tmp_path).returncode == 0
     (episode,) = answer("episodes", cwd=tmp_path)
     assert episode["nodes"] == 2
@@ -102,7 +102,7 @@ def test_interrupted_while_it_loads_it_says_so_in_a_line(tmp_path: Path) -> None
     done = subprocess.run(
         [sys.executable, "-c", LOADING], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
-    assert (done.returncode, done.stderr) == (130, "pycrorm: interrupted before anything was done\n")
+    assert (done.returncode, done.stderr) == (130, "pycrorm: interrupted before the command started\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -110,5 +110,5 @@ def test_interrupted_while_it_prints_a_line_it_leaves_with_the_last_one(tmp_path
     done = subprocess.run(
         [sys.executable, "-c", SPEAKING], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
-    line = "pycrorm: interrupted; what is not stored yet is safe in the spool, and the next start brings it in\n"
+    line = "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
     assert (done.returncode, done.stderr) == (130, line)

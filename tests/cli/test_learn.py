@@ -56,7 +56,7 @@ def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> No
     assert refused.returncode == 2
     done = pycrorm(*SMALL, "--resume", "--figure", "two.svg", "--study", "5", cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert "The same policies elsewhere" in done.stdout
+    assert "The same policies in other scenes" in done.stdout
     assert done.stdout.count("remembered") > 3
     assert f"{document['phases'][1]['success_rate']:.1%}" in done.stdout
     assert "picked up" in done.stdout
@@ -80,8 +80,8 @@ def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path
     _, said = process.communicate(timeout=120)
     assert process.returncode == 130, said
     *note, told = said.strip().splitlines()
-    assert told == "pycrorm: interrupted; what was recorded up to here is kept"
-    assert note in ([], ["what was recorded is being stored. Ctrl-C again leaves at once, and loses nothing"])
+    assert told == "pycrorm: interrupted; all events recorded so far are kept"
+    assert note in ([], ["recorded events are being stored; Ctrl-C again exits at once without losing any"])
     document = answer(*SMALL, *longer, "--resume", cwd=tmp_path)
     assert [each["rollouts"] for each in document["phases"]] == [2_500, 150, 150]
     assert 0 < document["phases"][0]["done_now"] < 2_500
@@ -101,11 +101,9 @@ def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: P
         note = process.stderr.readline()
         process.send_signal(signal.SIGINT)
         printed, told = process.communicate(timeout=120)
-    assert note == "what was recorded is being stored. Ctrl-C again leaves at once, and loses nothing\n"
+    assert note == "recorded events are being stored; Ctrl-C again exits at once without losing any\n"
     assert (process.returncode, printed) == (130, "")
-    assert (
-        told == "pycrorm: interrupted; what is not stored yet is safe in the spool, and the next start brings it in\n"
-    )
+    assert told == "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
     phase = answer(*SMALL, "--resume", cwd=tmp_path)["phases"][0]
     assert (phase["rollouts"], phase["done_now"] < 400) == (400, True)
 

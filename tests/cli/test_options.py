@@ -31,7 +31,7 @@ def test_verify_and_rebuild_name_the_events_that_wait_in_the_spool(tmp_path: Pat
     assert done.returncode == 0
     assert done.stderr == (
         "1 dead recorder left events that are not in the database: "
-        f"`pycrorm writer --once --url sqlite:///pycrorm.db --spool {spool}` brings them in.\n"
+        f"run `pycrorm writer --once --url sqlite:///pycrorm.db --spool {spool}` to store them.\n"
     )
     assert answer(verb, cwd=tmp_path)["episodes"] == 1
 

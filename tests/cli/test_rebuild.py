@@ -107,7 +107,7 @@ def test_interrupted_it_leaves_with_130_and_the_next_one_goes_on(tmp_path: Path,
     blocker.execute("ROLLBACK")
     blocker.close()
     assert (process.returncode, output) == (130, ""), errors
-    assert errors == "pycrorm: interrupted; what was recorded up to here is kept\n"
+    assert errors == "pycrorm: interrupted; all events recorded so far are kept\n"
     assert differences(before, tables_of(url)) == []
     assert answer("rebuild", cwd=tmp_path)["generation"] == 2
     assert differences(before, tables_of(url)) == []

@@ -125,8 +125,8 @@ def test_what_a_killed_robot_was_doing_is_shown(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["1", "--at", "noon"], "--at takes seconds since the episode's start, or an event as '#300', not 'noon'"),
-        (["1", "--at", "#3.5"], "--at takes seconds since the episode's start, or an event as '#300', not '#3.5'"),
+        (["1", "--at", "noon"], "--at takes seconds since the episode's start, or an event such as '#300', got 'noon'"),
+        (["1", "--at", "#3.5"], "--at takes seconds since the episode's start, or an event such as '#300', got '#3.5'"),
         (["1", "--at=-1"], "-1 s is before episode 1 began"),
         (["1", "--at", "#0"], "event 0 is before episode 1 began"),
         (["7", "--at", "1"], "there is no episode '7' (`pycrorm episodes` lists the 1 there are)"),

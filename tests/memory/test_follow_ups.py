@@ -104,5 +104,5 @@ async def test_episodes_and_show_name_the_parts(tmp_path: Path) -> None:
     assert "patrol (continues episode 2)" in pycrorm("episodes", cwd=tmp_path).stdout
     shown = pycrorm("show", "2", cwd=tmp_path).stdout
     assert f"continues episode {first}" in " ".join(shown.split())
-    assert f"goes on in episode {third}" in " ".join(shown.split())
+    assert f"continued in episode {third}" in " ".join(shown.split())
     assert answer("show", "3", cwd=tmp_path)["episode"]["continues"] == second

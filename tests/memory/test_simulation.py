@@ -213,7 +213,7 @@ async def test_the_command_leaves_thoughts_out_and_tells_of_them_when_asked(tmp_
     assert table.count("by FetchFromAnywhereAction of episode 1") == 2
     assert "thought" not in pycrorm("episodes", *url, cwd=tmp_path).stdout
     shown = pycrorm("show", "3", *url, cwd=tmp_path).stdout
-    assert "thought through by FetchFromAnywhereAction of episode 1; nothing of it happened" in shown
+    assert "simulated by FetchFromAnywhereAction of episode 1" in shown
     real = pycrorm("show", "1", *url, cwd=tmp_path).stdout
     thinker = next(line for line in real.splitlines() if "FetchFromAnywhereAction" in line)
-    assert thinker.endswith("thought through in episodes 2, 3")
+    assert thinker.endswith("simulated in episodes 2, 3")
