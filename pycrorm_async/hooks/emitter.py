@@ -11,6 +11,7 @@ from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import Happening
+from pycrorm_async.hooks.event_feed import EventFeed
 from pycrorm_async.hooks.event_sink import EventSink
 from pycrorm_async.hooks.values.missing_values import MissingValues
 from pycrorm_async.hooks.values.texts import clean, cut, message_of
@@ -45,6 +46,7 @@ class Emitter:
 
     Attributes:
         is_closed: whether the memory is closed, or belongs to the process that forked this one; hooks then do nothing.
+        feed: the observers of this memory, to which recorded events are published.
         missing: counts the values that could not be recorded.
         unawaited: for each designator type whose perform was called and never awaited, a sentence for the user.
     """
@@ -53,6 +55,7 @@ class Emitter:
         self.sink = sink
         self.settings = settings
         self.is_closed = False
+        self.feed = EventFeed()
         self.missing = MissingValues()
         self.unawaited: tuple[str, ...] = ()
         self._fault_count = 0
@@ -62,11 +65,14 @@ class Emitter:
     def faults(self) -> Faults:
         return Faults(self._fault_count, self._last_fault)
 
-    def put(self, episode: EpisodeId | None, event: Happening) -> int:
+    def put(self, episode: EpisodeId, event: Happening) -> int:
         """Append an event and return its sequence. Raises `NotEncodable` before anything is written."""
         kind = type(event)
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        return self.put_payload(Heading(episode, kind.__name__, kind.version), payload)
+        sequence = self.put_payload(Heading(episode, kind.__name__, kind.version), payload)
+        if self.feed.observers:
+            self.feed.publish(episode, sequence, event)
+        return sequence
 
     def put_payload(self, heading: Heading, payload: bytes) -> int:
         """Append an encoded event and return its sequence."""
@@ -84,7 +90,10 @@ class Emitter:
         """Append an event without using the reserve and without waiting; raise `SpoolFull` if there is no room."""
         kind = type(event)
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        return self.sink.put_nowait(Heading(episode, kind.__name__, kind.version), payload)
+        sequence = self.sink.put_nowait(Heading(episode, kind.__name__, kind.version), payload)
+        if self.feed.observers:
+            self.feed.publish(episode, sequence, event)
+        return sequence
 
     def note_unawaited(self, dtype: str) -> None:
         """Count a perform that was called and never awaited as a fault, and log a warning for the first of a type."""

@@ -316,6 +316,7 @@ class Recorder:
     def _declare(self, declared: DeclaredType) -> None:
         kind = type(declared.declaration)
         self._emitter.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
+        self._emitter.feed.note_type(declared.fingerprint, declared.dtype)
 
     # --- the port of the world ---------------------------------------------------------------------------------------
 
