@@ -1,0 +1,89 @@
+"""A program of a user type-checks strictly against the installed package, and mistakes in it are found."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.commands import environment
+
+ROOT = Path(__file__).parent.parent.parent
+PROGRAM = """\
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import assert_type
+
+from sqlalchemy import select
+
+from pycrorm_async import Memory, MemoryStatus, Projection, Reading, Settings, UserView
+from pycrorm_async.orm import Action, NavigateAction, Pose, TaskTreeNode
+from pycrorm_async.plan import ActionAbstract, NavigateAction as Navigate, PlanFailure, simulated_robot
+from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose as WorldPose
+
+
+@dataclass
+class GreetActionPerformable(ActionAbstract):
+    whom: str
+
+    async def perform(self) -> None:
+        if not self.whom:
+            raise PlanFailure("nobody to greet")
+
+
+async def plan() -> None:
+    with BulletWorld() as world, simulated_robot:
+        assert_type(world, BulletWorld)
+        robot = Object("pr2", ObjectType.ROBOT)
+        assert_type(robot.pose, WorldPose)
+        await Navigate([WorldPose([0.6, 0.4, 0])]).resolve().perform()
+        await (GreetActionPerformable("Ada") + GreetActionPerformable("Grace")).perform()
+
+
+async def main() -> Sequence[Action]:
+    settings = Settings(sync_interval_ms=10)
+    view = UserView("failures", select(TaskTreeNode.id))
+    async with Memory.open("sqlite:///memory.db", settings=settings, views=[view]) as memory:
+        assert_type(memory, Memory)
+        async with memory.episode(description="typed"):
+            await plan()
+        await memory.flush()
+        assert_type(memory.status, MemoryStatus)
+        assert_type(memory.reading, Reading)
+        async with memory.session() as session:
+            poses = (await session.scalars(select(Pose).join(NavigateAction.pose))).all()
+            assert_type(poses, Sequence[Pose])
+            actions = (await session.scalars(select(Action))).all()
+            assert_type(actions, Sequence[Action])
+        frame = await memory.dataframe(select(TaskTreeNode.dtype))
+        print(len(frame))
+    return actions
+
+
+class Rate(Projection):
+    name = "rate"
+    version = 1
+"""
+
+
+def checked(folder: Path, program: str) -> subprocess.CompletedProcess[str]:
+    """What mypy prints for this program, which lies outside the package's folder."""
+    (folder / "program.py").write_text(program)
+    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(folder / "cache"), "program.py"]
+    return subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_a_program_of_a_user_is_typed_and_its_mistakes_are_found(tmp_path: Path) -> None:
+    done = checked(tmp_path, PROGRAM)
+    assert done.stdout.startswith("Success: no issues found in 1 source file"), done.stdout
+    wrong = PROGRAM.replace('GreetActionPerformable("Ada")', "GreetActionPerformable(1)")
+    wrong = wrong.replace("Settings(sync_interval_ms=10)", 'Settings(sync_interval_ms="ten")')
+    done = checked(tmp_path, wrong.replace("await memory.flush()", "await memory.flsh()"))
+    assert [line.rpartition("[")[2] for line in done.stdout.splitlines()[:-1]] == [
+        "arg-type]",
+        "arg-type]",
+        "attr-defined]",
+    ]
