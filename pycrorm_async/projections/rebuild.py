@@ -1,4 +1,4 @@
-"""Makes the tables anew from the log, beside those that people see, and shows them at once when they are complete.
+"""Rebuild the tables from the log beside the visible ones, and replace those in one transaction.
 
     async with claimed(log):
         rebuild = await Rebuild.begin(log)
@@ -6,9 +6,21 @@
         await rebuild.show()
         await clear(log)
 
-Recording, folding and reading go on meanwhile. Every step is a short transaction of its own. Killed anywhere, the next
-rebuild takes up what is there: a generation that was being made is made to its end, one that is not shown any more is
-dropped. It is folded from the log alone; no class of a plan is needed.
+Theory of operation. `begin` creates a generation under the key `…/making`, with tables for all declared types, or
+resumes the one that an earlier rebuild left. `fold_next_batch` folds the log into it in short transactions, by one
+process or by several that share the episodes. `show` makes it visible. `clear` drops replaced generations in slices.
+Plans record, processes fold and queries read all the time; no plan's classes are needed. `claimed` admits one rebuild
+at a time. A killed one leaves rows in `pycrorm_generation`: the next resumes `…/making` and drops `…/gone/N`.
+
+The switch races with processes that fold into the visible tables. `show` therefore folds until little is missing and
+then, in one transaction that excludes other writers, locks the visible generation's row, folds the events that the
+visible tables have and the new ones lack, and replaces the views. If more than `_LATE_EVENTS_MAX` events are missing it
+rolls back and folds outside the transaction again, so that others wait for a short time only. So readers never see
+fewer events after the switch than before. The new revision is above both old ones: a batch folded for the old tables
+fails its check and is folded again (`generations`).
+
+Queries that began before the switch may still read the replaced tables. The switch never drops them: `clear` waits up
+to `sum(_DROP_PAUSES_S)` seconds for such queries, and reports tables that are still in use.
 """
 
 from __future__ import annotations
@@ -61,21 +73,22 @@ __all__ = ["Rebuild", "Share", "claimed", "clear", "recorded"]
 
 _MAKING, _GONE = "/making", "/gone/"
 _BATCH_EVENTS = 8_000
-"""So that nobody waits long for a turn to write: on SQLite such a batch holds the write lock for some 50 ms."""
+"""Bounds the events of one transaction: on SQLite such a batch holds the write lock for some 50 ms."""
 _SLICE_ROWS = 10_000
-"""So many rows of a table that is not shown any more are deleted at once."""
+"""Bounds the rows of a replaced table that one transaction deletes."""
 _PAUSE_S = 0.02
-"""So long nobody deletes: on SQLite whoever waits to write looks from time to time, and would find no gap."""
+"""The pause between two slices. SQLite connections poll for the write lock and would never find it free otherwise."""
 _LATE_EVENTS_MAX = 2_000
-"""So many events may be left to fold when the new tables are shown: they are folded while everybody waits."""
+"""Bounds the events folded inside the switch, during which all other writers wait."""
 _SHOW_ATTEMPTS = 50
+"""Bounds the attempts to switch while other processes record faster than this one folds."""
 _DROP_PAUSES_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
-"""Before each attempt: a question that was asked before the new tables were shown is answered by then."""
+"""The pauses before the attempts to drop a table, in which queries that began before the switch end."""
 _RECORDED = text("SELECT count(*), coalesce(sum(head), 0) FROM episode")
 
 
 async def recorded(log: EventLog) -> tuple[int, int]:
-    """How many episodes and how many events there are in the log."""
+    """Count the episodes and the events in the log."""
     async with log.reading() as connection:
         episodes, events = (await connection.execute(_RECORDED)).one()
         return int(episodes), int(events)
@@ -83,16 +96,16 @@ async def recorded(log: EventLog) -> tuple[int, int]:
 
 @asynccontextmanager
 async def claimed(log: EventLog) -> AsyncIterator[None]:
-    """Nobody else rebuilds this memory until the context is left. Raises `CallerError` if somebody does."""
+    """Exclude other rebuilds of this memory inside the context. Raises `CallerError` if one is running."""
     with log.translated():
-        async with dialect_of(log.engine).claim(log.engine) as alone:
-            if not alone:
-                raise CallerError(f"{log.address}: another `pycrorm rebuild` is at work: wait for it to end")
+        async with dialect_of(log.engine).claim(log.engine) as claim:
+            if not claim:
+                raise CallerError(f"{log.address}: another `pycrorm rebuild` is running: wait for it to end")
             yield
 
 
 class Rebuild:
-    """One generation on its way from the log to the people. Begun in a claimed memory; its workers join it.
+    """One generation while it is rebuilt. `begin` needs a claimed memory; worker processes `join`.
 
     Attributes:
         number: of the generation.
@@ -117,7 +130,7 @@ class Rebuild:
             log,
             self._making,
             generation,
-            meaning=TABLES if projection is None else CustomFoldDefinition(projection),
+            definition=TABLES if projection is None else CustomFoldDefinition(projection),
             share=share,
             after_tables=projection is not None,
             batch_events=_BATCH_EVENTS,
@@ -127,34 +140,35 @@ class Rebuild:
     async def begin(
         cls, log: EventLog, *, views: Sequence[UserView] = (), projection: Projection | None = None
     ) -> Self:
-        """Takes up the generation that is being made, or makes a new one, of all types that were ever declared.
+        """Resume the generation of an earlier rebuild, or create one with the tables of all declared types.
 
-        The views people have registered are kept; `views` are added, or take the place of those of the same names. With
-        a projection it is the tables of that one alone.
+        Registered views stay; `views` are added or replace them by name. With a projection, rebuilds only its tables.
         """
         with log.translated():
             payloads = await log.declarations()
             async with log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
-                there = await _known(log, connection)
-                shown = there.get(SHOWN)
-                # Asked at the end too; but who must move something is told before hours of work.
+                generations = await _generations(log, connection)
+                shown = generations.get(SHOWN)
+                # The switch checks this too; checking here reports a conflict before hours of work.
                 await dialect_of(connection).only_views(connection, shown.views if shown else ())
                 if projection is not None:
-                    return cls(log, await _begin_own(connection, there, projection), projection=projection)
-                making = await _going_on(connection, there, SHOWN, lambda each: each.version == PROJECTION_VERSION)
+                    return cls(log, await _begin_own(connection, generations, projection), projection=projection)
+                making = await _resumable(
+                    connection, generations, SHOWN, lambda each: each.version == PROJECTION_VERSION
+                )
                 if making is None:
-                    numbers = [each.number for key, each in there.items() if not key.startswith(PROJECTION)]
+                    numbers = [each.number for key, each in generations.items() if not key.startswith(PROJECTION)]
                     making = await make_generation(connection, 1 + max(numbers, default=0))
                     await make_empty(connection, {checkpoints.TABLE: checkpoints.COLUMNS}, making.number)
                 making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
                 await note(connection, MAKING, making)
-            goal = SideTarget(MAKING, None, making.version, number=making.number)
-            while (grown := await _grown(log, goal, payloads)).layout != making.layout:
+            target = SideTarget(MAKING, None, making.version, number=making.number)
+            while (grown := await _grow_slice(log, target, payloads)).layout != making.layout:
                 making = grown
             async with log.engine.begin() as connection:
                 await dialect_of(connection).alone(connection)
-                making = await goal.generation(connection, "change")
+                making = await target.generation(connection, "change")
                 layout = making.layout
                 if shown is not None:
                     layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
@@ -165,32 +179,32 @@ class Rebuild:
 
     @classmethod
     async def join(cls, log: EventLog, share: Share) -> Self:
-        """The rebuild of our tables that another process has begun, to fold a share of it."""
+        """Join the rebuild of the built-in tables that another process has begun, to fold a share of it."""
         async with log.reading() as connection:
             making = await noted(connection, MAKING)
         if making is None:
-            raise InternalError("nothing is being rebuilt")
+            raise InternalError(f"{log.address}: no rebuild is running that this worker could join")
         return cls(log, making, share=share)
 
     async def left(self) -> int:
-        """How many events of the log are not in the new tables yet."""
+        """Return the number of events in the log that the new tables lack."""
         async with self._log.reading() as connection:
             done = await checkpoints.total(connection, self._place)
         _, events = await recorded(self._log)
         return events - done
 
     async def parked(self) -> dict[int, str]:
-        """By episode number, why not all of it could be folded."""
+        """Return the parked episodes by number, with the reasons."""
         async with self._log.reading() as connection:
             return await checkpoints.parked(connection, self._place)
 
     async def fold_next_batch(self) -> int | None:
-        """Folds a batch; the number of events, None when none is left of this share."""
+        """Fold a batch; return the number of events, None when none is left of this share."""
         with self._log.translated():
             return await self._catch_up.fold_next_batch()
 
     async def show(self) -> None:
-        """Puts the new tables before the people, with all that the old ones showed. The old ones wait for `clear`."""
+        """Make the new tables visible, with at least the events of the old ones. `clear` drops the old ones."""
         with self._log.translated():
             for _ in range(_SHOW_ATTEMPTS):
                 while await self.fold_next_batch() is not None:
@@ -200,18 +214,21 @@ class Rebuild:
                     if await self._show_if_complete():
                         return
                 except RowRefused:
-                    continue  # folded again, it parks its episode
-        raise DatabaseUnavailable(f"{self._log.address}: more is recorded than can be folded meanwhile: run it again")
+                    continue  # `fold_next_batch` folds the event again and parks its episode
+        reason = f"the rebuild could not catch up with new events in {_SHOW_ATTEMPTS} attempts, the old tables stay"
+        raise DatabaseUnavailable(
+            f"{self._log.address}: {reason}: run `pycrorm rebuild` again when fewer robots record"
+        )
 
     async def _fill_kept(self) -> None:
-        """Makes the rows of the views that are kept, from the new tables."""
+        """Compute the rows of materialised views from the new tables."""
         async with self._log.reading() as connection:
             making = await self._making.generation(connection, "share")
         if not making.layout.kept:
             return
         engine = self._log.engine
-        meanings = public_views(making.layout, self.number, dialect_of(engine).stored_column)
-        views = {name: view_text(each, engine.dialect) for name, each in meanings.items()}
+        selects = public_views(making.layout, self.number, dialect_of(engine).stored_column)
+        views = {name: view_text(each, engine.dialect) for name, each in selects.items()}
         async with with_views(self._log.engine, views | making.layout.user_views) as connection:
             more = True
             while more:
@@ -221,10 +238,10 @@ class Rebuild:
                 await connection.commit()
 
     async def _show_if_complete(self) -> bool:
-        """False if so much is missing that everybody would have to wait for it."""
+        """Switch, unless so many events are missing that all writers would wait for them; return whether it did."""
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).alone(connection)
-            # Whoever folds holds the note that is changed here: from now on nobody does, until this is over.
+            # Every fold shares this row's lock while it writes, so no fold writes to the old tables from here on.
             old = await noted(connection, self._key, hold="change")
             new = await self._making.generation(connection, "change")
             seen = checkpoints.SEEN
@@ -247,45 +264,45 @@ class Rebuild:
             if self._projection is None:
                 await self._show_tables(connection, old, new)
             else:
-                await self._show_own(connection, old, new)
+                await self._show_projection(connection, old, new)
         return True
 
     async def _show_tables(self, connection: AsyncConnection, old: Generation | None, new: Generation) -> None:
-        # A view that was registered meanwhile is kept; and whoever has read a revision before must see another one.
         if old is not None:
-            # A view registered meanwhile that is kept has no table here: then there is more to make first.
+            # Keep views that were registered during the rebuild; a materialised one needs its tables created here.
             missing = old.layout.user_views.keys() - new.layout.user_views.keys()
             layout = new.layout.with_views(
                 {name: old.layout.user_views[name] for name in missing},
                 {name: kept for name, kept in old.layout.kept.items() if name in missing},
             )
             new = await grow_tables(connection, new, layout)
+            # Above both revisions, so that every process that folded for either of them notices the switch.
             new = replace(new, revision=max(new.revision, old.revision) + 1)
         new = await show(connection, new)
         await checkpoints.carry_over(connection, self._place)
         while await refresh_some(connection, new.layout, new.number):
             pass
 
-    async def _show_own(self, connection: AsyncConnection, old: Generation | None, new: Generation) -> None:
+    async def _show_projection(self, connection: AsyncConnection, old: Generation | None, new: Generation) -> None:
         revision = 1 + max(new.revision, old.revision if old is not None else 0)
         await note(connection, self._key, replace(new, revision=revision))
         tables = await current_generation(connection, hold="change")
-        assert tables is not None, "looked for when this was begun"
+        assert tables is not None, "`begin` checked that there are tables"
         await show(connection, replace(tables, revision=tables.revision + 1))
 
 
-async def _grown(log: EventLog, goal: SideTarget, payloads: Sequence[bytes]) -> Generation:
-    """The generation with more of the tables of these declarations, or as it was if it has all that can be made."""
+async def _grow_slice(log: EventLog, target: SideTarget, payloads: Sequence[bytes]) -> Generation:
+    """Create one slice of the missing tables of these declarations; return the generation, unchanged if none was."""
     async with log.engine.begin() as connection:
         await dialect_of(connection).alone(connection)
-        return await grow(connection, goal, await goal.generation(connection, "change"), payloads)
+        return await grow(connection, target, await target.generation(connection, "change"), payloads)
 
 
-async def _going_on(
-    connection: AsyncConnection, there: Mapping[str, Generation], key: str, usable: Callable[[Generation], bool]
+async def _resumable(
+    connection: AsyncConnection, generations: Mapping[str, Generation], key: str, usable: Callable[[Generation], bool]
 ) -> Generation | None:
-    """The generation that an earlier rebuild has begun; one that is of no use waits to be dropped afterwards."""
-    making = there.get(f"{key}{_MAKING}")
+    """Return the generation that an earlier rebuild left under `key`; mark it for dropping if it is not usable."""
+    making = generations.get(f"{key}{_MAKING}")
     if making is None or usable(making):
         return making
     await forget(connection, f"{key}{_MAKING}")
@@ -294,59 +311,57 @@ async def _going_on(
 
 
 async def _begin_own(
-    connection: AsyncConnection, there: Mapping[str, Generation], projection: Projection
+    connection: AsyncConnection, generations: Mapping[str, Generation], projection: Projection
 ) -> Generation:
     tables = await current_generation(connection)
     if tables is None:
-        raise DatabaseForeign("there are no tables yet: run `pycrorm rebuild` without a name")
+        raise DatabaseForeign("the database has no tables yet: run `pycrorm rebuild` without a name")
     layout = layout_of(projection, connection.dialect)
-    refuse_taken(projection.name, layout, tables.layout, projections_in(there))
+    refuse_taken(projection.name, layout, tables.layout, projections_in(generations))
     key = f"{PROJECTION}{projection.name}"
-    making = await _going_on(
-        connection, there, key, lambda each: each.version == projection.version and each.layout == layout
+    making = await _resumable(
+        connection, generations, key, lambda each: each.version == projection.version and each.layout == layout
     )
     return making or await make_own(connection, projection, f"{key}{_MAKING}")
 
 
 async def clear(log: EventLog) -> list[str]:
-    """Drops what is not shown any more, little by little; gives the names of the tables that had to be left."""
+    """Empty and drop replaced tables in slices; return the names of tables that are still in use and were left."""
     left: list[str] = []
     with log.translated():
         async with log.reading() as connection:
-            there = await _known(log, connection)
+            generations = await _generations(log, connection)
         await _sweep(log)
-        for key, generation in there.items():
+        for key, generation in generations.items():
             if key == SHOWN:
                 await _drop(log, checkpoints.place_of(generation.number))
-            of, gone, _ = key.partition(_GONE)
-            if not gone:
+            owner, separator, _ = key.partition(_GONE)
+            if not separator:
                 continue
-            ours = of == SHOWN
+            is_built_in = owner == SHOWN
             tables = [
-                *(CORE if ours else ()),
+                *(CORE if is_built_in else ()),
                 *generation.layout.leaves,
                 *kept_tables(generation.layout),
-                checkpoints.TABLE if ours else f"{checkpoints.TABLE}_{of.removeprefix(PROJECTION)}",
+                checkpoints.TABLE if is_built_in else f"{checkpoints.TABLE}_{owner.removeprefix(PROJECTION)}",
             ]
             named = [physical_name(each, generation.number) for each in tables]
-            kept = await _drop_all(log, named)
-            left += kept
-            if not kept:
+            in_use = await _drop_all(log, named)
+            left += in_use
+            if not in_use:
                 async with log.engine.begin() as connection:
                     await forget(connection, key)
     return left
 
 
-async def _known(log: EventLog, connection: AsyncConnection) -> dict[str, Generation]:
-    """Every generation there is. Raises `DatabaseForeign` where a newer version made one: it alone knows its tables."""
-    there = await all_noted(connection)
-    newest = max((each.version for key, each in there.items() if not key.startswith(PROJECTION)), default=0)
+async def _generations(log: EventLog, connection: AsyncConnection) -> dict[str, Generation]:
+    """Read all generations. Raises `DatabaseForeign` if a newer version made one, whose tables this one cannot list."""
+    generations = await all_noted(connection)
+    newest = max((each.version for key, each in generations.items() if not key.startswith(PROJECTION)), default=0)
     if newest > PROJECTION_VERSION:
-        raise DatabaseForeign(
-            f"{log.address}: there are tables made by version {newest} of the fold, this is version"
-            f" {PROJECTION_VERSION}: use a newer pycrorm"
-        )
-    return there
+        versions = f"there are tables made by version {newest} of the fold, this is version {PROJECTION_VERSION}"
+        raise DatabaseForeign(f"{log.address}: {versions}: use a newer pycrorm")
+    return generations
 
 
 async def _sweep(log: EventLog) -> None:
@@ -355,10 +370,10 @@ async def _sweep(log: EventLog) -> None:
 
 
 async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
-    """Those of them that somebody uses, and goes on using."""
+    """Drop these tables; return those that stay in use after the last attempt."""
     for pause_s in _DROP_PAUSES_S:
         await asyncio.sleep(pause_s)
-        await _sweep(log)  # where a view that was replaced cannot go yet, its tables cannot
+        await _sweep(log)  # drops replaced views first, because a table cannot be dropped before its views
         while tables and await _drop(log, tables[0]):
             tables = tables[1:]
         if not tables:
@@ -381,5 +396,5 @@ async def _drop(log: EventLog, table: str) -> bool:
         async with log.engine.begin() as connection:
             await dialect.drop(connection, table)
     except dialect.faults:
-        return False  # somebody reads it still
+        return False  # a query still reads it
     return True

@@ -85,7 +85,7 @@ async def test_a_second_one_is_refused_with_one_line(database_url: str, tmp_path
         done = await asyncio.to_thread(pycrorm, "rebuild", "--url", database_url, cwd=tmp_path)
     await log.close()
     assert done.returncode == 2
-    assert one_line_of(done).endswith("another `pycrorm rebuild` is at work: wait for it to end")
+    assert one_line_of(done).endswith("another `pycrorm rebuild` is running: wait for it to end")
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])

@@ -325,7 +325,7 @@ async def test_only_one_rebuilds_at_a_time(database_url: str) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     async with claimed(log):
-        with pytest.raises(CallerError, match="another `pycrorm rebuild` is at work: wait for it to end"):
+        with pytest.raises(CallerError, match="another `pycrorm rebuild` is running: wait for it to end"):
             await rebuild_memory(database_url)
     await log.close()
     assert (await rebuild_memory(database_url)).generation == 2

@@ -170,12 +170,12 @@ class CustomTables:
                 _log.warning("%s", fault)
                 continue
             changed = changed or is_new
-            goal = SideTarget(f"{PROJECTION}{each.name}", each.name, each.version)
+            target = SideTarget(f"{PROJECTION}{each.name}", each.name, each.version)
             self._folded[each.name] = CatchUp(
                 self._log,
-                goal,
+                target,
                 generation,
-                meaning=CustomFoldDefinition(each),
+                definition=CustomFoldDefinition(each),
                 after_tables=True,
                 batch_events=self._batch_events,
             )

@@ -1,1 +1,1 @@
-"""Running folds: batches, checkpoints, catching up."""
+"""Run the fold: read batches of events, write their rows and the checkpoints."""

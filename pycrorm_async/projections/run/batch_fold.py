@@ -1,10 +1,20 @@
-"""Folds batches of events into a generation: rows and progress in one transaction, or neither.
+"""Fold batches of events into a generation, writing rows and checkpoints in one transaction.
 
-Reading and folding hold no lock. The write transaction then checks that both the tables and the progress are as they
-were taken to be; if somebody else was quicker it is rolled back, and the events are read again. So any number may fold
-one memory, and none of them ever shows an event twice or half. Which generation it is and where its progress is noted
-is the `FoldTarget`'s: of what people see (`projector`), or of what is made beside it (`rebuild`). What events mean
-is the `FoldDefinition`'s: our tables here, or a projection of one's own (`own_tables`).
+Theory of operation. A batch has two phases. `prepare` reads the events and the declarations and folds them into rows in
+memory; it holds no lock and writes nothing. `write` opens a transaction, locks the generation's row, compares number
+and revision of the generation and the checkpoint of each episode with those that `prepare` assumed, and only then
+writes rows and checkpoints. If anything differs, because another process folded the same events or changed the tables,
+it rolls back and returns 0, and the caller reads the events again. So any number of processes may fold one memory:
+every event is folded exactly once, and rows and checkpoints never disagree.
+
+A declaration that the generation has no tables for makes the write transaction exclusive and grows the tables first
+(`growth`). If the database creates only some of them, the growth is committed, the batch is not, and it is folded
+again for the tables that exist now. An event that cannot be folded parks its episode at this event: the events before
+it are written, later ones are not read, and all other episodes continue. If the database refuses a row, the batch is
+written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
+
+`FoldTarget` is the generation and its checkpoints: the visible one (`projector`) or one beside it (`catch_up`).
+`FoldDefinition` turns events into rows: those of the built-in tables, here, or those of a custom projection.
 """
 
 from __future__ import annotations
@@ -33,53 +43,53 @@ from pycrorm_async.store.stored import Span, StoredEvent
 __all__ = ["Folding", "FoldTarget", "FoldDefinition", "Batch", "Prepared", "TABLES"]
 
 _REASON_LENGTH_MAX = 2_000
-"""Characters of the reason that an episode is parked for: `status` shows it, and a value may be megabytes long."""
+"""Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
 _SLICE_EVENTS = 100
-"""So many are folded before others of the loop get their turn; some 0.4 ms."""
+"""The events folded between two yields to the event loop, some 0.4 ms."""
 
 
 class FoldTarget(Growing, Protocol):
-    """A generation that is folded into. Everything happens in the caller's transaction."""
+    """A generation to fold into, and its checkpoints. Every method runs in the caller's transaction."""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
-        """As it is now, and stays until the transaction ends."""
+        """Read the generation and lock it until the transaction ends."""
         ...
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
-        """False if one of the episodes is not where it was believed to be: then nothing may be committed."""
+        """Advance the checkpoints; return False if one has moved, and then the caller must not commit."""
         ...
 
     async def park(self, connection: AsyncConnection, number: int, reason: str) -> None: ...
 
 
 class Batch(Protocol):
-    """What a batch of events makes."""
+    """The rows of a batch of events."""
 
     def fold(self, event: StoredEvent) -> None:
-        """Raises `CannotFold`, and then has added nothing."""
+        """Add the rows of an event. Raises `CannotFold`, and then has added none."""
         ...
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
-        """All is folded: makes ready what can be before a transaction, to be written into this generation."""
+        """Prepare the statements for this generation, after the last event and before the transaction."""
         ...
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:
-        """Raises `RowRefused`."""
+        """Write the rows. Raises `RowRefused`."""
         ...
 
 
 class FoldDefinition(Protocol):
-    """What events mean."""
+    """A way of turning events into rows."""
 
     def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
-        """What these declarations make of the layout, and a maker of empty batches that knows them."""
+        """Return the layout with these declarations, and a factory of empty batches for it."""
         ...
 
 
 @dataclass(frozen=True)
 class _Folded:
-    """A batch after the fold: its rows, ready for the generation of this number, (episode, folded before, folded now)
-    of each episode, and why some stop."""
+    """A folded batch: its rows for the generation `number`, (episode, folded before, folded now) for each episode, and
+    the reasons of the episodes to park."""
 
     rows: Batch
     number: int
@@ -89,7 +99,7 @@ class _Folded:
 
 @dataclass(frozen=True)
 class _Types:
-    """What the declarations that were read make of the generation's layout."""
+    """The declarations that were read, and the layout and batch factory for them at one revision."""
 
     payloads: list[bytes]
     revision: int
@@ -99,7 +109,7 @@ class _Types:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A batch that is to be written."""
+    """A batch between `prepare` and `write`."""
 
     spans: Sequence[Span]
     events: Sequence[StoredEvent]
@@ -108,22 +118,22 @@ class Prepared:
 
     @property
     def count(self) -> int:
-        """How many events are folded in it."""
+        """The number of its folded events."""
         return sum(now - before for _, before, now in self.done.steps)
 
     @property
     def is_whole(self) -> bool:
-        """Whether nothing of it stays behind: no episode is parked."""
+        """Whether it folds all its events, so that it parks no episode."""
         return not self.done.parked
 
     @property
     def reached(self) -> dict[int, int]:
-        """By number, how far the episodes are when it is written."""
+        """By episode number, the checkpoint after it is written."""
         return {number: now for number, _, now in self.done.steps}
 
 
 class _TableRows:
-    """Those of our own tables. Implements `Batch`."""
+    """The rows of the built-in tables. Implements `Batch`."""
 
     def __init__(self, designators: Designators) -> None:
         self._designators = designators
@@ -141,7 +151,7 @@ class _TableRows:
 
 
 class _Tables:
-    """Our own tables. Implements `FoldDefinition`."""
+    """The fold into the built-in tables. Implements `FoldDefinition`."""
 
     def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
         layout, accepted, refused = unite(layout, payloads)
@@ -153,49 +163,48 @@ TABLES = _Tables()
 
 
 class Folding:
-    """Folds events of one log into one goal. `generation` is how it was when last looked at."""
+    """Folds events of one log into one target. `generation` is its state when this process last read it."""
 
     def __init__(
-        self, log: EventLog, goal: FoldTarget, generation: Generation, meaning: FoldDefinition = TABLES
+        self, log: EventLog, target: FoldTarget, generation: Generation, definition: FoldDefinition = TABLES
     ) -> None:
         self._log = log
-        self._goal = goal
-        self._meaning = meaning
+        self._target = target
+        self._definition = definition
         self.generation = generation
         self._types: _Types | None = None
 
     async def batch(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> int:
-        """How many of them are folded now: fewer if an episode was parked, none if somebody else was quicker.
+        """Prepare and write these events; return the number folded.
 
-        An event that is missing or cannot be folded parks its episode with the reason; what came before it is written,
-        and the others go on.
+        It is smaller if an episode was parked, and 0 if another process folded them first.
         """
         return await self.write(await self.prepare(spans, events))
 
     async def prepare(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> Prepared:
-        """The first half of it: writes nothing, and gives way to others of the loop from time to time."""
+        """Fold the events into rows, yielding to the event loop at intervals. Writes nothing."""
         types = await self._types_now()
         return Prepared(spans, events, types, await self._folded(spans, events, types))
 
     async def write(self, batch: Prepared) -> int:
-        """The second half."""
+        """Write a prepared batch; return the number of events folded, as `batch` does."""
         try:
             async with self._log.writing() as connection:
-                found = await self._generation(connection, batch.done, batch.types)
-                grown = found is not None and found.layout != batch.types.layout
-                written = found if grown else await self._write(connection, batch.done, found)
+                generation = await self._generation(connection, batch.done, batch.types)
+                grown = generation is not None and generation.layout != batch.types.layout
+                written = generation if grown else await self._write(connection, batch.done, generation)
                 if written is None:
                     await connection.rollback()
                     return 0
             self.generation = written
-            if grown:  # some tables are not there yet, or never will be: read and folded again with those that are
+            if grown:  # some tables of this batch do not exist: the caller folds it again for those that do
                 return 0
         except RowRefused as refusal:
-            return await self._apart(batch.spans, batch.events, refusal)
+            return await self._isolate(batch.spans, batch.events, refusal)
         return batch.count
 
     async def batch_in(self, connection: AsyncConnection, spans: Sequence[Span], events: Sequence[StoredEvent]) -> bool:
-        """The same in the caller's transaction, which must not be committed if it says False or raises `RowRefused`."""
+        """Fold in the caller's transaction, which must be rolled back if this returns False or raises `RowRefused`."""
         types = await self._types_now()
         done = await self._folded(spans, events, types)
         generation = await self._generation(connection, done, types)
@@ -210,77 +219,77 @@ class Folding:
         return _Folded(rows, number, steps, parked)
 
     async def _generation(self, connection: AsyncConnection, done: _Folded, types: _Types) -> Generation | None:
-        """The generation to write to, grown by what was declared; None if it is not what the fold took it to be.
+        """Lock the generation and create missing tables; return None if its number or revision has changed.
 
-        Its layout is another than that of `types` if not all could be made.
+        The layout of the result differs from that of `types` if some tables could not be created.
         """
         growing = types.layout != self.generation.layout
         if growing:
             await dialect_of(connection).alone(connection)
-        generation = await self._goal.generation(connection, "change" if growing else "share")
+        generation = await self._target.generation(connection, "change" if growing else "share")
         if (generation.number, generation.revision) != (done.number, types.revision):
             self.generation = generation
             return None
-        return await grow(connection, self._goal, generation, types.payloads) if growing else generation
+        return await grow(connection, self._target, generation, types.payloads) if growing else generation
 
     async def _write(
         self, connection: AsyncConnection, done: _Folded, generation: Generation | None
     ) -> Generation | None:
-        """The generation written to; None if there is none, or the progress is not what the fold took it to be."""
-        if generation is None or not await self._goal.advance(connection, done.steps):
+        """Write rows and checkpoints; return None, to roll back, without a generation or if a checkpoint has moved."""
+        if generation is None or not await self._target.advance(connection, done.steps):
             return None
         await done.rows.write(connection, generation.number)
         for number, reason in done.parked.items():
-            await self._goal.park(connection, number, _writable(reason))
+            await self._target.park(connection, number, _writable(reason))
         return generation
 
     async def _types_now(self) -> _Types:
-        """Read after the events: a declaration is stored before the first event that needs it."""
+        """Read the declarations. Called after the events are read, because each is stored before its first use."""
         payloads = await self._log.declarations()
         types = self._types
         if types is None or types.revision != self.generation.revision or types.payloads != payloads:
-            layout, batch = self._meaning.learn(self.generation.layout, payloads)
+            layout, batch = self._definition.learn(self.generation.layout, payloads)
             types = _Types(payloads, self.generation.revision, layout, batch)
             self._types = types
         return types
 
-    async def _apart(self, spans: Sequence[Span], events: Sequence[StoredEvent], refusal: RowRefused) -> int:
-        """The database refused a row of this batch: find the episode it belongs to, and park that one."""
+    async def _isolate(self, spans: Sequence[Span], events: Sequence[StoredEvent], refusal: RowRefused) -> int:
+        """Fold the batch in smaller parts until the refused row's event is alone, and park its episode there."""
         if len(spans) > 1:
-            return sum([await self.batch([span], some) for span, some in _by_span(spans, events)])
+            return sum([await self.batch([span], part) for span, part in _by_span(spans, events)])
         span = spans[0]
         if len(events) > 1:
-            # Halves, so that all that comes before the event is shown.
+            # The second half is folded only if the first is whole, so that no event is folded behind the refused one.
             middle = len(events) // 2
             cut = events[middle - 1].sequence
             count = await self.batch([span._replace(last=cut)], events[:middle])
             return count + (await self.batch([span._replace(after=cut)], events[middle:]) if count == middle else 0)
         async with self._log.writing() as connection:
             reason = f"event {events[0].sequence}: the database refuses it: {refusal}"
-            await self._goal.park(connection, events[0].number, _writable(reason))
+            await self._target.park(connection, events[0].number, _writable(reason))
         return 0
 
 
 def _writable(reason: str) -> str:
-    """The reason as every database takes it: it may name what a declaration or an event holds."""
-    shown = reason[:_REASON_LENGTH_MAX] + ("…" if len(reason) > _REASON_LENGTH_MAX else "")
-    return shown.encode(errors="backslashreplace").decode().replace("\0", "\\x00")
+    """Shorten and escape a reason for storage: it may quote recorded text that a database refuses."""
+    shortened = reason[:_REASON_LENGTH_MAX] + ("…" if len(reason) > _REASON_LENGTH_MAX else "")
+    return shortened.encode(errors="backslashreplace").decode().replace("\0", "\\x00")
 
 
 async def _fold_all(
     spans: Sequence[Span], events: Sequence[StoredEvent], rows: Batch
 ) -> tuple[list[Progress], dict[int, str]]:
-    """The events of these spans, in their order, added to `rows`; how far that is, and why some episodes stop."""
+    """Fold the events of these spans into `rows`, in order; return the new checkpoints and the episodes to park."""
     steps: list[Progress] = []
     parked: dict[int, str] = {}
-    seen = 0
-    for span, some in _by_span(spans, events):
+    count = 0
+    for span, part in _by_span(spans, events):
         last = span.after
-        for event in some:
+        for event in part:
             if event.sequence != last + 1:
                 break
-            seen += 1
-            if seen % _SLICE_EVENTS == 0:
+            count += 1
+            if count % _SLICE_EVENTS == 0:
                 await asyncio.sleep(0)
             try:
                 rows.fold(event)
@@ -295,6 +304,6 @@ async def _fold_all(
 
 
 def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, list[StoredEvent]]]:
-    """Each span with its events, of which there may be none; one span an episode."""
-    read = {number: list(some) for number, some in groupby(events, key=attrgetter("number"))}
-    return ((span, read.get(span.number, [])) for span in spans)
+    """Pair each span with its events, which may be none; each episode has one span."""
+    events_by_number = {number: list(part) for number, part in groupby(events, key=attrgetter("number"))}
+    return ((span, events_by_number.get(span.number, [])) for span in spans)

@@ -1,4 +1,13 @@
-"""Generations with a progress of their own: one that is made beside what people see, and those of projections."""
+"""Fold into generations that have their own checkpoint table: one that a rebuild fills, and those of projections.
+
+Theory of operation. The checkpoints of the visible built-in tables are `episode.folded`. Every other generation has a
+table with one row for each episode (`checkpoints`), which is dropped together with it. `SideTarget` finds the
+generation under its key in every transaction and fails if another one has taken its place, so a rebuild that was
+replaced, or a projection that was rebuilt elsewhere, is never written to. On a server `CatchUp` prepares the next batch
+while the current one is written; the prepared batch is used only if the current one was written whole, because it was
+read as continuing that one. Several workers may fill one generation, each its `Share` of the episodes, so that no two
+of them advance one checkpoint.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +32,11 @@ __all__ = ["SideTarget", "CatchUp", "Share", "WHOLE"]
 _log = logging.getLogger("pycrorm_async.projections")
 
 _EPISODES_MAX = 400
-"""So many episodes that have more are looked up for a batch: each costs as much as folding some of its events."""
+"""Bounds the episodes in one batch, because reading each of them costs as much as folding some of its events."""
 
 
 class Share(NamedTuple):
-    """Which episodes one of several workers folds: those whose number leaves `part` when divided by `many`."""
+    """The episodes that one of several workers folds: those whose number modulo `many` is `part`."""
 
     part: int = 0
     many: int = 1
@@ -37,13 +46,13 @@ WHOLE = Share()
 
 
 class SideTarget:
-    """A generation that is noted under a name of its own. Implements `Goal`.
+    """A generation with its own checkpoint table. Implements `FoldTarget`.
 
     Args:
-        key: under which it is noted.
-        projection: whose; None for our own tables.
-        version: of the fold here.
-        number: of the generation; None for whichever is noted.
+        key: of its row in `pycrorm_generation`.
+        projection: the custom projection's name; None for the built-in tables.
+        version: of the fold in this process.
+        number: of the generation; None accepts any that has the key.
     """
 
     def __init__(self, key: str, projection: str | None, version: int, *, number: int | None = None) -> None:
@@ -54,13 +63,17 @@ class SideTarget:
         self.place = ""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
-        found = await noted(connection, self._key, hold=hold)
-        if found is None or self._number not in (None, found.number):
-            raise InternalError(f"the tables of {self._projection or 'the memory'} that were folded into are gone")
-        if found.version != self._version:
-            raise DatabaseForeign(f"its tables are of version {found.version} now, and here it is {self._version}")
-        self.place = checkpoints.place_of(found.number, self._projection)
-        return found
+        generation = await noted(connection, self._key, hold=hold)
+        if generation is None or self._number not in (None, generation.number):
+            raise InternalError(
+                f"another process replaced the tables of {self._projection or 'the memory'} during the fold"
+            )
+        if generation.version != self._version:
+            raise DatabaseForeign(
+                f"its tables have version {generation.version} now, but this process folds version {self._version}"
+            )
+        self.place = checkpoints.place_of(generation.number, self._projection)
+        return generation
 
     async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
         grown = await grow_tables(connection, generation, layout)
@@ -77,36 +90,36 @@ class SideTarget:
 
 
 class CatchUp:
-    """Folds into such a generation what the log has more, batch after batch."""
+    """Folds the events that a generation lacks, batch after batch."""
 
     def __init__(
         self,
         log: EventLog,
-        goal: SideTarget,
+        target: SideTarget,
         generation: Generation,
         *,
-        meaning: FoldDefinition = TABLES,
+        definition: FoldDefinition = TABLES,
         share: Share = WHOLE,
         after_tables: bool = False,
         batch_events: int,
     ) -> None:
         self._log = log
-        self._goal = goal
+        self._target = target
         self._share = share
         self._after_tables = after_tables
         self._batch_events = batch_events
-        self.folding = Folding(log, goal, generation, meaning)
+        self.folding = Folding(log, target, generation, definition)
         self._after = 0
         self._ready: Prepared | None = None
 
     async def fold_next_batch(self) -> int | None:
-        """Folds a batch; the number of events, None when none is left of this share. Raises `LogDamaged`."""
+        """Fold a batch; return the number of events, None when none is left of this share. Raises `LogDamaged`."""
         batch, self._ready = self._ready or await self._prepared({}), None
         if batch is None:
             return None
         if self._log.address.is_sqlite:
             return await self.folding.write(batch)
-        # While a server writes, the next batch is read and folded. Where this process writes, that gains nothing.
+        # A server writes in its own process, so this one can prepare the next batch meanwhile.
         following = asyncio.create_task(self._prepared(batch.reached))
         try:
             count = await self.folding.write(batch)
@@ -120,19 +133,19 @@ class CatchUp:
         return count
 
     async def _prepared(self, reached: Mapping[int, int]) -> Prepared | None:
-        """The next batch. `reached` is how far episodes are once the one before it is written."""
+        """Prepare the next batch. `reached`: the checkpoints after the batch before it is written."""
         while True:
             async with self._log.reading() as connection:
-                await self._goal.generation(connection, "share")  # it is not dropped meanwhile
-                found = await checkpoints.behind(
+                await self._target.generation(connection, "share")  # locked, so that no rebuild drops its tables
+                episodes = await checkpoints.behind(
                     connection,
-                    self._goal.place,
+                    self._target.place,
                     after=self._after,
                     limit=_EPISODES_MAX,
                     share=self._share,
                     after_tables=self._after_tables,
                 )
-            behind = beyond(found, reached)
+            behind = beyond(episodes, reached)
             if behind:
                 break
             if self._after == 0:
@@ -147,12 +160,12 @@ class CatchUp:
 
 
 def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredEvent], ids: dict[int, str]) -> LogDamaged:
-    """What to raise of the first event that should be there."""
-    there = {(each.number, each.sequence) for each in events}
+    """Return the error for the first event of these spans that is missing."""
+    present = {(each.number, each.sequence) for each in events}
     number, sequence = next(
         (span.number, sequence)
         for span in spans
         for sequence in range(span.after + 1, span.last + 1)
-        if (span.number, sequence) not in there
+        if (span.number, sequence) not in present
     )
     return LogDamaged(ids[number], sequence, f"is missing in {log.address}")

@@ -1,7 +1,7 @@
-"""Release parked episodes whose next event can be folded now: by a later version, or since a name became free.
+"""Release parked episodes whose next event can be folded now: by a newer version, or because a name became free.
 
-A process looks once, when it opens the tables. It folds the one event that each episode is parked at, and writes
-nothing of it; folding continues there with the next batch.
+A process tries this once, when it opens the tables. It folds the one event at which each episode is parked and discards
+the rows; the next batch folds it again and continues there.
 """
 
 from __future__ import annotations
@@ -24,21 +24,22 @@ from pycrorm_async.store.log import park
 __all__ = ["release_parked"]
 
 _EPISODES_MAX = 1_000
-"""Parked episodes that one process looks at, at 0.1 ms each: opening a memory must not take minutes."""
+"""Bounds the parked episodes that one process tries, at 0.1 ms each, so that opening a memory never takes minutes."""
 _AT_AN_EVENT = re.compile(r"event (\d+): (?!the database refuses it)")
-"""How a reason begins that the fold gave; whether a database takes a row is known only when it is written."""
+"""Matches a reason from the fold. A row that the database refused is excluded, because only writing it again shows
+whether the database accepts it now."""
 
 
-async def release_parked(connection: AsyncConnection, goal: Growing, generation: Generation) -> Generation:
-    """The generation, with tables that the database makes now and refused before; the episodes that need them go on.
+async def release_parked(connection: AsyncConnection, target: Growing, generation: Generation) -> Generation:
+    """Release episodes and create tables that the database refused before; return the generation with those.
 
-    Everything happens in the caller's transaction, alone in the memory.
+    Runs in the caller's transaction, which must exclude all other writers of the memory.
     """
     dialect = dialect_of(connection)
     parked = [each for each in await dialect.stopped(connection) if each.parked is not None]
     places = [(each, _AT_AN_EVENT.match(each.parked or "")) for each in parked[:_EPISODES_MAX]]
     payloads = await dialect.declarations(connection) if parked or generation.layout.unmade else []
-    generation = await _tried_again(connection, goal, generation, payloads)
+    generation = await _retry_unmade(connection, target, generation, payloads)
     if not parked:
         return generation
     united = unite(generation.layout, payloads)
@@ -55,18 +56,18 @@ async def release_parked(connection: AsyncConnection, goal: Growing, generation:
     return generation
 
 
-async def _tried_again(
-    connection: AsyncConnection, goal: Growing, generation: Generation, payloads: Sequence[bytes]
+async def _retry_unmade(
+    connection: AsyncConnection, target: Growing, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
-    """The generation with what can be made now of the tables that the database refused to make."""
+    """Try again to create the tables that the database refused; return the generation with those it creates now."""
     unmade = generation.layout.unmade
     if not unmade:
         return generation
     attempt = await connection.begin_nested()
-    forgotten = generation.without_unmade()
-    grown = await grow(connection, goal, forgotten, [each for each in payloads if fingerprint(each) in unmade])
+    cleared = generation.without_unmade()
+    grown = await grow(connection, target, cleared, [each for each in payloads if fingerprint(each) in unmade])
     if grown.layout == generation.layout:
-        await attempt.rollback()  # as it was, and no process has to read it again
+        await attempt.rollback()  # keeps the revision, so that no other process has to read the layout again
         return generation
     await attempt.commit()
     return grown

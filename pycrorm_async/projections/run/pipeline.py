@@ -1,13 +1,15 @@
-"""Folds batch after batch with several hands: while one writes its batch, another one prepares the next.
+"""Fold batch after batch with several workers: while one writes its batch, another prepares the next.
 
     pipeline = FoldPipeline(log)
     while await pipeline.fold_next(hands) is not None: ...
 
-A hand is a process, or anything else, that folds into the tables of the same log. It prepares a batch (reads the events
-and folds them into rows) and writes it later in one transaction. The pipeline decides which events each batch has. A
-batch that was prepared is written only if the batch before it was written whole; otherwise the pipeline forgets it and
-reads from the tables how far they are. So no order of answers, deaths or restarts folds an event twice or leaves one
-out: the tables themselves refuse a batch that does not continue them.
+Theory of operation. A `Hand` folds into the tables of the log, usually in a process of its own. It prepares a batch
+(reads the events and folds them into rows) and later writes it in one transaction. The pipeline chooses the events of
+each batch. It prepares at most one batch ahead, and writes a prepared batch only if the batch before it was written
+whole; otherwise it discards the prepared one and reads the checkpoints again. A hand may die or be replaced at any
+moment: its batch then counts as not written. If its transaction committed although its answer was lost, the checkpoints
+show it, because the next batch is read from them, and a batch that does not continue the checkpoints is rolled back. So
+no event is folded twice or left out.
 """
 
 from __future__ import annotations
@@ -22,16 +24,16 @@ from pycrorm_async.store.stored import Span
 __all__ = ["FoldPipeline", "Hand", "Outlook", "LOOKAHEAD_EVENTS_MIN"]
 
 LOOKAHEAD_EVENTS_MIN: Final = 2_000
-"""A smaller batch is not prepared ahead: more events may join it while the one before it is written."""
+"""The smallest batch that is prepared ahead; a smaller one waits for the events that arrive during the write."""
 
 
 class Outlook(NamedTuple):
-    """The state of the tables once a prepared batch is written.
+    """The state of the tables after a prepared batch is written.
 
     Attributes:
-        events: folded in the batch.
+        events: the number folded in the batch.
         reached: by episode number, the last sequence folded.
-        is_whole: False if the batch stops an episode.
+        is_whole: False if the batch parks an episode.
     """
 
     events: int
@@ -40,19 +42,19 @@ class Outlook(NamedTuple):
 
 
 class Hand(Protocol):
-    """Folds one batch at a time into the tables. Both methods raise `DatabaseUnavailable`."""
+    """A worker that folds one batch at a time into the tables. Both methods raise `DatabaseUnavailable`."""
 
     async def prepare(self, spans: Sequence[Span]) -> Outlook:
-        """Reads and folds these events, and forgets the batch it had prepared before. Writes nothing."""
+        """Read and fold these events, and discard the batch prepared before. Writes nothing."""
         ...
 
     async def write(self) -> int:
-        """Writes the batch; the number of events of it that are in the tables now."""
+        """Write the batch; return the number of its events that are in the tables now."""
         ...
 
 
 class FoldPipeline:
-    """The order in which one log is folded. At most one batch is prepared ahead."""
+    """Assigns the events of one log to hands, batch by batch."""
 
     def __init__(self, log: EventLog, *, batch_events: int = 10_000) -> None:
         self._log = log
@@ -61,10 +63,10 @@ class FoldPipeline:
         self._last_number = 0
 
     async def fold_next(self, hands: Sequence[Hand]) -> int | None:
-        """Folds one batch with these hands, of which there is one or more; the number of events, None if none is left.
+        """Fold one batch with one or more hands; return the number of events, None if no episode is behind.
 
-        Fewer events than the batch has (none, if another process was quicker) are no fault: the next call goes on.
-        Raises what a hand raises; what was written stays.
+        The number is smaller than the batch if an episode was parked, and 0 if another process folded it first. Raises
+        the errors of the hands; rows that were written stay.
         """
         prepared, self._ready = self._ready, None
         if prepared is None or prepared[0] not in hands:
@@ -88,12 +90,12 @@ class FoldPipeline:
         return count
 
     async def size(self) -> int:
-        """The number of events that the next batch would have."""
+        """Return the number of events that the next batch would have."""
         with self._log.translated():
             return size_of(await self._log.unfolded(self._batch_events, after=0))
 
     async def _spans(self, reached: Mapping[int, int]) -> list[Span]:
-        # Each time from where the last one ended, so that an episode that is always behind does not hold up others.
+        # Start behind the last batch's episode, so that an episode that always grows does not starve the others.
         spans = await self._log.unfolded(self._batch_events, after=self._last_number, reached=reached)
         if spans:
             self._last_number = spans[-1].number
@@ -101,7 +103,7 @@ class FoldPipeline:
 
 
 def size_of(spans: Sequence[Span]) -> int:
-    """The number of events in these spans.
+    """Return the number of events in these spans.
 
     >>> size_of([Span(1, 0, 7), Span(2, 3, 4)])
     8
