@@ -97,5 +97,5 @@ async def _rebuild(url: str, workers: int | None, projection: Projection | None)
             watch(done, total, what)
 
         if projection is not None:
-            return await rebuild_projection(url, projection, tell=tell)
-        return await rebuild_memory(url, workers=workers, tell=tell)
+            return await rebuild_projection(url, projection, report_progress=tell)
+        return await rebuild_memory(url, workers=workers, report_progress=tell)

@@ -62,7 +62,7 @@ async def _verify(url: str, episode: str | None, known: Sequence[Projection]) ->
     try:
         only = None if episode is None else await episode_named(log, episode)
         with watched("verifying") as tell:
-            found = await verify_log(log, episode=only, projections=known, tell=tell)
+            found = await verify_log(log, episode=only, projections=known, report_progress=tell)
         return found, {each.number: each.id for each in await log.episodes()}
     finally:
         await log.close()

@@ -166,7 +166,7 @@ def test_one_whose_code_is_not_here_is_left_as_it_is_and_told(lab: Path) -> None
     assert "the code of the projection weighed is not here: give it with --projection module:Class" in one_line_of(told)
     told = pycrorm("verify", cwd=lab)
     assert told.returncode == 0
-    assert one_line_of(told) == "the projection weighed was not looked at: its code is not here"
+    assert one_line_of(told) == "the projection weighed was not looked at: its code is not installed here"
 
 
 def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_folded(lab: Path) -> None:
@@ -179,7 +179,7 @@ def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_fol
     assert "episode 1 is stopped in the projection weighed: event 5: weighed raised ValueError" in one_line_of(told)
     ran = pycrorm("writer", "--once", "--projection", "lab:Next", cwd=lab)
     assert ran.returncode == 0
-    said = "of version 1, and the one here of version 2: `pycrorm rebuild weighed` makes them anew"
+    said = "have version 1, its code has version 2: run `pycrorm rebuild weighed`"
     assert said in one_line_of(ran)
     assert pycrorm("rebuild", "weighed", "--projection", "lab:Next", cwd=lab).returncode == 0
     assert weighed(lab) == WEIGHED
@@ -190,11 +190,11 @@ def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_fol
     ("arguments", "said"),
     [
         (["rebuild", "--projection", "lab"], "'lab' names no projection: write module:Class"),
-        (["verify", "--projection", "nowhere:At"], "nowhere does not import: ModuleNotFoundError"),
+        (["verify", "--projection", "nowhere:At"], "nowhere cannot be imported: ModuleNotFoundError"),
         (["writer", "--once", "--projection", "lab:Absent"], "lab has no 'Absent'"),
         (["rebuild", "--projection", "lab:Strange"], "lab:Strange is no projection"),
         (["rebuild", "--projection", "lab:NoTables"], "it has no tables"),
-        (["rebuild", "--projection", "lab:Weighed", "--projection", "lab:Picky"], "two projections are called"),
+        (["rebuild", "--projection", "lab:Weighed", "--projection", "lab:Picky"], "two projections have the name"),
         (["rebuild", "scales"], "there is no projection 'scales': there are tables"),
         (["run", "weighing.py", "--writer", "daemon", "--projection", "lab:Weighed"], "knows no projections"),
     ],

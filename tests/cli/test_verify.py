@@ -105,7 +105,7 @@ def test_what_cannot_be_verified_is_one_line(folder: Path) -> None:
     ask_to_change(folder / "pycrorm.db", "DROP TABLE state_sample__1")
     done = pycrorm("verify", cwd=folder)
     assert (done.returncode, done.stdout) == (3, "")
-    assert "a table is gone: run `pycrorm rebuild`" in one_line_of(done)
+    assert "a table is missing: run `pycrorm rebuild`" in one_line_of(done)
 
 
 def test_a_log_without_tables_and_what_is_no_memory_at_all_are_one_line(tmp_path: Path) -> None:
@@ -120,7 +120,7 @@ def test_a_log_without_tables_and_what_is_no_memory_at_all_are_one_line(tmp_path
     other.commit()
     other.close()
     for name, reason in (
-        ("bare", "has no tables yet: `pycrorm writer --once` makes them"),
+        ("bare", "has no tables yet: run `pycrorm writer --once`"),
         ("other", "is a database of another program"),
         ("none", "does not exist"),
     ):

@@ -149,7 +149,7 @@ async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
     assert numbers[3] > 3 + reserve
     assert await is_clean(database_url)
     [reason] = await incarnations(database_url)
-    assert "events were offered again; 0 of 2 episodes stay incomplete" in reason
+    assert "events were appended again; 0 of 2 episodes stay incomplete" in reason
 
 
 async def test_a_lost_episode_of_a_dead_recorder_ends_lost_again(

@@ -212,7 +212,7 @@ async def test_another_version_is_not_folded_before_it_is_rebuilt(
     await folded(log, [*declarations(PICK_UP), *tries(1).records], GraspRate())
     before = await folded(log, [], GraspRate())
     projector = await folded(log, tries(2).records, NextGraspRate())
-    assert "of version 1, and the one here of version 2: `pycrorm rebuild grasp_rate`" in caplog.text
+    assert "have version 1, its code has version 2: run `pycrorm rebuild grasp_rate`" in caplog.text
     assert await shown(log) == rows_of(1)
     await rebuilt(log, NextGraspRate())
     new = [(each[0], each[1], each[2], each[3] == "TOP") for episode in (1, 2) for each in rows_of(episode)]
@@ -274,8 +274,11 @@ class TakesALeaf(TakesAView):
 @pytest.mark.parametrize(
     ("projection", "reason"),
     [
-        (TakesAView(), "the projection other wants 'grasp_tries_per_arm', which the projection grasp_rate has"),
-        (TakesALeaf(), "the projection other wants 'pick_up_action', which the memory has"),
+        (
+            TakesAView(),
+            "the projection other needs the name 'grasp_tries_per_arm', which the projection grasp_rate has",
+        ),
+        (TakesALeaf(), "the projection other needs the name 'pick_up_action', which the memory has"),
     ],
 )
 async def test_a_name_that_is_taken_is_refused_with_both(log: EventLog, projection: Projection, reason: str) -> None:
@@ -361,10 +364,10 @@ async def test_values_are_kept_as_they_are_also_in_columns_with_names_of_the_dat
         ({"name": "Grasp Rate"}, "its name is 'Grasp Rate', and must be"),
         ({"version": 0}, "its version is 0"),
         ({"tables": {}}, "it has no tables"),
-        ({"tables": {"pose": {"x": "real"}}}, "the table 'pose' has a name that the memory itself uses"),
-        ({"tables": {"one": {"id": "integer"}}}, "the column one.id: not a name it can have"),
+        ({"tables": {"pose": {"x": "real"}}}, "the table name 'pose' is used by the memory itself"),
+        ({"tables": {"one": {"id": "integer"}}}, "the column name one.id is reserved"),
         ({"tables": {"one": {"n": "int"}}}, "the column one.n is 'int', and must be one of row, integer"),
-        ({"tables": {"grasp_tries_per_arm": {}}}, "two of its tables and views are called 'grasp_tries_per_arm'"),
+        ({"tables": {"grasp_tries_per_arm": {}}}, "two of its tables and views have the name 'grasp_tries_per_arm'"),
     ],
 )
 def test_a_projection_that_cannot_be_is_refused_at_once(attributes: dict[str, Any], reason: str) -> None:
@@ -382,7 +385,7 @@ async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not
     found = await verify(log, projections=[GraspRate()])
     assert (found.drift, found.damage, found.not_compared) == (0, 0, {})
     assert found.rows == (await verify(log)).rows + 4 * 4 + 2
-    assert (await verify(log)).not_compared == {"grasp_rate": "its code is not here"}
+    assert (await verify(log)).not_compared == {"grasp_rate": "its code is not installed here"}
     table = "pycrorm_own_grasp_try__1"
     first, second = rows_of(2)[:2]
     async with log.engine.begin() as connection:
@@ -409,7 +412,7 @@ async def test_verify_tells_of_a_fold_that_means_something_else_under_the_same_v
     found = await verify(log, projections=[NoLeftHand()])
     (told,) = map(str, found.differences)
     assert told == (
-        "grasp_rate.fold is 'shown in the tables', and should be"
+        "grasp_rate.fold is 'folded in the tables', and should be"
         " 'parked: grasp_rate raised ZeroDivisionError: no right hand'"
     )
     assert (await verify(log, projections=[NextGraspRate()])).not_compared.keys() == {"grasp_rate"}

@@ -118,14 +118,14 @@ async def test_large_logs_are_remade_by_two_processes_where_two_cores_are_idle(
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     await store(url, [*TYPES, *(record for number in range(1, 8) for record in picking(number).records)])
-    before, real, shared_out = tables_of(url), rebuilding._share_out, list[int]()
+    before, real, shared_out = tables_of(url), rebuilding._run_workers, list[int]()
 
     async def share_out(address: DatabaseAddress, rebuild: Rebuild, workers: int, look: Callable[[int], None]) -> None:
         shared_out.append(workers)
         await real(address, rebuild, workers, look)
         assert await rebuild.left() == 0
 
-    monkeypatch.setattr(rebuilding, "_share_out", share_out)
+    monkeypatch.setattr(rebuilding, "_run_workers", share_out)
     monkeypatch.setattr(rebuilding, "_ALONE_EVENTS_MAX", events)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores)
     monkeypatch.setattr(os, "getloadavg", lambda: (load, 9.0, 9.0))
@@ -253,10 +253,10 @@ async def test_interrupted_it_is_taken_up_where_it_was(database_url: str, monkey
             raise EndedError
 
     with pytest.raises(EndedError):
-        await rebuild_memory(database_url, tell=interrupted)
+        await rebuild_memory(database_url, report_progress=interrupted)
     assert differences(before, tables_of(database_url)) == []
     told: list[int] = []
-    done = await rebuild_memory(database_url, tell=lambda _what, done, _total: told.append(done))
+    done = await rebuild_memory(database_url, report_progress=lambda _what, done, _total: told.append(done))
     assert told[0] > 150
     assert done.generation == 2
     assert differences(before, tables_of(database_url)) == []
@@ -413,7 +413,9 @@ async def test_a_table_of_somebody_in_the_schema_of_the_views_is_one_line_and_st
     ask_to_change(url, "CREATE TABLE memory.mine (a int)")
     for _ in range(2):
         with pytest.raises(DatabaseError, match=r"memory\.mine is not of the memory.*: move it to another schema"):
-            await rebuild_memory(url, tell=lambda _what, done, _total: pytest.fail(f"told after {done} events"))
+            await rebuild_memory(
+                url, report_progress=lambda _what, done, _total: pytest.fail(f"told after {done} events")
+            )
         assert ask(url, "SELECT count(*) FROM memory.mine") == [(0,)]
         assert traces(url) == []
     ask_to_change(url, "DROP TABLE memory.mine")

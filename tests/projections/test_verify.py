@@ -129,7 +129,9 @@ async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault
         # Some is folded in the first parts of each look: the tables are behind what is read, or ahead of it.
         left = iter([*range(3)])
         assert_clean(
-            await verify(log, tell=lambda *_, left=left: at_once(fold) if next(left, None) is not None else None)
+            await verify(
+                log, report_progress=lambda *_, left=left: at_once(fold) if next(left, None) is not None else None
+            )
         )
         looks += 1
     assert looks > 1
@@ -154,7 +156,7 @@ async def test_tables_that_are_made_anew_between_two_parts_are_no_fault(
         if told in (2, 5, 6):
             at_once(rebuild)
 
-    assert_clean(await verify(log, tell=tell))
+    assert_clean(await verify(log, report_progress=tell))
     assert {table.physical.rpartition("__")[2].strip('"') for table in shown(database_url)} == {"4"}
 
 
@@ -181,7 +183,7 @@ async def test_an_episode_that_grows_between_two_parts_is_no_fault(
         at_once(record)
         stored += 6
 
-    found = await verify(log, tell=tell)
+    found = await verify(log, report_progress=tell)
     assert_clean(found)
     assert (found.events, found.behind) == (len(whole.records), 0)
     await log.close()
@@ -304,7 +306,7 @@ async def test_a_table_that_is_gone_is_told_in_a_line(log: EventLog, database_ur
         database_url,
         f"DROP TABLE {named(database_url, 'object_removal')} {'CASCADE' * database_url.startswith('postgresql:')}",
     )
-    with pytest.raises(Exception, match="a table is gone: run `pycrorm rebuild`"):
+    with pytest.raises(Exception, match="a table is missing: run `pycrorm rebuild`"):
         await look(log)
 
 

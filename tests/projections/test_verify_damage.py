@@ -89,11 +89,11 @@ CANNOT = "is in the tables, and cannot be folded:"
         ),
         (f"DELETE FROM event {OF_2} 20", ["event 20: is missing"]),
         ("DELETE FROM event WHERE episode = 2", ["event 1: is missing"]),
-        (f"{ONE_MORE.format(2, 21)} {OF_2} 20", ["event 21: is there, and the episode is said to end with 20"]),
-        (f"{ONE_MORE.format(2, 0)} {OF_2} 20", ["event 0: is there, and the episode is said to end with 20"]),
+        (f"{ONE_MORE.format(2, 21)} {OF_2} 20", ["event 21: exists, but the episode must end with event 20"]),
+        (f"{ONE_MORE.format(2, 0)} {OF_2} 20", ["event 0: exists, but the episode must end with event 20"]),
         (
             f"UPDATE event SET sequence = 25 {OF_2} 20",
-            ["event 25: is there, and the episode is said to end with 20", "event 20: is missing"],
+            ["event 25: exists, but the episode must end with event 20", "event 20: is missing"],
         ),
         (
             f"UPDATE event SET payload = '?' {OF_2} 9",
@@ -169,7 +169,7 @@ async def test_declarations_that_were_swapped_or_changed_are_told(
         ask_to_change(database_url, change)
     found = await told(log, database_url, monkeypatch)
     assert {str(each) for each in found.damages} == {
-        f"the declaration {name} is not what was declared" for name in (first, second)
+        f"the declaration {name} does not match its fingerprint" for name in (first, second)
     }
     assert found.drift == 0
     ask_to_change(database_url, f"UPDATE pycrorm_declaration SET payload = '?' WHERE fingerprint = '{first}'")

@@ -1,1 +1,1 @@
-"""Custom projections: those of the user's own."""
+"""Fold the log into tables of the user's own."""

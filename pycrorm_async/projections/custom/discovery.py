@@ -1,6 +1,6 @@
-"""Which projections a process knows: those that are named, and those that installed packages offer.
+"""Discover custom projections: those given by the caller and those installed as entry points.
 
-A package offers one as an entry point, in its `pyproject.toml`:
+A package declares a projection in its `pyproject.toml`:
 
     [project.entry-points."pycrorm.projections"]
     grasp_rate = "lab.projections:GraspRate"
@@ -27,20 +27,20 @@ _log = logging.getLogger("pycrorm_async.projections")
 
 
 def checked(projections: Sequence[Projection]) -> tuple[Projection, ...]:
-    """The same. Raises `CallerError` for one that cannot be, and for two of one name."""
+    """Validate projections and return them. Raises `CallerError` for an invalid one, and for two of one name."""
     names: set[str] = set()
     for each in projections:
         if not isinstance(each, Projection):
-            raise CallerError(f"{each!r} is no projection: give an object of a class that derives from Projection")
+            raise CallerError(f"{each!r} is no projection: pass an instance of a class that derives from Projection")
         columns_of(each)
         if each.name in names:
-            raise CallerError(f"two projections are called {each.name!r}: rename one")
+            raise CallerError(f"two projections have the name {each.name!r}: rename one")
         names.add(each.name)
     return tuple(projections)
 
 
 def named(references: Sequence[str]) -> tuple[Projection, ...]:
-    """The projections of these `module:Class`, also of modules in the working directory. Raises `CallerError`."""
+    """Import projections by `module:Class`, also from the working directory. Raises `CallerError`."""
     if references and str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     return checked([_named(each) for each in references])
@@ -53,36 +53,36 @@ def _named(reference: str) -> Projection:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:
-        raise CallerError(f"{module_name} does not import: {type(error).__name__}: {error}") from error
+        raise CallerError(f"{module_name} cannot be imported: {type(error).__name__}: {error}") from error
     if not hasattr(module, class_name):
         raise CallerError(f"{module_name} has no {class_name!r}")
-    return _made(getattr(module, class_name), reference)
+    return _instance(getattr(module, class_name), reference)
 
 
-def _made(kind: Any, reference: str) -> Projection:
-    """One of this class."""
+def _instance(kind: Any, reference: str) -> Projection:
+    """Create and validate an instance of this class. Raises `CallerError`."""
     if not isinstance(kind, type) or not issubclass(kind, Projection):
         raise CallerError(f"{reference} is no projection: derive from pycrorm_async.Projection")
     try:
-        made = kind()
+        projection = kind()
     except Exception as error:
-        raise CallerError(f"{reference} cannot be made: {type(error).__name__}: {error}") from error
-    columns_of(made)
-    return made
+        raise CallerError(f"{reference} cannot be instantiated: {type(error).__name__}: {error}") from error
+    columns_of(projection)
+    return projection
 
 
 def installed_besides(projections: Sequence[Projection]) -> tuple[Projection, ...]:
-    """Those that packages offer, without those of the same names. What is wrong with one is told in the log."""
-    there = {each.name for each in projections}
-    found: list[Projection] = []
+    """Return the installed projections whose names these do not have. A faulty one is logged and left out."""
+    names = {each.name for each in projections}
+    installed: list[Projection] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda each: (each.name, each.value)):
         try:
-            made = _made(entry.load(), entry.value)
-        except Exception as error:  # noqa: BLE001 - somebody else's package; the others go on
+            projection = _instance(entry.load(), entry.value)
+        except Exception as error:  # noqa: BLE001 - a fault in one package must not disable the others
             reason = error if isinstance(error, CallerError) else f"{type(error).__name__}: {error}"
             _log.warning("the projection %s of an installed package is left out: %s", entry.name, reason)
             continue
-        if made.name not in there:
-            there.add(made.name)
-            found.append(made)
-    return tuple(found)
+        if projection.name not in names:
+            names.add(projection.name)
+            installed.append(projection)
+    return tuple(installed)

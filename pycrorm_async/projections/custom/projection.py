@@ -1,4 +1,5 @@
-"""Projections of one's own: tables that a pure fold makes from the log, kept live, rebuilt and verified like ours.
+"""Define custom projections: tables that a pure fold makes from the log, kept live, rebuilt and verified like built-in
+ones.
 
 >>> class GraspRate(Projection):
 ...     name, version = "grasp_rate", 1
@@ -6,8 +7,8 @@
 ...
 ...     def fold(self, event, rows):
 ...         match event.happening:
-...             case NodeStarted(parameters=given) if event.dtype == "PickUpAction":
-...                 rows.insert("grasp_try", event.id, arm=given["arm"], grasp=given["grasp"], status="RUNNING")
+...             case NodeStarted(parameters=values) if event.dtype == "PickUpAction":
+...                 rows.insert("grasp_try", event.id, arm=values["arm"], grasp=values["grasp"], status="RUNNING")
 ...             case NodeEnded(node=node, status=status):
 ...                 rows.update("grasp_try", event.row(node), status=status)
 """
@@ -30,19 +31,19 @@ __all__ = ["Projection", "Event", "Changes", "Column", "OF_EVERY_TABLE", "column
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 Column: TypeAlias = Literal["row", "integer", "real", "text", "boolean", "time", "json"]
-"""How a column is stored: the id of a row, a scalar, µs since 1970, JSON."""
+"""The storage of a column: the id of a row, a scalar, µs since 1970, JSON."""
 OF_EVERY_TABLE: dict[str, Storage] = {"id": "key", "process_metadata_id": "row"}
 
 
 class Event(NamedTuple):
-    """One event of the log, as a fold gets it.
+    """One event of the log, as a fold receives it.
 
     Attributes:
         number: of its episode, in this database.
         sequence: of the event in its episode.
         time: µs since 1970.
-        monotonic_ns: by the clock that never goes back.
-        happening: what happened, one of `pycrorm_async.events.types`.
+        monotonic_ns: reading of the monotonic clock.
+        happening: the payload, one of `pycrorm_async.events.types`.
         dtype: of a NodeStarted, its designator's type; None for others.
         parameters: of a NodeStarted, by field, as `NodeStarted.parameters`; None for one that could not be recorded.
     """
@@ -57,38 +58,38 @@ class Event(NamedTuple):
 
     @property
     def id(self) -> int:
-        """The id of the row this event makes, in any table: for a NodeStarted that of its node and designator."""
+        """The id of this event's row, in any table: for a NodeStarted that of its node and designator."""
         return row(self.number, self.sequence)
 
     def row(self, sequence: int, slot: int = 0) -> int:
-        """The id of the row that an event of the same episode makes; up to 32 of them, by their slots."""
+        """Return the id of a row of another event in the same episode; each event may have 32, by slot."""
         return row(self.number, sequence, slot)
 
 
 class Changes:
-    """What one event changes. Both keep the rule that an event changes rows of its own episode only."""
+    """The row changes of one event. An event may change rows of its own episode only."""
 
     def __init__(self) -> None:
         self.all: list[tuple[bool, str, int, dict[str, Any]]] = []
 
     def insert(self, table: str, id: int, /, **columns: Any) -> None:  # noqa: A002
-        """A row that is not there yet; columns that are not given are null."""
+        """Insert a new row; omitted columns are null."""
         self.all.append((True, table, id, columns))
 
     def update(self, table: str, id: int, /, **columns: Any) -> None:  # noqa: A002
-        """Other values for a row; no effect if there is none of this id."""
+        """Set columns of a row; no effect if no row has this id."""
         self.all.append((False, table, id, columns))
 
 
 class Projection(ABC):
-    """Derive from it, say what the tables are, and fold.
+    """The base class of custom projections: subclasses define tables and a fold.
 
     Attributes:
-        name: in the database: small letters, digits and underscores.
-        version: counts what the fold means. With another one `pycrorm rebuild NAME` makes the tables anew.
-        tables: columns and how they are stored (`row` for the id of one, `integer`, `real`, `text`, `boolean`,
-            `time` in µs since 1970, `json`). Every table also has `id`, and `process_metadata_id` for its episode.
-        views: questions about these tables with a name, shown beside them.
+        name: in the database: lower-case letters, digits and underscores.
+        version: of the fold. After a change of it, `pycrorm rebuild NAME` rebuilds the tables.
+        tables: columns and their storage (`row` for the id of one, `integer`, `real`, `text`, `boolean`, `time` in µs
+            since 1970, `json`). Every table also has `id`, and `process_metadata_id` for its episode.
+        views: named queries over these tables, created beside them.
     """
 
     name: ClassVar[str]
@@ -98,14 +99,14 @@ class Projection(ABC):
 
     @abstractmethod
     def fold(self, event: Event, rows: Changes) -> None:
-        """Says what this event changes. Pure: the same event always changes the same; nothing is looked up or kept.
+        """Add the changes of this event to `rows`. Must be pure: no lookups, no state, the same event gives the same.
 
-        One that raises stops its episode in this projection, with the reason in `pycrorm status`, until a rebuild.
+        An exception parks the episode in this projection until a rebuild; `pycrorm status` shows the reason.
         """
 
 
 def columns_of(projection: Projection) -> dict[str, dict[str, Storage]]:
-    """Its tables with all their columns. Raises `CallerError` for a projection that cannot be."""
+    """Return the projection's tables with all their columns. Raises `CallerError` for an invalid projection."""
     fault = _fault_in(projection)
     if fault is not None:
         raise CallerError(f"the projection {type(projection).__qualname__}: {fault}")
@@ -116,23 +117,23 @@ def _fault_in(projection: Projection) -> str | None:
     name: Any = getattr(projection, "name", None)
     version: Any = projection.version
     if not isinstance(name, str) or not _NAME.fullmatch(name) or name == "tables":
-        return f"its name is {name!r}, and must be small letters, digits and underscores, 40 at most, not 'tables'"
+        return f"its name is {name!r}, and must be lower-case letters, digits and underscores, 40 at most, not 'tables'"
     if not isinstance(version, int) or not 0 < version < 2**31:
-        return f"its version is {version!r}, and must be a number from 1 on"
+        return f"its version is {version!r}, and must be an integer > 0"
     if not getattr(projection, "tables", None):
         return "it has no tables: set `tables`"
     for table, columns in projection.tables.items():
         if not _NAME.fullmatch(table):
-            return f"the table {table!r}: a name is small letters, digits and underscores, 40 at most"
+            return f"the table name {table!r} must be lower-case letters, digits and underscores, 40 at most"
         if is_reserved(table):
-            return f"the table {table!r} has a name that the memory itself uses"
+            return f"the table name {table!r} is used by the memory itself"
         for column, storage in columns.items():
             if not _NAME.fullmatch(column) or column in OF_EVERY_TABLE:
-                return f"the column {table}.{column}: not a name it can have"
+                return f"the column name {table}.{column} is reserved, or has other characters than a-z, 0-9 and _"
             if storage not in get_args(Column):
                 return f"the column {table}.{column} is {storage!r}, and must be one of {', '.join(get_args(Column))}"
     if any(each.materialised for each in projection.views):
-        return "a view of a projection cannot be materialised: it stands on tables that are kept already"
+        return "a view of a projection cannot be materialised: its tables are stored already"
     names = [*projection.tables, *(each.name for each in projection.views)]
-    twice = next((each for each in names if [*map(str.lower, names)].count(each.lower()) > 1), None)
-    return f"two of its tables and views are called {twice!r}" if twice else None
+    duplicate = next((each for each in names if [*map(str.lower, names)].count(each.lower()) > 1), None)
+    return f"two of its tables and views have the name {duplicate!r}" if duplicate else None

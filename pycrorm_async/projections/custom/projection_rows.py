@@ -1,4 +1,4 @@
-"""What a projection of one's own makes of a batch of events, checked, so that every database keeps the same."""
+"""Collect the rows of a custom projection for one batch, checked so that every database stores the same values."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _INTEGER_MAX = 2**63 - 1
 
 
 class CustomRows:
-    """Rows to insert, and changes of rows that came with an earlier batch; by table and id. Implements `Batch`."""
+    """Rows to insert, and changes of rows that an earlier batch inserted, by table and id. Implements `Batch`."""
 
     def __init__(self, projection: Projection, declared: Mapping[str, DesignatorTypeDeclared]) -> None:
         self._projection = projection
@@ -36,7 +36,7 @@ class CustomRows:
         self._insertion: Insertion = None
 
     def fold(self, event: StoredEvent) -> None:
-        """Adds what the projection makes of this event. Raises `CannotFold`, and then has added nothing."""
+        """Add the projection's changes for this event. Raises `CannotFold`, and then has added none."""
         changes = Changes()
         try:
             self._projection.fold(self._event(event), changes)
@@ -46,8 +46,8 @@ class CustomRows:
             raise CannotFold(f"{self._projection.name} raised {type(error).__name__}: {error}") from error
         new: set[tuple[str, int]] = set()
         checked = []
-        for inserts, table, id_, given in changes.all:
-            checked.append((inserts, table, id_, self._checked(event, table, id_, given)))
+        for inserts, table, id_, columns in changes.all:
+            checked.append((inserts, table, id_, self._checked(event, table, id_, columns)))
             if inserts and ((table, id_) in new or id_ in self._inserts[table]):
                 raise CannotFold(f"{table} has a row {id_} already")
             if inserts:
@@ -55,41 +55,41 @@ class CustomRows:
         for inserts, table, id_, values in checked:
             if inserts:
                 self._inserts[table][id_] = {"id": id_, "process_metadata_id": event.number, **values}
-                self._updates[table].pop(id_, None)  # it was of a row that was not there yet
+                self._updates[table].pop(id_, None)  # an update before the insert had no row, so it has no effect
             elif id_ in self._inserts[table]:
                 self._inserts[table][id_] |= values
             elif values:
                 self._updates[table].setdefault(id_, {}).update(values)
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
-        """All rows to insert, by (table, columns)."""
-        found: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
+        """Return all rows to insert, by (table, columns)."""
+        rows_by_table: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
         for table, rows in self._inserts.items():
             columns = tuple(self._columns[table])
             if rows:
-                found[f"{OWN}{table}", columns] = [tuple(map(each.get, columns)) for each in rows.values()]
-        return found
+                rows_by_table[f"{OWN}{table}", columns] = [tuple(map(each.get, columns)) for each in rows.values()]
+        return rows_by_table
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
-        """Makes ready what is to be inserted."""
+        """Prepare the statements that insert the rows."""
         self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self.to_insert(), generation))
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:
-        """All of it, in this transaction. Raises `RowRefused`."""
+        """Write all rows in the caller's transaction. Raises `RowRefused`."""
         dialect, quote = dialect_of(connection), connection.dialect.identifier_preparer.quote
         await dialect.insert(connection, self._insertion)
         for table, rows in self._updates.items():
-            alike: dict[tuple[str, ...], list[Row]] = {}
+            updates: dict[tuple[str, ...], list[Row]] = {}
             for id_, values in rows.items():
-                alike.setdefault(tuple(sorted(values)), []).append((id_, *(values[name] for name in sorted(values))))
-            for columns, made in alike.items():
+                updates.setdefault(tuple(sorted(values)), []).append((id_, *(values[name] for name in sorted(values))))
+            for columns, changed in updates.items():
                 kinds = {
                     quote(dialect.stored_column(name)): column_type(self._columns[table][name]).compile(
                         dialect=connection.dialect
                     )
                     for name in ("id", *columns)
                 }
-                await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, made)
+                await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, changed)
 
     def _event(self, stored: StoredEvent) -> Event:
         happening = happening_of(stored)
@@ -102,20 +102,20 @@ class CustomRows:
         number, sequence, _, _, wall_ns, monotonic_ns, _ = stored
         return Event(number, sequence, microseconds(wall_ns), monotonic_ns, happening, dtype, parameters)
 
-    def _checked(self, event: StoredEvent, table: str, id_: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked(self, event: StoredEvent, table: str, id_: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         columns = self._columns.get(table)
         if columns is None:
             raise CannotFold(f"{self._projection.name} has no table {table!r}")
         if not isinstance(id_, int) or id_ >> 31 != event.number:
             raise CannotFold(f"{table}: {id_!r} is no row of this episode: use event.id or event.row(sequence)")
-        for name in given:
+        for name in values:
             if name not in columns or name in OF_EVERY_TABLE:
                 raise CannotFold(f"{table} has no column {name!r} to fill")
-        return {name: _value(f"{table}.{name}", columns[name], each) for name, each in given.items()}
+        return {name: _value(f"{table}.{name}", columns[name], each) for name, each in values.items()}
 
 
 def _value(place: str, storage: Storage, value: Any) -> Any:
-    """As the column holds it. SQLite would take anything, and change what it cannot hold. Raises `CannotFold`."""
+    """Return the value as the column stores it. Raises `CannotFold` where SQLite would accept it and change it."""
     if value is None:
         return None
     match storage:

@@ -1,7 +1,7 @@
-"""The tables of a projection of one's own, kept up to date with the log beside ours, and not at their cost.
+"""Create the tables of custom projections and keep them up to date, after the built-in tables.
 
-`pycrorm_generation` notes them as `projection/NAME`. A process that does not know the projection leaves them as they
-are; one that does catches up. Whatever is wrong with one is told, and the others and our own tables go on.
+`pycrorm_generation` lists them under `projection/NAME`. A process without the projection's code leaves its tables as
+they are; a process that has it catches up. A fault in one projection is logged, and the others continue.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ __all__ = [
     "fault_in_version",
 ]
 
-_LOOK_S = 1.0
-"""What another process has stored is looked for so often: it costs as much as there are episodes."""
+_CHECK_S = 1.0
+"""The interval between checks for events from other processes, because a check costs a scan of all episodes."""
 
 _log = logging.getLogger("pycrorm_async.projections")
 
 
 class CustomFoldDefinition:
-    """What events mean to this projection. Implements `Meaning`."""
+    """The fold of a custom projection. Implements `FoldDefinition`."""
 
     def __init__(self, projection: Projection) -> None:
         self._projection = projection
@@ -64,13 +64,13 @@ class CustomFoldDefinition:
         for payload in payloads:
             try:
                 declared[fingerprint(payload)] = declaration_of(payload)
-            except ValueError:  # a newer version's: its nodes cannot be folded
+            except ValueError:  # from a newer version: its nodes cannot be folded
                 continue
         return layout, lambda: CustomRows(self._projection, declared)
 
 
 def layout_of(projection: Projection, dialect: Dialect) -> Layout:
-    """Its tables and views. Raises `CallerError`."""
+    """Return the projection's tables and views. Raises `CallerError`."""
     tables = columns_of(projection)
     leaves: dict[str, dict[str, Storage]] = {
         f"{OWN}{name}": {each: storage for each, storage in columns.items() if each != "id"}
@@ -81,87 +81,92 @@ def layout_of(projection: Projection, dialect: Dialect) -> Layout:
 
 
 async def make_own(connection: AsyncConnection, projection: Projection, key: str) -> Generation:
-    """Makes its tables, empty, and notes them under that key."""
-    there = await all_noted(connection)
-    ours = f"{PROJECTION}{projection.name}"
-    numbers = [each.number for name, each in there.items() if name == ours or name.startswith(f"{ours}/")]
+    """Create the projection's tables and checkpoints, empty, as a new generation under this key."""
+    generations = await all_noted(connection)
+    own = f"{PROJECTION}{projection.name}"
+    numbers = [each.number for name, each in generations.items() if name == own or name.startswith(f"{own}/")]
     empty = Generation(1 + max(numbers, default=0), 0, Layout(), {}, projection.version)
-    made = await grow_tables(connection, empty, layout_of(projection, connection.dialect))
-    await make_empty(connection, {f"{checkpoints.TABLE}_{projection.name}": checkpoints.COLUMNS}, made.number)
-    await note(connection, key, made)
-    return made
+    generation = await grow_tables(connection, empty, layout_of(projection, connection.dialect))
+    await make_empty(connection, {f"{checkpoints.TABLE}_{projection.name}": checkpoints.COLUMNS}, generation.number)
+    await note(connection, key, generation)
+    return generation
 
 
 def refuse_taken(name: str, layout: Layout, tables: Layout, projections: Mapping[str, Generation]) -> None:
-    """Raises `CallerError` if this projection wants a name that the memory or another one has."""
-    others = {other: one for other, one in projections.items() if other != name}
-    owners = {each: f"the projection {other}" for other, one in others.items() for each in _names(one.layout)}
+    """Raise `CallerError` if the memory or another projection has a name of this projection's tables and views."""
+    others = {other: generation for other, generation in projections.items() if other != name}
+    owners = {
+        each: f"the projection {other}" for other, generation in others.items() for each in _names(generation.layout)
+    }
     owners |= dict.fromkeys(_names(tables), "the memory")
     for each in _names(layout):
         if each in owners:
-            raise CallerError(f"the projection {name} wants {each!r}, which {owners[each]} has: rename it")
+            raise CallerError(f"the projection {name} needs the name {each!r}, which {owners[each]} has: rename it")
 
 
 async def _set_up(connection: AsyncConnection, projection: Projection, tables: Layout) -> tuple[Generation, bool]:
-    """Makes what is missing of it; how it is, and whether the views have to be made again.
+    """Create the projection's missing tables; return its generation, and whether the views must be created again.
 
     Args:
-        connection: alone in the memory.
-        projection: known here.
-        tables: the layout of ours.
+        connection: in a transaction that excludes all other writers of the memory.
+        projection: to set up.
+        tables: the layout of the built-in tables.
 
     Raises `CallerError` for a name that is taken, `DatabaseForeign` for tables of another version.
     """
     layout = layout_of(projection, connection.dialect)
-    there = projections_in(await all_noted(connection))
-    refuse_taken(projection.name, layout, tables, there)
-    found = there.get(projection.name)
+    generations = projections_in(await all_noted(connection))
+    refuse_taken(projection.name, layout, tables, generations)
+    generation = generations.get(projection.name)
     key = f"{PROJECTION}{projection.name}"
-    if found is None:
+    if generation is None:
         return await make_own(connection, projection, key), True
-    fault = fault_in_version(projection, found, layout)
+    fault = fault_in_version(projection, generation, layout)
     if fault is not None:
         raise DatabaseForeign(fault)
-    if found.layout == layout:
-        return found, False
-    found = replace(found, revision=found.revision + 1, layout=layout)
-    await note(connection, key, found)
-    return found, True
+    if generation.layout == layout:
+        return generation, False
+    generation = replace(generation, revision=generation.revision + 1, layout=layout)
+    await note(connection, key, generation)
+    return generation, True
 
 
-def fault_in_version(projection: Projection, found: Generation, layout: Layout) -> str | None:
-    """Why this projection cannot be folded into the tables that are there; None if it can."""
+def fault_in_version(projection: Projection, generation: Generation, layout: Layout) -> str | None:
+    """Return the reason why this projection cannot be folded into these tables; None if it can."""
     name = projection.name
-    if found.version != projection.version:
+    if generation.version != projection.version:
         return (
-            f"the tables of the projection {name} are of version {found.version}, and the one here of version"
-            f" {projection.version}: `pycrorm rebuild {name}` makes them anew"
+            f"the tables of the projection {name} have version {generation.version}, its code has version"
+            f" {projection.version}: run `pycrorm rebuild {name}`"
         )
-    if found.layout.leaves != layout.leaves:
-        return f"the projection {name} has other tables than its version {found.version} had: count that up"
+    if generation.layout.leaves != layout.leaves:
+        return (
+            f"the projection {name} defines other tables than its stored version {generation.version}:"
+            f" raise its version, then run `pycrorm rebuild {name}`"
+        )
     return None
 
 
 class CustomTables:
-    """The projections that a process knows, each kept up to date. What is wrong with one is told, once."""
+    """Folds the custom projections of a process. A fault in one is logged once, and then it is left out."""
 
     def __init__(
-        self, log: EventLog, named: Sequence[Projection], found: Sequence[Projection], *, batch_events: int
+        self, log: EventLog, named: Sequence[Projection], installed: Sequence[Projection], *, batch_events: int
     ) -> None:
         self._log = log
         self._named = named
-        self._found = found
+        self._installed = installed
         self._batch_events = batch_events
         self._folded: dict[str, CatchUp] = {}
-        self._looked_s = 0.0
+        self._checked_s = 0.0
 
     async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
-        """Makes what is missing; whether the views have to be made again.
+        """Create missing tables; return whether the views must be created again.
 
-        Raises `CallerError` for a name that is taken, of a projection that was named.
+        Raises `CallerError` for a taken name of a projection that the caller gave; an installed one is left out.
         """
         changed = False
-        for each in (*self._named, *self._found):
+        for each in (*self._named, *self._installed):
             try:
                 generation, is_new = await _set_up(connection, each, tables)
             except (DatabaseForeign, CallerError) as fault:
@@ -182,9 +187,9 @@ class CustomTables:
         return changed
 
     async def fold_next_batch(self, *, now: bool) -> bool:
-        """A batch of each; False if nothing was behind. Without `now` it is enough to look from time to time."""
+        """Fold a batch of each; return False if none was behind. Without `now` it checks every `_CHECK_S` only."""
         time_s = asyncio.get_running_loop().time()
-        if not self._folded or (not now and time_s < self._looked_s + _LOOK_S):
+        if not self._folded or (not now and time_s < self._checked_s + _CHECK_S):
             return False
         count = 0
         for name, each in [*self._folded.items()]:
@@ -193,21 +198,21 @@ class CustomTables:
             except DatabaseUnavailable:
                 raise
             except PycrormError as fault:
-                _log.warning("the projection %s is not kept up to date any more: %s", name, fault)
+                _log.warning("this process stops folding the projection %s: %s", name, fault)
                 del self._folded[name]
         if not count:
-            self._looked_s = time_s
+            self._checked_s = time_s
         return count > 0
 
 
 class ProjectionState(NamedTuple):
-    """How a projection is that has tables in a memory.
+    """The state of a projection that has tables in a memory.
 
     Attributes:
-        name, version: as its tables were made.
-        behind: events that they do not show yet.
-        parked: by episode number, why no more of it is folded.
-        fault: why it is not kept up to date by those who know it as it is here; None if it is, or is not known here.
+        name, version: of its tables.
+        behind: the number of events that its tables lack.
+        parked: the parked episodes by number, with the reasons.
+        fault: the reason why this process cannot fold it; None if it can, or has not its code.
     """
 
     name: str
@@ -217,19 +222,19 @@ class ProjectionState(NamedTuple):
     fault: str | None
 
 
-async def states(log: EventLog, known: Sequence[Projection]) -> list[ProjectionState]:
-    """Of every projection in this memory. `known` are those whose code is here."""
-    here = {each.name: each for each in known}
-    found: list[ProjectionState] = []
+async def states(log: EventLog, projections: Sequence[Projection]) -> list[ProjectionState]:
+    """Return the state of every projection in this memory. `projections` are those whose code this process has."""
+    by_name = {each.name: each for each in projections}
+    result: list[ProjectionState] = []
     async with log.reading() as connection:
         for name, each in projections_in(await all_noted(connection)).items():
             place = checkpoints.place_of(each.number, name)
             fault = None
-            if name in here:
-                fault = fault_in_version(here[name], each, layout_of(here[name], connection.dialect))
+            if name in by_name:
+                fault = fault_in_version(by_name[name], each, layout_of(by_name[name], connection.dialect))
             left, parked = await checkpoints.left(connection, place), await checkpoints.parked(connection, place)
-            found.append(ProjectionState(name, each.version, left, parked, fault))
-    return found
+            result.append(ProjectionState(name, each.version, left, parked, fault))
+    return result
 
 
 def _names(layout: Layout) -> list[str]:

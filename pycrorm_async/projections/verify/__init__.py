@@ -1,1 +1,1 @@
-"""Verification: the log and the tables compared."""
+"""Verify the log and compare the tables with it."""

@@ -1,7 +1,7 @@
-"""One episode of the log read again, part after part: are its events whole, and what rows do they make.
+"""Check one episode of the log part by part: validate its events and fold them again.
 
-What has not ended where a part ends is carried to the next one: the nodes that run, and the episode itself. So a part
-can be any piece of an episode, and memory stays flat however long that is.
+Nodes that still run where a part ends, and the episode's row, are carried to the next part. So a part may be any piece
+of an episode, and the memory used does not depend on the episode's length.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _SIMULATED = COLUMNS["process_metadata"].index("simulated")
 
 
 class EpisodeCheck:
-    """What is known of the episode of this number, up to where it was read.
+    """The check of the episode with this number, up to the last part read.
 
     Attributes:
-        events, behind, remarks: how many were found: events, those of them that the tables do not show, unusual orders.
+        events, behind, remarks: the number of events, of those that are not folded, and of unusual orders.
         damages: sequence and reason of each.
-        compared: whether the tables show nothing of what comes now; they were behind when the last part was read.
-        carried: ids of the nodes that run, and are compared later.
+        compared: whether the rows are compared completely, because the tables ended before the last part did.
+        carried: ids of the running nodes, which a later part compares.
     """
 
     def __init__(self, number: int) -> None:
@@ -48,8 +48,8 @@ class EpisodeCheck:
         self._open_when_lost: set[int] = set()
 
     def resume(self, rows: Rows, after: int, folded: int) -> None:
-        """Puts what was carried into the rows of this part, which follows `after`."""
-        if folded < after:  # the tables went back, and what is carried is ahead of them
+        """Add the carried rows to those of this part, which follows `after`."""
+        if folded < after:  # a rebuild made the tables shorter, so the carried rows are ahead of them
             self.compared = True
             return
         rows.nodes |= self._nodes
@@ -61,7 +61,7 @@ class EpisodeCheck:
     def read(
         self, span: Span, events: Mapping[int, StoredEvent], folded: int, designators: Designators, rows: Rows
     ) -> None:
-        """The events of a span by sequence; the rows they make, as far as the tables show them."""
+        """Check the events of a span, given by sequence, and fold those up to `folded` into `rows`."""
         if self.compared:
             folded = 0
         for sequence in range(span.after + 1, span.last + 1):
@@ -75,9 +75,10 @@ class EpisodeCheck:
                 self._lose(sequence, folded, rows)
 
     def leave(self, rows: Rows, after: int, folded: int) -> None:
-        """This part ends after that event, and there are more: takes back what is compared later."""
+        """End a part after event `after` of an episode that continues: take the rows to carry out of `rows`."""
         self._nodes, self._row, self.carried = {}, None, frozenset()
-        # In the next snapshot the tables may show more than is folded here; they are compared to their end now.
+        # Tables that end inside this part are compared to their end now, because the next snapshot may have more rows
+        # than this part folded.
         self.compared = self.compared or folded < after
         if self.compared:
             return
@@ -90,7 +91,7 @@ class EpisodeCheck:
             simulated.remove((self.number,))
 
     def hides(self, difference: Difference) -> bool:
-        """Whether it is about a row of which nothing can be told, because events before it are lost."""
+        """Return whether to suppress a difference, because lost events make its expected row unknown."""
         if self._lost is None:
             return False
         open_then = difference.table == "task_tree_node" and difference.sequence in self._open_when_lost
@@ -112,7 +113,7 @@ class EpisodeCheck:
             if shown and self._lost is None:
                 fold_happening(event, happening, designators, rows)
         except CannotFold as reason:
-            # What the tables show was folded once, so it was something else then.
+            # An event that is in the tables could be folded once, so the log has changed since.
             if shown or isinstance(reason, Undecodable):
                 self._damaged(
                     event.sequence, f"is in the tables, and cannot be folded: {reason}" if shown else str(reason)

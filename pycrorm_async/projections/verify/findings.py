@@ -1,4 +1,4 @@
-"""The findings of a verification: damage of the log, differences of the tables, and what is not in them at all."""
+"""Define the findings of a verification: damage to the log, differences in the tables, parked and refused episodes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Damage", "Stopped", "Verified"]
 
 
 class Damage(NamedTuple):
-    """Where the log contradicts itself. Without an episode it is the database as a whole."""
+    """A place where the log contradicts itself; without an episode, the whole database."""
 
     number: int | None
     sequence: int | None
@@ -24,7 +24,7 @@ class Damage(NamedTuple):
 
 
 class Stopped(NamedTuple):
-    """An episode of which no more is folded (parked), or stored (refused)."""
+    """An episode that is no longer folded (parked) or no longer stored (refused)."""
 
     number: int
     how: Literal["parked", "refused"]
@@ -32,18 +32,18 @@ class Stopped(NamedTuple):
 
 
 class Verified(NamedTuple):
-    """What was found.
+    """The result of a verification.
 
     Attributes:
-        episodes, events, rows: that were looked at.
-        behind: events that the tables do not show yet, which is no fault.
-        damage, drift: how many findings of each kind there are.
+        episodes, events, rows: the number of each that was checked.
+        behind: the number of events that are not folded yet, which is no fault.
+        damage, drift: the number of findings of damage and of differences.
         damages, differences: the first hundred of each.
-        remarks: what is unusual in the order of events and happens in honest plans.
-        not_compared: by name, why the tables of a projection of somebody's were not looked at.
-        stopped: the episodes that are parked or refused, and why; the rows of what came before were compared.
-        unmade: by dtype, why a designator type has no tables here.
-        outdated: why no table was compared at all: an older fold made them. None if they are this version's.
+        remarks: the number of unusual event orders that correct plans produce too.
+        not_compared: by name, the reason why the tables of a custom projection were not compared.
+        stopped: the parked and refused episodes; the rows of their earlier events were compared.
+        unmade: by dtype, the reason why a designator type has no tables.
+        outdated: the reason why no table was compared: an older fold made them. None for tables of this version.
     """
 
     episodes: int

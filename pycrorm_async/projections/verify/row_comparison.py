@@ -1,6 +1,6 @@
-"""What a fold makes against what the tables show, row by row, part after part of the log.
+"""Compare the rows that the fold makes with the rows in the tables, for one part of the log at a time.
 
-A part can be any piece of an episode: nodes that have not ended where it ends are looked at in a later one.
+A part may be any piece of an episode: nodes that still run where it ends are compared with a later part.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ _KEYS_AT_ONCE = 1_000
 
 
 class Difference(NamedTuple):
-    """A place where a table does not show what the log says.
+    """A row in which a table differs from the log.
 
     Attributes:
-        number, sequence: of the episode in this database, and of the event that makes the row.
-        table: as people know it.
-        column: None if the row as a whole is missing, or should not be there.
-        stored, expected: what the table has and what the fold makes; None for a row that is not there.
+        number, sequence: of the episode in this database, and of the row's event.
+        table: its public name.
+        column: None if the whole row is missing or superfluous.
+        stored, expected: the values in the table and from the fold; None for a missing row.
     """
 
     number: int
@@ -48,19 +48,16 @@ class Difference(NamedTuple):
         return f"{self.table}.{self.column} is {self.stored!r}, and should be {self.expected!r}"
 
 
-class Made(Protocol):
-    """What a fold makes of events."""
+class FoldedRows(Protocol):
+    """The rows that a fold makes of events."""
 
     def to_insert(self) -> Mapping[tuple[str, tuple[str, ...]], Sequence[Row]]:
-        """Rows by (table, columns)."""
+        """Return the rows by (table, columns)."""
         ...
 
 
 class Range(NamedTuple):
-    """The rows with an id from `low` on and below `high`; and the episodes from number `first` on and below `end`.
-
-    None: whatever there is on that side.
-    """
+    """A half-open range of row ids, `low` to `high`, and of episode numbers, `first` to `end`. None is unbounded."""
 
     low: int | None
     high: int | None
@@ -69,11 +66,11 @@ class Range(NamedTuple):
 
 
 class Comparison:
-    """Compares the tables of one generation with what folds make: those of its layout, and `core`.
+    """Compares the tables of one generation, those of its layout and `core`, with folded rows.
 
     Attributes:
-        generation: whose tables these are.
-        count: of the rows that were looked at last.
+        generation: the owner of the tables.
+        count: the number of stored rows in the last comparison.
         tables: their names in the database.
     """
 
@@ -93,38 +90,38 @@ class Comparison:
     async def differences(
         self,
         connection: AsyncConnection,
-        rows: Made,
+        rows: FoldedRows,
         within: Range,
         *,
         carried: Collection[int],
         settled: Collection[int],
     ) -> list[Difference]:
-        """What is different in a part of the log.
+        """Return the differences in one part of the log.
 
         Args:
-            connection: everything is read in its transaction.
-            rows: what the fold makes of this part.
-            within: the rows this part must have made, and no other.
-            carried: ids of nodes that have not ended yet; they are looked at later.
-            settled: ids of nodes that were carried and are looked at now.
+            connection: in the transaction to read in.
+            rows: the folded rows of this part.
+            within: the range of rows that this part, and no other, makes.
+            carried: ids of nodes that still run and are compared with a later part.
+            settled: ids of nodes carried from earlier parts that are compared now.
         """
         self.count = 0
         expected = self._expected(rows)
-        found: list[Difference] = []
+        differences: list[Difference] = []
         for name, table in self._tables.items():
-            made = expected.pop(name, {})
+            folded = expected.pop(name, {})
             first, end = (within.first, within.end) if name in _EPISODE_KEYED else (within.low, within.high)
-            there = await self._read(connection, table, first, end)
+            stored = await self._read(connection, table, first, end)
             if name == _NODES:
-                there |= await self._nodes(connection, table, [*settled])
+                stored |= await self._nodes(connection, table, [*settled])
                 for each in carried:
-                    made.pop((each,), None)
-                    there.pop((each,), None)
-            self.count += len(there)
-            found += _compared(name, [*table.columns.keys()], made, there)
-        for name, made in expected.items():  # of a type that came later than these tables
-            found += _compared(name, [], made, {})
-        return found
+                    folded.pop((each,), None)
+                    stored.pop((each,), None)
+            self.count += len(stored)
+            differences += _compared(name, [*table.columns.keys()], folded, stored)
+        for name, folded in expected.items():  # of types declared after these tables were created
+            differences += _compared(name, [], folded, {})
+        return differences
 
     async def _nodes(self, connection: AsyncConnection, table: Table, keys: list[int]) -> dict[Row, Row]:
         read: dict[Row, Row] = {}
@@ -139,24 +136,24 @@ class Comparison:
         where = [key >= first] if first is not None else []
         return await _rows(connection, table, *where, *([key < end] if end is not None else []))
 
-    def _expected(self, rows: Made) -> dict[str, dict[Row, Row]]:
+    def _expected(self, rows: FoldedRows) -> dict[str, dict[Row, Row]]:
         expected: dict[str, dict[Row, Row]] = {}
-        for (name, columns), made in rows.to_insert().items():
+        for (name, columns), folded in rows.to_insert().items():
             table = self._tables.get(name)
             whole = columns if table is None else tuple(table.columns.keys())
             into = expected.setdefault(name, {})
             keys = _key_of(columns, table)
             if whole == columns:
-                into.update((keys(row), row) for row in made)
+                into.update((keys(row), row) for row in folded)
                 continue
             places = [columns.index(each) if each in columns else None for each in whole]
-            for row in made:
+            for row in folded:
                 into[keys(row)] = tuple(None if place is None else row[place] for place in places)
         return expected
 
 
 async def _rows(connection: AsyncConnection, table: Table, *where: ColumnElement[bool]) -> dict[Row, Row]:
-    """By their keys. Without their types: what a database holds is compared, not what is made of it."""
+    """Read rows by their keys, without column types, so that the stored values are compared and not converted ones."""
     untyped: list[ColumnElement[Any]] = [column(each.name) for each in table.columns]
     answer = await connection.execute(select(*untyped).select_from(table).where(*where))
     keys = _key_of(table.columns.keys(), table)
@@ -164,7 +161,7 @@ async def _rows(connection: AsyncConnection, table: Table, *where: ColumnElement
 
 
 def _key_of(columns: Sequence[str], table: Table | None) -> Callable[[Row], Row]:
-    """The key of a row of these columns."""
+    """Return a function that takes the key out of a row with these columns."""
     names = ["id"] if table is None else [each.key for each in table.primary_key.columns]
     places = [columns.index(each) for each in names]
     if len(places) == 1:
@@ -174,12 +171,12 @@ def _key_of(columns: Sequence[str], table: Table | None) -> Callable[[Row], Row]
 
 
 def _compared(
-    name: str, columns: Sequence[str], made: Mapping[Row, Row], there: Mapping[Row, Row]
+    name: str, columns: Sequence[str], folded_rows: Mapping[Row, Row], stored_rows: Mapping[Row, Row]
 ) -> Iterator[Difference]:
-    if made == there:
+    if folded_rows == stored_rows:
         return
-    for key in sorted(made.keys() | there.keys(), key=_comparable):
-        stored, expected = there.get(key), made.get(key)
+    for key in sorted(folded_rows.keys() | stored_rows.keys(), key=_comparable):
+        stored, expected = stored_rows.get(key), folded_rows.get(key)
         if stored == expected:
             continue
         number, sequence = (key[0], 1) if name in _EPISODE_KEYED else _event_of(key[0])
@@ -192,7 +189,7 @@ def _compared(
 
 
 def _event_of(key: Any) -> tuple[int, int]:
-    """Episode and event that make the row; SQLite also keeps what is no number where a number belongs."""
+    """Return number and sequence of the row's event; (0, 0) for a key that is no integer, which SQLite can store."""
     return row_key(key)[:2] if isinstance(key, int) else (0, 0)
 
 

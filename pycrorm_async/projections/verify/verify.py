@@ -1,6 +1,6 @@
-"""Folds the log again and compares with the tables; and looks whether the log itself is whole.
+"""Verify a memory: check that the log is complete, fold it again and compare the tables.
 
-Reads only. Each part is read in one snapshot, so recording and folding go on meanwhile.
+Writes nothing. Each part is read in one snapshot, so that recording and folding continue in the meantime.
 """
 
 from __future__ import annotations
@@ -33,14 +33,16 @@ from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 __all__ = ["Verified", "Damage", "Stopped", "verify"]
 
 _PART_EVENTS = 4_000
-_TOLD_MAX = 100
-"""So many findings of each kind are kept; all are counted."""
+"""Bounds the events of one part, and so the memory used."""
+_FINDINGS_MAX = 100
+"""Bounds the findings of each kind that are kept; all are counted."""
 _ATTEMPTS = 10
+"""Bounds the snapshots for one part while rebuilds replace the tables."""
 
 _FINGERPRINTS = text("SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal")
 _TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number >= :first_number AND number < :end")
-# From one number to the next by the index: to read all of it takes minutes where there is much.
-_NUMBERS_OF_NOBODY = text("""
+# Jumps from one number to the next in the index, because reading every event would take minutes in a large log.
+_NUMBERS_WITHOUT_EPISODE = text("""
 WITH RECURSIVE there (number) AS (
     SELECT min(episode) FROM event
     UNION ALL SELECT (SELECT min(episode) FROM event WHERE episode > number) FROM there WHERE number IS NOT NULL
@@ -58,19 +60,19 @@ async def verify(
     *,
     episode: EpisodeRow | None = None,
     projections: Sequence[Projection] = (),
-    tell: Callable[[int, int], None] = lambda _done, _total: None,
+    report_progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Verified:
-    """Looks at all of a memory, or at one episode.
+    """Verify a whole memory, or one episode.
 
     Args:
         log: may be open for reading only.
-        episode: to look at; all of them if None.
-        projections: whose tables are looked at too.
-        tell: how many events were looked at, of how many.
+        episode: to verify; all of them if None.
+        projections: custom projections whose tables are compared too.
+        report_progress: called with the number of events checked and their total.
 
     Raises `DatabaseForeign` for tables of a newer version, `DatabaseUnavailable` for a memory without tables.
     """
-    check = _Check(log, tell)
+    check = _Check(log, report_progress)
     with log.translated():
         if episode is None:
             await check.whole()
@@ -83,16 +85,16 @@ async def verify(
         except TablesOutdated as fault:
             check.outdated = str(fault)
         await check.projections(projections, episode)
-    return check.found()
+    return check.result()
 
 
 class _Check:
-    """One look at a memory, and how far it is."""
+    """One verification of a memory, and its findings so far."""
 
-    def __init__(self, log: EventLog, tell: Callable[[int, int], None]) -> None:
+    def __init__(self, log: EventLog, report_progress: Callable[[int, int], None]) -> None:
         self._log = log
         self._dialect = dialect_of(log.engine)
-        self._tell = tell
+        self._report_progress = report_progress
         self._damages: list[Damage] = []
         self._differences: list[Difference] = []
         self._damage = self._drift = self._remarks = 0
@@ -104,7 +106,7 @@ class _Check:
         self._unfinished = EpisodeCheck(0)
         self._comparison: Comparison | None = None
 
-    def found(self) -> Verified:
+    def result(self) -> Verified:
         return Verified(
             episodes=self._episodes,
             events=self._events,
@@ -122,7 +124,7 @@ class _Check:
         )
 
     async def whole(self) -> None:
-        """The database's own pages, the declarations, and events of no episode."""
+        """Check the database's pages, the declarations, and events that belong to no episode."""
         try:
             async with self._log.snapshot() as connection:
                 for reason in await self._dialect.faults_of_file(connection):
@@ -130,14 +132,14 @@ class _Check:
                 names = (await connection.execute(_FINGERPRINTS)).scalars()
                 for name, payload in zip(names, await self._dialect.declarations(connection), strict=True):
                     if fingerprint(payload) != name:
-                        self._damaged(None, None, f"the declaration {name} is not what was declared")
-                for (number,) in await connection.execute(_NUMBERS_OF_NOBODY):
+                        self._damaged(None, None, f"the declaration {name} does not match its fingerprint")
+                for (number,) in await connection.execute(_NUMBERS_WITHOUT_EPISODE):
                     self._damaged(None, None, f"there are events of an episode {number}, which is not in the log")
         except DamageError as fault:
             self._damaged(None, None, str(fault))
 
     async def stopped(self, episode: EpisodeRow | None) -> None:
-        """The episodes that stopped, and the types without tables that stop every episode which performs them."""
+        """Collect the parked and refused episodes, and the types without tables, which park their episodes."""
         for each in await self._log.stopped():
             if episode is None or each.number == episode.number:
                 if each.refused is not None:
@@ -148,7 +150,7 @@ class _Check:
             self._unmade = await unmade_types(self._log)
 
     async def episodes(self, at: _Place, end: int | None) -> None:
-        """Those from this place on and below number `end`; to the end of the memory if None."""
+        """Check the episodes from this place up to but not including number `end`; None is the end of the memory."""
         async with self._log.snapshot() as connection:
             total = await self._heads(connection, at.number, end)
         limit = _PART_EVENTS
@@ -158,18 +160,18 @@ class _Check:
                 after = await self._part(after, end, limit)
                 limit = min(limit * 8, _PART_EVENTS)
             except _Unreadable as fault:
-                if limit > 1:  # until it is known which event
+                if limit > 1:  # halve the part until the unreadable event is alone
                     limit = max(limit // 8, 1)
                 else:
                     self._damaged(fault.span.number, fault.span.last, f"cannot be read: {fault}")
                     after = _Place(fault.span.number + 1, 0)
-            self._tell(self._events, max(total, self._events))
+            self._report_progress(self._events, max(total, self._events))
 
-    async def projections(self, known: Sequence[Projection], episode: EpisodeRow | None) -> None:
-        """The tables of those that are known here, of all episodes or of one."""
-        self._not_compared = await not_compared(self._log, known)
+    async def projections(self, projections: Sequence[Projection], episode: EpisodeRow | None) -> None:
+        """Compare the tables of these projections, for all episodes or for one."""
+        self._not_compared = await not_compared(self._log, projections)
         first, end = (0, None) if episode is None else (episode.number, episode.number + 1)
-        for each in known:
+        for each in projections:
             if each.name in self._not_compared:
                 continue
             try:
@@ -181,33 +183,31 @@ class _Check:
                 self._damaged(None, None, str(fault))
 
     async def _heads(self, connection: AsyncConnection, first: int, end: int | None) -> int:
-        """How many events there should be; and tells of those that should not be."""
+        """Return the number of events that the episodes must have; report events outside of that range."""
         numbers = {"first_number": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end}
         for number, head, lowest, highest in await connection.execute(_BEYOND, numbers):
             for sequence in sorted({lowest, highest}):
                 if not 1 <= sequence <= head:
-                    self._damaged(number, sequence, f"is there, and the episode is said to end with {head}")
+                    self._damaged(number, sequence, f"exists, but the episode must end with event {head}")
         return int((await connection.execute(_TOTAL, numbers)).scalar_one())
 
     async def _part(self, at: _Place, end: int | None, limit: int) -> _Place | None:
-        """Looks at so many events that follow this place, in one snapshot; where to go on, None at the end.
+        """Check up to `limit` events after this place in one snapshot; return the next place, None at the end.
 
-        Raises `_Unreadable`, and has told nothing then.
+        Raises `_Unreadable`, and then has reported nothing.
         """
         for _ in range(_ATTEMPTS):
             async with self._log.snapshot() as connection:
                 generation = await current_generation(connection)
                 if generation is None:
-                    raise DatabaseUnavailable(
-                        f"{self._log.address} has no tables yet: `pycrorm writer --once` makes them"
-                    )
+                    raise DatabaseUnavailable(f"{self._log.address} has no tables yet: run `pycrorm writer --once`")
                 comparison = self._comparison
                 if comparison is None or comparison.generation != generation:
                     self._comparison = comparison = Comparison(generation, self._dialect.stored_column)
                 if await self._dialect.keep(connection, comparison.tables):
                     return await self._look(connection, comparison, at, end, limit)
-            # Between two statements tables were made anew and the old ones dropped.
-        raise DatabaseForeign(f"{self._log.address}: a table is gone: run `pycrorm rebuild`")
+            # A rebuild replaced and dropped the tables between two statements: read the generation again.
+        raise DatabaseForeign(f"{self._log.address}: a table is missing: run `pycrorm rebuild`")
 
     async def _look(
         self, connection: AsyncConnection, comparison: Comparison, at: _Place, end: int | None, limit: int
@@ -244,7 +244,7 @@ class _Check:
         return place
 
     async def _events_of(self, connection: AsyncConnection, spans: Sequence[Span]) -> dict[int, dict[int, StoredEvent]]:
-        """By number and sequence."""
+        """Read the events of these spans, by number and sequence."""
         try:
             with self._log.translated():
                 events = await self._dialect.spans(connection, spans)
@@ -268,19 +268,19 @@ class _Check:
     ) -> None:
         try:
             with self._log.translated():
-                found = await comparison.differences(connection, rows, within, carried=carried, settled=settled)
+                differences = await comparison.differences(connection, rows, within, carried=carried, settled=settled)
         except DamageError as fault:
             self._damaged(None, None, str(fault))
             return
         self._rows += comparison.count
-        for each in sorted(found, key=attrgetter("number", "sequence")):
+        for each in sorted(differences, key=attrgetter("number", "sequence")):
             if each.number not in read or not read[each.number].hides(each):
                 self._differs(each)
 
     # --- findings -----------------------------------------------------------------------------------------------
 
     def _take_over(self, episodes: Iterable[EpisodeCheck]) -> None:
-        """What was found in this part of each."""
+        """Move the findings of this part from the episodes' checks to the result."""
         for each in episodes:
             for sequence, reason in each.damages:
                 self._damaged(each.number, sequence, reason)
@@ -292,17 +292,17 @@ class _Check:
 
     def _differs(self, difference: Difference) -> None:
         self._drift += 1
-        if len(self._differences) < _TOLD_MAX:
+        if len(self._differences) < _FINDINGS_MAX:
             self._differences.append(difference)
 
     def _damaged(self, number: int | None, sequence: int | None, reason: str) -> None:
         self._damage += 1
-        if len(self._damages) < _TOLD_MAX:
+        if len(self._damages) < _FINDINGS_MAX:
             self._damages.append(Damage(number, sequence, " ".join(reason.split())))
 
 
 class _Unreadable(Exception):
-    """The first event of this span, or one after it, cannot be read from the file."""
+    """The database cannot read the first event of this span, or a later one."""
 
     def __init__(self, span: Span, reason: str) -> None:
         super().__init__(reason)
@@ -310,19 +310,19 @@ class _Unreadable(Exception):
 
 
 class _Place(NamedTuple):
-    """After this event of this episode."""
+    """The place in the log behind event `after` of episode `number`."""
 
     number: int
     after: int
 
     @property
     def row(self) -> int:
-        """The smallest id a row can have that is made after it."""
+        """The smallest id of a row made by an event behind this place."""
         return self.number << 31 | (self.after + 1 if self.after else 0) << 5
 
 
 def _cut(episodes: Sequence[EpisodeRow], at: _Place, limit: int) -> tuple[list[Span], _Place | None]:
-    """The next part of these episodes, and where the one after it begins; None if that is the end of all."""
+    """Return the spans of the next part of these episodes, and the place behind it; None at the end of the memory."""
     spans: list[Span] = []
     left = limit
     for each in episodes:
@@ -340,14 +340,14 @@ def _cut(episodes: Sequence[EpisodeRow], at: _Place, limit: int) -> tuple[list[S
 
 
 async def _episodes(connection: AsyncConnection, first: int, end: int | None, limit: int) -> list[EpisodeRow]:
-    found = await connection.execute(
+    rows = await connection.execute(
         text(
             "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode"
             " WHERE number >= :first AND number < :end ORDER BY number LIMIT :limit"
         ),
         {"first": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end, "limit": limit},
     )
-    return [EpisodeRow(*row) for row in found]
+    return [EpisodeRow(*row) for row in rows]
 
 
 async def _designators(connection: AsyncConnection, generation: Generation) -> Designators:

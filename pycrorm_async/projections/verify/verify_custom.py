@@ -1,4 +1,4 @@
-"""Folds the log again for a projection of one's own, and compares with its tables, whole episodes at a time."""
+"""Fold the log again for a custom projection and compare its tables, in parts of whole episodes."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ _ATTEMPTS = 10
 
 
 class Compared(NamedTuple):
-    """Some episodes: how many rows were looked at, and what is different."""
+    """The result for some episodes: the number of rows compared, and the differences."""
 
     rows: int
     differences: list[Difference]
 
 
-async def not_compared(log: EventLog, known: Sequence[Projection]) -> dict[str, str]:
-    """By name, why a projection of this memory cannot be compared."""
-    here = {each.name: each for each in known}
+async def not_compared(log: EventLog, projections: Sequence[Projection]) -> dict[str, str]:
+    """Return the projections of this memory that cannot be compared, by name, with the reasons."""
+    by_name = {each.name: each for each in projections}
     async with log.snapshot() as connection:
-        there = projections_in(await all_noted(connection))
+        generations = projections_in(await all_noted(connection))
         dialect = connection.dialect
     reasons: dict[str, str] = {}
-    for name, each in there.items():
-        fault = "its code is not here"
-        if name in here:
-            fault = fault_in_version(here[name], each, layout_of(here[name], dialect)) or ""
+    for name, each in generations.items():
+        fault = "its code is not installed here"
+        if name in by_name:
+            fault = fault_in_version(by_name[name], each, layout_of(by_name[name], dialect)) or ""
         if fault:
             reasons[name] = fault
     return reasons
@@ -56,9 +56,9 @@ async def not_compared(log: EventLog, known: Sequence[Projection]) -> dict[str, 
 async def compared(
     log: EventLog, projection: Projection, *, first: int = 0, end: int | None = None
 ) -> AsyncIterator[Compared]:
-    """Part after part, the episodes from number `first` on and below `end`; all of them if None.
+    """Yield the comparison of the episodes with numbers from `first` up to but not including `end`, part by part.
 
-    Nothing if it has no tables here yet. Raises `DatabaseForeign` if one is gone.
+    Yields one empty part if the projection has no tables yet. Raises `DatabaseForeign` if a table is missing.
     """
     at: int | None = first
     while at is not None:
@@ -76,9 +76,10 @@ async def _part(log: EventLog, projection: Projection, first: int, end: int | No
             place = checkpoints.place_of(generation.number, projection.name)
             if await dialect_of(connection).keep(connection, [*comparison.tables, place]):
                 return await _look(connection, projection, comparison, first, end)
-        # Between two statements they were made anew and the old ones dropped.
+        # A rebuild replaced and dropped the tables between two statements: read the generation again.
     raise DatabaseForeign(
-        f"{log.address}: a table of the projection {projection.name} is gone: run `pycrorm rebuild {projection.name}`"
+        f"{log.address}: a table of the projection {projection.name} is missing:"
+        f" run `pycrorm rebuild {projection.name}`"
     )
 
 
@@ -101,34 +102,34 @@ async def _look(
         count += last
         if fault is not None:
             sequence, reason = fault
-            stored = "shown in the tables"
+            stored = "folded in the tables"
             findings.append(Difference(number, sequence, projection.name, "fold", stored, f"parked: {reason}"))
     else:
         if len(folded) == _EPISODES_MAX:
             following = folded[-1][0] + 1
     lost = {each.number for each in findings}
     within = Range(first << 31 or None, None if following is None else following << 31, None, None)
-    found = await comparison.differences(connection, rows, within, carried=(), settled=())
-    findings += [each._replace(table=each.table.removeprefix(OWN)) for each in found if each.number not in lost]
+    differences = await comparison.differences(connection, rows, within, carried=(), settled=())
+    findings += [each._replace(table=each.table.removeprefix(OWN)) for each in differences if each.number not in lost]
     return None if following == end else following, Compared(comparison.count, findings)
 
 
 async def _folded(
     connection: AsyncConnection, projection: Projection, generation: Generation, first: int, end: int | None
 ) -> list[tuple[int, int]]:
-    """Number of each episode, and how much of it the tables show."""
+    """Return number and checkpoint of each episode."""
     place = checkpoints.place_of(generation.number, projection.name)
-    found = await connection.execute(
+    rows = await connection.execute(
         text(
             f"SELECT id, folded FROM {place} WHERE id >= :first AND id < :end ORDER BY id LIMIT {_EPISODES_MAX}"  # noqa: S608
         ),
         {"first": first, "end": EPISODE_NUMBER_MAX + 1 if end is None else end},
     )
-    return [(each.id, each.folded) for each in found]
+    return [(each.id, each.folded) for each in rows]
 
 
 async def _fold_again(connection: AsyncConnection, rows: Batch, number: int, last: int) -> tuple[int, str] | None:
-    """The event that cannot be folded, and why; None if all of them can."""
+    """Fold an episode up to event `last`; return the first event that cannot be folded, with the reason."""
     for after in range(0, last, _PART_EVENTS):
         page = Span(number, after, min(after + _PART_EVENTS, last))
         sequence = after
