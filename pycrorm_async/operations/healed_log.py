@@ -1,25 +1,27 @@
-"""Appends to a log, and offers it again what it lost of what was stored before: after a failover, a restored backup.
+"""Append to a log, and append again the events that it lost in a failover or a restored backup.
 
     healed = HealedLog(log, spool, settings, clock=clock)
     refusals = await healed.append(records)
     await healed.confirm()
 
-Theory of operation. The spool remembers how far each episode was stored (`queue/heads.py`), and keeps the segments for
-a while (`queue/stored.py`). Every append carries the episode that was stored last in this spool, by whatever process.
-The transaction that appends reads how far that episode is; a log that holds less went back, and takes nothing
-(`LogWentBack`). Commits of a log are lost from the end, so if the last one is there all are. An append that finds a gap
-in an episode of which more was stored shows the same. `confirm` asks the question without an append: at a start, at a
-flush, now and then in the daemon.
+Theory of operation. The spool remembers the acknowledged head of each episode, the last sequence that the log has
+confirmed (`queue/retention/acknowledged_heads.py`), and keeps stored segments for a while
+(`queue/retention/stored_segments.py`). Every append names the episode of this spool that was stored last, by any
+process. The transaction that appends reads that episode's head in the log. If the log has less than was acknowledged,
+it went back: nothing is stored and `LogWentBack` is raised. A log loses its commits from the end, so if the last one is
+present, all are. An append that finds a gap in an episode with a higher acknowledged head proves the same. `confirm`
+makes this check without an append: at a start, at a flush, and at intervals in the daemon.
 
-Then the heads of all episodes that are remembered are compared with the log's, and all records beyond the log's heads
-are read from the segments and appended, declarations first, each episode under the number it had. Several processes may
-do so at once: the same event is stored once. What no segment holds any more stays missing; the episode is refused with
-its gap when more of it comes. Its remembered head is lowered to the log's, so that it is not looked for again.
+Healing compares the acknowledged heads of all episodes with those of the log. It reads the records beyond the log's
+heads from the segments and appends them, declarations first, each episode under its old number. Several processes may
+heal at once, because the log stores the same event only once. Records that no segment contains any more stay missing:
+the acknowledged head is lowered to the log's, so that healing does not search for them again, and the episode is
+refused with its gap when later events of it arrive.
 
-Numbers. An append assigns none that is not above the highest one remembered, and leaves a reserve free behind that, for
-other spools that were stored in the same log and come back later. A spool that remembers nothing of the lost episodes
-and comes before all others may be given their numbers; then a lost episode gets a new number, and its row ids change.
-No two episodes ever have one number.
+An append assigns only episode numbers above the highest number remembered, and leaves a reserve free behind it for
+other spools that were stored in the same log and return later. A spool that remembers none of the lost episodes and
+appends before all others may receive their numbers; then a lost episode gets a new number, and its row ids change. No
+number is ever given to two episodes.
 """
 
 from __future__ import annotations
@@ -44,19 +46,22 @@ from pycrorm_async.store.stored import Basis, EpisodeRow
 
 __all__ = ["HealedLog"]
 
-_ASKED_AT_ONCE: Final = 1_000
-"""Episodes whose heads are read by one statement."""
+_EPISODES_MAX: Final = 1_000
+"""Bounds the episodes whose heads one statement reads."""
 _ROUNDS: Final = 3
-"""A log may go back again while it is healed; after so many rounds the caller sees the error and tries later."""
+"""Bounds the healings in one append, because a log may go back again while it is healed; then the caller retries."""
 
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
 
 
 class HealedLog:
-    """One log, and what a spool knows of it. Belongs to the loop of the log.
+    """One log, with the heads that a spool remembers of it. Belongs to the loop of the log.
 
-    `offered` counts the records that were offered again, `missing` the episodes that could not be completed.
+    Attributes:
+        rounds: the number of healings.
+        offered: the number of events that were appended again.
+        missing: the number of episodes that could not be completed.
     """
 
     def __init__(self, log: EventLog, spool: Path, settings: Settings, *, clock: Clock) -> None:
@@ -74,7 +79,7 @@ class HealedLog:
         self.missing = 0
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        """As `EventLog.append`, of a log that went back after it was healed. Raises `LogWentBack` if that failed."""
+        """Append as `EventLog.append` does, healing a log that went back. Raises `LogWentBack` if that failed."""
         heads = self._heads
         if heads is None:
             return await self._store.append(records)
@@ -85,11 +90,11 @@ class HealedLog:
             except LogWentBack as error:
                 await self._heal(heads, error)
                 continue
-            known = heads.all  # as before this batch, which nobody noted yet
+            acknowledged = heads.all  # without this batch, whose heads are noted below
             short = [
-                LogWentBack(row.id, known[each].head, row.head)
+                LogWentBack(row.id, acknowledged[each].head, row.head)
                 for each, row in stored.rows.items()
-                if each in known and row.head < known[each].head
+                if each in acknowledged and row.head < acknowledged[each].head
             ]
             if not short:
                 break
@@ -100,7 +105,7 @@ class HealedLog:
         return stored.refusals
 
     async def confirm(self) -> None:
-        """Offer again what the log lost. Raises `DatabaseUnavailable`; may then be called again."""
+        """Append again the events that the log lost. Raises `DatabaseUnavailable`; may then be called again."""
         heads = self._heads
         if heads is None:
             return
@@ -114,8 +119,8 @@ class HealedLog:
 
     def _basis(self, heads: AcknowledgedHeads) -> Basis:
         def number_of(episode: EpisodeId) -> int | None:
-            noted = heads.all.get(episode)
-            return (noted.number or None) if noted is not None else None
+            acknowledged = heads.all.get(episode)
+            return (acknowledged.number or None) if acknowledged is not None else None
 
         return Basis(heads.last, number_of, heads.number_max)
 
@@ -123,10 +128,10 @@ class HealedLog:
         async with self._healing:
             heads.refresh()
             lost = await self._lost(heads)
-            if not lost:  # another task, or another process, healed it meanwhile
+            if not lost:  # another task or process has healed it
                 return
             self.rounds += 1
-            _log.warning("%s: looking for what it lost of %d episodes in %s", cause, len(lost), self._spool)
+            _log.warning("%s: searching %s for the lost events of %d episodes", cause, self._spool, len(lost))
             await self._store.skip_numbers(heads.number_max)
             offered = await self._offer(heads, lost)
             self.offered += offered
@@ -134,25 +139,25 @@ class HealedLog:
             self.missing += len(left)
             if left:
                 heads.note({each: (heads.all[each].number, head) for each, head in left.items()}, lowered=True)
-            done = f"{offered:,} events were offered again; {len(left)} of {len(lost)} episodes stay incomplete"
+            done = f"{offered:,} events were appended again; {len(left)} of {len(lost)} episodes stay incomplete"
             _log.warning("%s: %s", self._store.address, done)
             noticed_by = f"{socket.gethostname()}:{self._spool}"
             try:
                 await self._store.note_incarnation(self._clock.wall_ns(), noticed_by, f"{cause}; {done}")
             except DatabaseError as error:
-                _log.warning("that the log went back cannot be noted in it: %s", error)
+                _log.warning("%s: the healing cannot be recorded in the log: %s", self._store.address, error)
 
     async def _lost(self, heads: AcknowledgedHeads) -> dict[EpisodeId, int]:
-        """The episodes of which the log holds less than was stored, and how far it has them."""
-        remembered = dict(heads.all)
+        """Return the episodes of which the log has less than was acknowledged, with their heads in the log."""
+        acknowledged = dict(heads.all)
         rows: dict[EpisodeId, EpisodeRow] = {}
-        for some in _parts(list(remembered), _ASKED_AT_ONCE):
-            rows |= await self._store.heads(some)
-        found = {each: rows[each].head if each in rows else 0 for each in remembered}
-        return {each: head for each, head in found.items() if head < remembered[each].head}
+        for part in _parts(list(acknowledged), _EPISODES_MAX):
+            rows |= await self._store.heads(part)
+        present = {each: rows[each].head if each in rows else 0 for each in acknowledged}
+        return {each: head for each, head in present.items() if head < acknowledged[each].head}
 
     async def _offer(self, heads: AcknowledgedHeads, lost: Mapping[EpisodeId, int]) -> int:
-        """Appends what the segments hold of it; how many events that were."""
+        """Append the lost events that the segments contain; return their number."""
         basis = self._basis(heads)._replace(witness=None)
         offered = 0
         recorders = await asyncio.to_thread(stored_recorders, self._spool, self._store.log_id)
@@ -160,16 +165,16 @@ class HealedLog:
             parts = _lost_records(stored_records(recorder), lost)
             try:
                 while batch := await asyncio.to_thread(next, parts, None):
-                    for some in _parts(batch, self._settings.batch_events_max):
-                        await self._store.store(some, basis)
+                    for part in _parts(batch, self._settings.batch_events_max):
+                        await self._store.store(part, basis)
                     offered += sum(each.episode is not None for each in batch)
-            except LogDamaged as error:  # of this recorder; what the others can heal is healed
+            except LogDamaged as error:  # skip this recorder; the segments of the others may still heal the log
                 _log.error("recorder %s: %s", recorder.name, error)
         return offered
 
 
 def _lost_records(parts: Iterable[Sequence[Record]], lost: Mapping[EpisodeId, int]) -> Iterator[list[Record]]:
-    """Declarations, and events beyond these heads; without segments that hold none of either."""
+    """Yield the declarations and the events beyond these heads, and skip segments that have neither."""
     for part in parts:
         wanted = [
             each for each in part if each.episode is None or each.sequence > lost.get(each.episode, each.sequence)

@@ -1,4 +1,4 @@
-"""`pycrorm rebuild`: one rebuild from its beginning to its end, by one process or several."""
+"""`pycrorm rebuild`: run one rebuild from start to end, by one process or several."""
 
 from __future__ import annotations
 
@@ -28,24 +28,27 @@ __all__ = ["RebuildSummary", "rebuild_memory", "rebuild_projection", "projection
 
 ReportProgress: TypeAlias = Callable[[str, int, int], None]
 
-_LOOK_S = 0.5
+_REPORT_S = 0.5
+"""The interval between two progress reports while workers fold."""
 _ALONE_EVENTS_MAX = 500_000
-"""Of 400,000 two processes took 0.8 times as long as one on SQLite and as long on PostgreSQL."""
+"""The largest log that one process folds by default. For 400,000 events two processes took 0.8 times as long as one on
+SQLite, and as long on PostgreSQL."""
 _IDLE_CORES_MIN = 1.5
-"""Beside four busy processes on two cores two were hardly faster than one, and who recorded waited twice as long."""
-_WAIT_S = 20.0
-"""For a turn to write on SQLite: what has run for an hour does not give up for a plan that is busy."""
+"""The idle cores that two processes need by default. Beside four busy processes on two cores they were hardly faster
+than one, and recorders waited twice as long."""
+_BUSY_TIMEOUT_S = 20.0
+"""The wait for SQLite's write lock, long because a rebuild of an hour must not fail for a busy plan."""
 
 
 class RebuildSummary(NamedTuple):
-    """What a rebuild made.
+    """The result of a rebuild.
 
     Attributes:
-        generation: number of the tables that people see now.
-        events, episodes: in the log at the end.
-        seconds: it took.
-        parked: by episode id, why not all of it could be folded.
-        left: tables that are not shown any more and that somebody uses still.
+        generation: number of the generation that is visible now.
+        events, episodes: the number of each in the log at the end.
+        seconds: its duration.
+        parked: the parked episodes by id, with the reasons.
+        left: replaced tables that could not be dropped, because queries still use them.
     """
 
     generation: int
@@ -61,40 +64,40 @@ async def rebuild_memory(
     *,
     workers: int | None = 1,
     views: Sequence[UserView] = (),
-    tell: ReportProgress = lambda _what, _done, _total: None,
+    report_progress: ReportProgress = lambda _step, _done, _total: None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> RebuildSummary:
-    """Makes the tables of a memory anew from its log.
+    """Rebuild the tables of a memory from its log.
 
     Args:
-        url: of a memory that is there; what is recorded meanwhile will be in the tables too.
-        workers: processes that fold at once, each its share of the episodes. On SQLite one at a time writes, while
-            another folds. More than one needs a core for each, and a second to begin; None: two for a large log, where
-            two cores have nothing to do. They are spawned: a script that has more than one does so below
+        url: of an existing memory; events that are recorded during the rebuild are included.
+        workers: the number of processes that fold, each a share of the episodes. On SQLite one of them writes at a
+            time, while the others fold. Each needs a core, and a second to start. None: two for a large log if two
+            cores are idle, otherwise one. Workers are spawned, so a script must call this with more than one below
             `if __name__ == "__main__":`.
-        views: questions with a name to keep beside the tables, with those that were registered before.
-        tell: what is done now, how many events are done, and of how many.
-        clock: what the time is taken from.
+        views: named queries to create beside the tables, in addition to the registered ones.
+        report_progress: called with the current step, the number of events done and their total.
+        clock: the time source.
 
-    Raises `DatabaseUnavailable`; `CallerError` if somebody else rebuilds this memory. Interrupted or killed, the next
-    one takes up what was made.
+    Raises `DatabaseUnavailable`; `CallerError` if another rebuild of this memory is running. After an interruption or
+    a kill, the next rebuild resumes this one.
     """
-    return await _rebuilt(url, lambda log: Rebuild.begin(log, views=views), workers, tell, clock)
+    return await _run(url, lambda log: Rebuild.begin(log, views=views), workers, report_progress, clock)
 
 
 async def rebuild_projection(
     url: str,
     projection: Projection,
     *,
-    tell: ReportProgress = lambda _what, _done, _total: None,
+    report_progress: ReportProgress = lambda _step, _done, _total: None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> RebuildSummary:
-    """The same for the tables of one projection, of whatever version they are. Raises also `DatabaseForeign`."""
-    return await _rebuilt(url, lambda log: Rebuild.begin(log, projection=projection), 1, tell, clock)
+    """Rebuild the tables of one custom projection, as `rebuild_memory` does. Raises also `DatabaseForeign`."""
+    return await _run(url, lambda log: Rebuild.begin(log, projection=projection), 1, report_progress, clock)
 
 
 async def projections_of(url: str) -> list[str]:
-    """The names of the projections that have tables in a memory, whether their code is here or not."""
+    """Return the names of the projections that have tables in a memory, also of those whose code is not installed."""
     log = await EventLog.open(shared_address(url), create=False)
     try:
         async with log.reading() as connection:
@@ -103,23 +106,27 @@ async def projections_of(url: str) -> list[str]:
         await log.close()
 
 
-async def _rebuilt(
-    url: str, begin: Callable[[EventLog], Awaitable[Rebuild]], workers: int | None, tell: ReportProgress, clock: Clock
+async def _run(
+    url: str,
+    begin: Callable[[EventLog], Awaitable[Rebuild]],
+    workers: int | None,
+    report_progress: ReportProgress,
+    clock: Clock,
 ) -> RebuildSummary:
     address = shared_address(url)
-    await (await EventLog.open(address, create=False)).close()  # it makes no memory where there is none
+    await (await EventLog.open(address, create=False)).close()  # raises where no memory exists, instead of creating one
     log = await _opened(address)
     try:
         async with claimed(log):
             began = clock.monotonic_ns()
             await clear(log)
             rebuild = await begin(log)
-            await _fold(log, rebuild, workers, tell)
-            tell("showing", 1, 1)
+            await _fold(log, rebuild, workers, report_progress)
+            report_progress("showing", 1, 1)
             await rebuild.show()
             seconds = (clock.monotonic_ns() - began) / 1e9
             parked = await rebuild.parked()
-            tell("clearing up", 1, 1)
+            report_progress("clearing up", 1, 1)
             left = await clear(log)
         episodes, events = await recorded(log)
         ids = {each.number: each.id for each in await log.episodes()} if parked else {}
@@ -136,46 +143,52 @@ async def _rebuilt(
 
 
 async def _opened(address: DatabaseAddress) -> EventLog:
-    return await EventLog.open(address, create=True, busy_timeout_s=_WAIT_S if address.is_sqlite else BUSY_TIMEOUT_S)
+    timeout_s = _BUSY_TIMEOUT_S if address.is_sqlite else BUSY_TIMEOUT_S
+    return await EventLog.open(address, create=True, busy_timeout_s=timeout_s)
 
 
-async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, tell: ReportProgress) -> None:
+async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, report_progress: ReportProgress) -> None:
     _, total = await recorded(log)
     if workers is None:
         idle = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
         workers = 2 if idle >= _IDLE_CORES_MIN and await rebuild.left() > _ALONE_EVENTS_MAX else 1
     if workers > 1:
-        await _share_out(log.address, rebuild, workers, lambda left: tell("rebuilding", max(total - left, 0), total))
-    # All of it, or what came meanwhile and what a worker that failed has left: then it fails here too, and says why.
+        await _run_workers(
+            log.address, rebuild, workers, lambda left: report_progress("rebuilding", max(total - left, 0), total)
+        )
+    # Fold the events that are left: all without workers, otherwise new ones and those of a worker that failed. Its
+    # fault is raised here, in the process that reports it.
     done = total - await rebuild.left()
     while (count := await rebuild.fold_next_batch()) is not None:
         done += count
-        tell("rebuilding", done, max(total, done))
+        report_progress("rebuilding", done, max(total, done))
 
 
-async def _share_out(address: DatabaseAddress, rebuild: Rebuild, workers: int, look: Callable[[int], None]) -> None:
-    """Returns when every worker has ended; leaves none behind."""
+async def _run_workers(
+    address: DatabaseAddress, rebuild: Rebuild, workers: int, report_left: Callable[[int], None]
+) -> None:
+    """Fold with spawned processes; return when all have ended. Kills them when it is cancelled."""
     context = multiprocessing.get_context("spawn")
     processes: list[BaseProcess] = []
     try:
-        with _not_interrupted():
+        with _interrupts_blocked():
             for part in range(workers):
                 process = context.Process(target=_work, args=(address, Share(part, workers)), daemon=True)
                 process.start()
                 processes.append(process)
         while working := [each.sentinel for each in processes if each.is_alive()]:
-            look(await rebuild.left())
-            await asyncio.to_thread(wait, working, _LOOK_S)
+            report_left(await rebuild.left())
+            await asyncio.to_thread(wait, working, _REPORT_S)
     finally:
         for each in processes:
-            each.kill()  # nothing is lost: what it had not committed is folded again
+            each.kill()  # loses nothing: its uncommitted events are folded again
             each.join()
 
 
 @contextmanager
-def _not_interrupted() -> Iterator[None]:
-    """Processes that are started inside never hear of Ctrl-C, which a terminal sends to all: who began ends them."""
-    resource_tracker.ensure_running()  # else the first start begins it, which lets Ctrl-C through again
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT in processes started inside. A terminal sends Ctrl-C to all of them; their parent ends them."""
+    resource_tracker.ensure_running()  # starting it unblocks SIGINT, so it must not be started by the first process
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
