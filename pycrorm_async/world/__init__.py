@@ -1,6 +1,7 @@
-"""Where a plan acts: a kinematic Bullet world, its objects, and the robot's measures. Knows nothing of memory.
+"""A kinematic Bullet world, its objects, and descriptions of robots. This package does not depend on the memory.
 
-Importing this package imports neither Bullet nor numpy; Bullet is loaded when the first world is entered.
+Importing it imports neither Bullet nor numpy: the classes are loaded on first access, Bullet when the first world is
+entered.
 
 >>> with BulletWorld() as world:
 ...     robot = Object("pr2", ObjectType.ROBOT)
@@ -60,7 +61,7 @@ __all__ = [
     "watcher",
 ]
 
-_HOME = {
+_NAMES_BY_MODULE = {
     "queries.bounding_boxes": ("BoundingBox",),
     "bullet": ("BulletWorld",),
     "world_copy": ("copied",),
@@ -75,7 +76,7 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _HOME.items():
+    for module, names in _NAMES_BY_MODULE.items():
         if name in names:
             return getattr(import_module(f"{__name__}.{module}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

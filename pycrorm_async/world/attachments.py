@@ -1,6 +1,7 @@
-"""What moves with what: the attachments of one world, and what a motion carries along.
+"""Keep the attachments of one world, and carry attached objects along with a motion.
 
-A child hangs on one link of one parent and keeps its pose relative to that link; chains are allowed, circles are not.
+A child is attached to one link of one parent and keeps its pose relative to that link. Chains are allowed, cycles are
+not.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ __all__ = ["Attachment", "Attachments"]
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """`child` moves with `link` of `parent` (None: its root link) and is at `relative` from it."""
+    """A child that moves with `link` of `parent` (None: its root link) at the pose `relative` to that link."""
 
     parent: Object
     child: Object
@@ -29,29 +30,29 @@ class Attachment:
 
 
 class Attachments:
-    """All attachments of one world; changing them moves nothing and tells nobody."""
+    """All attachments of one world. Changing them moves no object and notifies no observer."""
 
     def __init__(self) -> None:
         self._of_child: dict[Object, Attachment] = {}
 
     def __iter__(self) -> Iterator[Attachment]:
-        """In the order they were made."""
+        """Iterate over the attachments in the order of their creation."""
         return iter(tuple(self._of_child.values()))
 
     def of(self, child: Object) -> Attachment | None:
-        """What `child` hangs on."""
+        """Return the attachment of `child` to its parent."""
         return self._of_child.get(child)
 
     def on(self, parent: Object) -> tuple[Attachment, ...]:
-        """What hangs on `parent` itself."""
+        """Return the attachments of direct children of `parent`."""
         return tuple(each for each in self._of_child.values() if each.parent is parent)
 
     def below(self, parent: Object) -> tuple[Object, ...]:
-        """All that hangs on `parent`, however deep, parents first."""
-        return tuple(thing for each in self.on(parent) for thing in (each.child, *self.below(each.child)))
+        """Return all descendants of `parent`, parents before their children."""
+        return tuple(obj for each in self.on(parent) for obj in (each.child, *self.below(each.child)))
 
     def add(self, parent: Object, child: Object, link: str | None) -> None:
-        """Attach `child` where it is now; raises `AttachmentRefused`."""
+        """Attach `child` at its current pose. Raises `AttachmentRefused`."""
         if parent.world is not child.world:
             raise AttachmentRefused(f"{child.name!r} and {parent.name!r} are in different worlds")
         present = self._of_child.get(child)
@@ -62,30 +63,30 @@ class Attachments:
         above: Object | None = parent
         while above is not None:
             if above is child:
-                raise AttachmentRefused(f"{child.name!r} cannot hang on itself (by way of {parent.name!r})")
-            above = found.parent if (found := self._of_child.get(above)) else None
+                raise AttachmentRefused(f"{child.name!r} cannot be attached to itself (through {parent.name!r})")
+            above = attachment.parent if (attachment := self._of_child.get(above)) else None
         self.put(parent, child, link)
 
     def put(self, parent: Object, child: Object, link: str | None) -> None:
-        """Note that `child` hangs on that link, where it is now."""
+        """Store the attachment of `child` to that link at its current pose, without checks."""
         relative = child.pose.relative_to(parent.link_pose(link))
         self.keep(Attachment(parent, child, link, relative))
 
     def keep(self, attachment: Attachment) -> None:
-        """Note an attachment as it is given; the child is taken to be where it says."""
+        """Store an attachment; the caller ensures that the child is at its relative pose."""
         self._of_child[attachment.child] = attachment
 
     def remove(self, parent: Object, child: Object) -> Attachment:
-        """Take one away and return it; raises `AttachmentRefused` if it is not there."""
+        """Remove an attachment and return it. Raises `AttachmentRefused` if `child` is not attached to `parent`."""
         present = self._of_child.get(child)
         if present is None or present.parent is not parent:
             raise AttachmentRefused(f"{child.name!r} is not attached to {parent.name!r}")
         return self._of_child.pop(child)
 
     def carry(self, parent: Object, joints: Iterable[str] | None = None) -> list[Object]:
-        """Bring what hangs on `parent`, however deep, to where it now belongs; returns it, parents first.
+        """Move all descendants of `parent` to their poses relative to its links; return them, parents first.
 
-        With `joints`, only what hangs on links that these joints move.
+        With `joints`, only the children on links that these joints move, and their descendants.
         """
         carried: list[Object] = []
         moved = None if joints is None else set(joints)

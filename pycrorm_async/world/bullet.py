@@ -1,7 +1,7 @@
-"""The world a plan acts in: one Bullet client of its own, the objects in it, and who is told of what happens there.
+"""A world owns one Bullet client and its objects, and notifies its observers of every change.
 
-Motions are kinematic: things are put where they are to be, nothing is stepped and nothing falls. Any number of worlds
-can be open at once, in tasks and threads; one world belongs to one thread at a time.
+Motions are kinematic: setters place objects and joints, the simulation is never stepped, and objects do not fall. Any
+number of worlds can be open at once, in tasks and threads; one world belongs to one thread at a time.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ _GRAVITY_M_PER_S2 = -9.8
 
 
 class BulletWorld:
-    """A world, to be entered once with `with`; inside, it is `current_world` of this context.
+    """A world, entered once with `with`; inside that block it is `current_world` of the context.
 
     >>> with BulletWorld() as world:
     ...     Object("bowl", ObjectType.BOWL)
     ...     world.objects
     (Object('bowl', BOWL, Pose(position=[0.0, 0.0, 0.0], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')),)
 
-    Entering takes some 50 ms, raises `WorldUnavailable`, and whatever this context's watcher refuses it with.
-    Afterwards everything that would change the world raises `WorldClosed`; what was last known can still be read.
+    Entering takes about 50 ms. It raises `WorldUnavailable`, and any exception of the context's watcher. After the
+    block every change raises `WorldClosed`; the last poses and joint positions can still be read.
 
     Args:
-        mode: with a window, or without.
-        copy_of: for `copying.copied` only: the world that this one is filled from. No watcher is told of a copy.
+        mode: whether Bullet opens a window.
+        copy_of: the world this one is a copy of; only for `world_copy.copied`. A copy has no watcher.
     """
 
     def __init__(self, mode: WorldMode = WorldMode.DIRECT, *, copy_of: BulletWorld | None = None) -> None:
@@ -63,30 +63,30 @@ class BulletWorld:
         self._begin()
         self._outer = current_world.here()
         current_world.set(self)
-        self._tell_entered()
+        self._notify_entered()
         return self
 
     def connect(self) -> Self:
-        """Enter it for all contexts of this process that are in no world of their own, until `close`.
+        """Enter the world until `close`, for every context of this process that has not entered a world of its own.
 
-        For notebooks, whose cells have a context each. If several are connected, plans act in the last one.
+        This is for notebooks, where each cell has its own context. If several are connected, plans act in the last one.
         """
         self._begin()
         current_world.connect(self)
-        self._tell_entered()
+        self._notify_entered()
         return self
 
     def close(self) -> None:
-        """Leave it; twice is once."""
+        """Leave the world; a second call does nothing."""
         if self.entered:
             self.__exit__(None, None, None)
 
     def _begin(self) -> None:
         if self._client is not None or self._left:
-            raise WorldClosed("a world is entered once; make a new BulletWorld()")
-        self._client = _connected(self.mode)
+            raise WorldClosed("a world can be entered only once; create a new BulletWorld()")
+        self._client = _connect(self.mode)
 
-    def _tell_entered(self) -> None:
+    def _notify_entered(self) -> None:
         self._watcher = watcher.get() if self.copy_of is None else None
         if self._watcher is not None:
             try:
@@ -109,22 +109,22 @@ class BulletWorld:
 
     def _close(self) -> None:
         current_world.disconnect(self)
-        if current_world.here() is self:  # it is not when the context manager is closed in another context
+        if current_world.here() is self:  # False if the context manager is closed in another context
             current_world.set(self._outer)
         client, self._client, self._left = self.client, None, True
         engine().disconnect(physicsClientId=client)
 
     @property
     def entered(self) -> bool:
-        """Whether it can be acted on now."""
+        """Whether the world is entered and not left yet."""
         return self._client is not None
 
     @property
     def client(self) -> int:
-        """Bullet's number of this world; raises `WorldClosed`."""
+        """Bullet's number of this world. Raises `WorldClosed`."""
         if self._client is None:
             raise WorldClosed(
-                "the world was left; only what was last known of it can be read"
+                "the world is closed; only its last poses and joint positions can be read"
                 if self._left
                 else "the world is not entered; act inside `with BulletWorld() as world:`"
             )
@@ -132,78 +132,82 @@ class BulletWorld:
 
     @property
     def description(self) -> str:
-        """The world in a line."""
-        things = ", ".join(f"{thing.name} ({thing.object_type.name})" for thing in self.objects)
-        return f"BulletWorld ({self.mode.value}): {things or 'empty'}"
+        """The world's mode and objects in one line."""
+        objects = ", ".join(f"{obj.name} ({obj.object_type.name})" for obj in self.objects)
+        return f"BulletWorld ({self.mode.value}): {objects or 'empty'}"
 
-    # --- what is in it ----------------------------------------------------------------------------------------
+    # --- objects ----------------------------------------------------------------------------------------------
 
     @property
     def objects(self) -> tuple[Object, ...]:
-        """In the order they were added."""
+        """The objects in the order in which they were added."""
         return tuple(self._objects.values())
 
     @property
     def robot(self) -> Object | None:
-        """The first object of type ROBOT."""
+        """The first object of type ROBOT; None without one."""
         return self._robot
 
     def object(self, name: str) -> Object:
-        """The object of that name; raises `ObjectNotInWorld`."""
-        for thing in self._objects.values():
-            if thing.name == name:
-                return thing
-        raise ObjectNotInWorld(name, tuple(thing.name for thing in self.objects))
+        """Return the object of that name. Raises `ObjectNotInWorld`."""
+        for obj in self._objects.values():
+            if obj.name == name:
+                return obj
+        raise ObjectNotInWorld(name, tuple(obj.name for obj in self.objects))
 
-    def has(self, thing: Object) -> bool:
-        """Whether this very object is in it."""
-        return self._objects.get(thing.body.number) is thing
+    def has(self, obj: Object) -> bool:
+        """Return whether the world contains this object; objects are compared by identity."""
+        return self._objects.get(obj.body.number) is obj
 
-    def add(self, thing: Object) -> None:
-        """Called by `Object` when its body is there; tells the observers."""
-        self._objects[thing.body.number] = thing
-        if self._robot is None and thing.object_type is ObjectType.ROBOT:
-            self._robot = thing
+    def add(self, obj: Object) -> None:
+        """Add an object whose body is loaded, and notify the observers; only `Object` calls this."""
+        self._objects[obj.body.number] = obj
+        if self._robot is None and obj.object_type is ObjectType.ROBOT:
+            self._robot = obj
         for observer in self._observers:
-            observer.object_added(thing)
+            observer.object_added(obj)
 
-    def remove(self, thing: Object) -> None:
-        """Take an object out, detached first; its last pose and joints can still be read."""
-        thing.check_present()
-        thing.detach_all()
-        thing.body.unload()
-        del self._objects[thing.body.number]
-        if thing is self._robot:
+    def remove(self, obj: Object) -> None:
+        """Detach an object and remove it; its last pose and joints can still be read."""
+        obj.check_present()
+        obj.detach_all()
+        obj.body.unload()
+        del self._objects[obj.body.number]
+        if obj is self._robot:
             robots = (other for other in self._objects.values() if other.object_type is ObjectType.ROBOT)
             self._robot = next(robots, None)
         for observer in self._observers:
-            observer.object_removed(thing)
+            observer.object_removed(obj)
 
-    # --- going back -------------------------------------------------------------------------------------------
+    # --- resetting and restoring ------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Every object detached, joints 0, at its original pose; only what is not so is touched and told."""
+        """Detach every object, set its joints to 0, and move it to its original pose.
+
+        Objects that are in that state already are not moved, and observers get no call for them.
+        """
         _ = self.client
         for each in self.attachments:
             each.parent.detach(each.child)
-        for thing in self.objects:
-            thing.reset()
+        for obj in self.objects:
+            obj.reset()
 
     def save_state(self) -> WorldState:
-        """Poses, joint positions and attachments of all objects, as a frozen value."""
-        return state.saved(self)
+        """Return poses, joint positions and attachments of all objects as a frozen value."""
+        return state.save(self)
 
     def restore_state(self, saved: WorldState) -> None:
-        """Make the objects of `saved` as they were then; tells what differed, and nothing else.
+        """Restore the objects of `saved`; observers get the differences only.
 
-        An object that was added since stays where it is, detached from the others. Raises `ObjectNotInWorld` if one
-        of the state's objects is gone, `UnknownJoint` if another one has its name now, `PoseRefused` or
-        `JointLimitExceeded` if it was made by hand with a number that is not finite; then nothing was touched.
+        An object that was added since keeps its pose and is detached from the restored ones. The following are raised
+        before anything is changed: `ObjectNotInWorld` if an object of the state was removed, `UnknownJoint` if its
+        name now belongs to an object without that joint, `PoseRefused` or `JointLimitExceeded` if a hand-made state
+        has numbers that are not finite.
         """
         _ = self.client
         state.restore(self, saved)
 
-    # --- looking ----------------------------------------------------------------------------------------------
+    # --- visibility -------------------------------------------------------------------------------------------
 
     def ray_test(
         self,
@@ -212,60 +216,60 @@ class BulletWorld:
         *,
         ignore: Iterable[Object] = (),
     ) -> list[Object | None]:
-        """For every ray the first object it meets; None where it meets none, or the floor.
+        """Return the first object on every ray; None for no object, or the floor.
 
-        Objects in `ignore` are looked through. A ray does not meet the shape it starts in. Points in "map", metres.
+        Objects in `ignore` are transparent. A ray does not hit the shape it starts in. Points are in "map", m.
         """
         return visibility.first_met(self, starts, ends, ignore=frozenset(ignore))
 
-    def visible(self, thing: Object, eye: Sequence[float], *, ignore: Iterable[Object] = ()) -> float:
-        """The share of `thing` that is seen from the point `eye`, 0 to 1; nothing of it is beyond a field of view.
+    def visible(self, obj: Object, eye: Sequence[float], *, ignore: Iterable[Object] = ()) -> float:
+        """Return the share of an object that is visible from the point `eye`, 0 to 1; no field of view limits it.
 
-        Rays go to points spread through its shapes; those that meet another object or the floor first are hidden.
+        Rays go to points spread through its shapes; a point is hidden if its ray hits another object or the floor.
         """
-        return visibility.visible_share(self, thing, eye, ignore=frozenset(ignore))
+        return visibility.visible_share(self, obj, eye, ignore=frozenset(ignore))
 
-    # --- who is told ------------------------------------------------------------------------------------------
+    # --- observers --------------------------------------------------------------------------------------------
 
     @property
     def observers(self) -> tuple[WorldObserver, ...]:
-        """In the order they came."""
+        """The observers in the order in which they were added."""
         return self._observers
 
     def observe(self, observer: WorldObserver) -> None:
-        """From now on it is told of every change. One that observes already is not told twice."""
+        """Add an observer; adding it a second time does nothing."""
         if observer not in self._observers:
             self._observers = (*self._observers, observer)
 
     def unobserve(self, observer: WorldObserver) -> None:
-        """It is no longer told."""
+        """Remove an observer."""
         self._observers = tuple(other for other in self._observers if other is not observer)
 
-    def tell_moved(self, things: Iterable[Object]) -> None:
-        """Called when a motion is complete: these objects have new poses."""
+    def notify_moved(self, objects: Iterable[Object]) -> None:
+        """Notify the observers, after a motion is complete, that these objects have new poses."""
         if self._observers:
-            for thing in things:
+            for obj in objects:
                 for observer in self._observers:
-                    observer.object_moved(thing)
+                    observer.object_moved(obj)
 
-    def tell_turned(self, thing: Object, positions: Mapping[str, float]) -> None:
-        """Called when a motion is complete: these joints have new positions."""
+    def notify_joints(self, obj: Object, positions: Mapping[str, float]) -> None:
+        """Notify the observers, after a motion is complete, that these joints have new positions."""
         for observer in self._observers:
-            observer.joints_moved(thing, positions)
+            observer.joints_moved(obj, positions)
 
 
-def _connected(mode: WorldMode) -> int:
-    """A new Bullet client with a floor."""
+def _connect(mode: WorldMode) -> int:
+    """Open a Bullet client with a floor."""
     bullet = engine()
-    if mode is WorldMode.GUI and not os.environ.get("DISPLAY"):  # Bullet would end the process
-        raise WorldUnavailable("a window needs a display (DISPLAY is not set); use WorldMode.DIRECT")
+    if mode is WorldMode.GUI and not os.environ.get("DISPLAY"):  # without a display Bullet ends the process
+        raise WorldUnavailable("a window needs a display, but DISPLAY is not set; use WorldMode.DIRECT")
     try:
         client: int = bullet.connect(bullet.GUI if mode is WorldMode.GUI else bullet.DIRECT)
     except bullet.error as reason:
-        raise WorldUnavailable(f"Bullet opens no further world: {reason}") from reason
+        raise WorldUnavailable(f"Bullet cannot open another world: {reason}") from reason
     if client < 0:
-        raise WorldUnavailable("Bullet opens no further world; leave those that are not needed")
-    # remembering files by name would give a changed description's old text, and keep every one in memory
+        raise WorldUnavailable("Bullet cannot open another world; close worlds that are not needed")
+    # Bullet's file cache is keyed by name: it would return the old text of a changed description, and never shrink.
     bullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=client)
     bullet.setGravity(0, 0, _GRAVITY_M_PER_S2, physicsClientId=client)
     floor = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client)

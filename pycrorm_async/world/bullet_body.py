@@ -1,8 +1,8 @@
-"""The silent side of an object: one loaded description in one Bullet client, and where it stands.
+"""A body is one loaded description in one Bullet client, with its pose and joint positions.
 
-Poses and joint positions are kept here exactly as they were set; Bullet gets a copy and answers for the links. Nothing
-here tells an observer, checks a limit or knows what is attached: `objects.Object` does, and everything outside this
-package goes through it.
+Poses and joint positions are kept here exactly as they were set; Bullet gets a copy and computes the frames of the
+links. A body notifies no observer, checks no limits and ignores attachments: `objects.Object` does that, and code
+outside this package uses `Object` only.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Body:
 
     def __init__(self, name: str, urdf: str, client: int, pose: Pose, color: Color | None) -> None:
         self.client = client
-        self.number = _loaded(name, urdf, client)
+        self.number = _load(name, urdf, client)
         self.pose = pose
         self.positions: dict[str, float] = {}
         self.limits: dict[str, tuple[float, float]] = {}
@@ -42,7 +42,7 @@ class Body:
         self.movable_above: dict[str, tuple[str, ...]] = {}
         self._joint_numbers: dict[str, int] = {}
         self._link_numbers: dict[str, int] = {}
-        self._inertial: dict[int, Frame] = {}  # Bullet places a link by its centre of mass, given in its frame
+        self._inertial: dict[int, Frame] = {}  # Bullet places a link by its centre of mass, in the link's frame
         self._inertial_back: dict[int, Frame] = {}
         self._read()
         self.solids: dict[str, tuple[Solid, ...]] = {
@@ -60,26 +60,26 @@ class Body:
 
     @property
     def links(self) -> tuple[str, ...]:
-        """All links, the root first."""
+        """The names of all links, the root first."""
         return tuple(self._link_numbers)
 
     def link_number(self, link: str) -> int:
-        """Bullet's number of the link."""
+        """Return Bullet's number of the link."""
         return self._link_numbers[link]
 
     def place(self, pose: Pose) -> None:
-        """Put the root link's frame there."""
-        position, orientation = _composed((pose.position, pose.orientation), self._inertial[_ROOT])
+        """Move the root link's frame to this pose."""
+        position, orientation = _compose((pose.position, pose.orientation), self._inertial[_ROOT])
         engine().resetBasePositionAndOrientation(self.number, position, orientation, physicsClientId=self.client)
         self.pose = pose
 
     def turn(self, positions: Mapping[str, float]) -> None:
-        """Set these joints, all at once."""
+        """Set these joints together, rad or m."""
         self._turn_in_bullet(positions)
         self.positions.update(positions)
 
     def link_frame(self, link: str) -> Frame:
-        """Where the link's frame is in "map"."""
+        """Return the link's frame in "map"."""
         number = self._link_numbers[link]
         if number == _ROOT:
             return self.pose.position, self.pose.orientation
@@ -87,16 +87,16 @@ class Body:
         return self._link_frame(number, state)
 
     def link_frame_at(self, link: str, positions: Mapping[str, float]) -> Frame:
-        """Where the link's frame would be in "map" with these joints there; Bullet tries it and puts them back."""
-        now = {joint: self.positions[joint] for joint in positions}
+        """Return the link's frame in "map" at these joint positions; sets the joints in Bullet and restores them."""
+        current = {joint: self.positions[joint] for joint in positions}
         try:
             self._turn_in_bullet(positions)
             return self.link_frame(link)
         finally:
-            self._turn_in_bullet(now)
+            self._turn_in_bullet(current)
 
     def box(self, links: Iterable[str]) -> BoundingBox | None:
-        """The box around the shapes of these links; None if they have none."""
+        """Return the box around the shapes of these links; None if they have no shapes."""
         shaped = [link for link in links if self.solids[link]]
         numbers = [number for link in shaped if (number := self._link_numbers[link]) != _ROOT]
         states: Sequence[Any] = ()
@@ -110,7 +110,7 @@ class Body:
         return box_around((frames[self._link_numbers[link]], self.solids[link]) for link in shaped)
 
     def unload(self) -> None:
-        """Take it out of Bullet; pose and positions stay readable."""
+        """Remove the body from Bullet; pose and positions stay readable."""
         engine().removeBody(self.number, physicsClientId=self.client)
 
     def _turn_in_bullet(self, positions: Mapping[str, float]) -> None:
@@ -119,11 +119,11 @@ class Body:
         engine().resetJointStatesMultiDof(self.number, numbers, values, physicsClientId=self.client)
 
     def _link_frame(self, number: int, state: Sequence[Any]) -> Frame:
-        # Bullet also gives the link's own frame, but in single precision; its inertial frame is exact to a double
-        return _composed((state[0], state[1]), self._inertial_back[number])
+        # Bullet returns the link's own frame in single precision; its inertial frame has double precision.
+        return _compose((state[0], state[1]), self._inertial_back[number])
 
     def _read(self) -> None:
-        """Names, limits and inertial frames, as Bullet understood them; parents come before their children."""
+        """Read names, limits and inertial frames from Bullet, parents before their children."""
         bullet, client = engine(), self.client
         root = bullet.getBodyInfo(self.number, physicsClientId=client)[0].decode()
         names = {_ROOT: root}
@@ -143,20 +143,20 @@ class Body:
         for number in names:
             dynamics = bullet.getDynamicsInfo(self.number, number, physicsClientId=client)
             self._inertial[number] = Vector(*dynamics[3]), Quaternion(*dynamics[4])
-            self._inertial_back[number] = _inverse(self._inertial[number])
+            self._inertial_back[number] = _invert(self._inertial[number])
 
     def _paint(self, color: Color) -> None:
         for number in self._link_numbers.values():
             engine().changeVisualShape(self.number, number, rgbaColor=color, physicsClientId=self.client)
 
 
-def _loaded(name: str, urdf: str, client: int) -> int:
-    """Bullet's number of a body made from URDF text, all links kept, its base fixed where it is put."""
+def _load(name: str, urdf: str, client: int) -> int:
+    """Load URDF text with all its links and a fixed base, and return Bullet's number of the body."""
     bullet = engine()
     with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
         file.write(urdf)
         file.flush()
-        with captured() as words:
+        with captured() as output:
             try:
                 number: int | None = bullet.loadURDF(
                     file.name,
@@ -167,24 +167,24 @@ def _loaded(name: str, urdf: str, client: int) -> int:
             except bullet.error:
                 number = None
     if number is None:
-        raise DescriptionNotLoadable(name, _reason("".join(words)))
+        raise DescriptionNotLoadable(name, _reason("".join(output)))
     return number
 
 
-def _reason(words: str) -> str:
-    """What Bullet printed as errors, without its file names and line numbers."""
-    said = [part.partition("]:\n")[2].strip() for part in words.split("b3Error[")[1:]]
-    return " ".join(part.split("b3Warning[")[0] for part in said) or "Bullet gives no reason"
+def _reason(output: str) -> str:
+    """Extract the errors from Bullet's output, without its file names and line numbers."""
+    errors = [part.partition("]:\n")[2].strip() for part in output.split("b3Error[")[1:]]
+    return " ".join(part.split("b3Warning[")[0] for part in errors) or "Bullet printed no reason"
 
 
 def _joint_type(number: int, *, lower: float, upper: float) -> JointType:
-    """Bullet knows no continuous joints: they are revolute, without a range."""
+    """Return the joint's type; Bullet reports a continuous joint as a revolute one with an empty range."""
     kind = JointType(number) if number <= JointType.FIXED else JointType.UNKNOWN
     return JointType.CONTINUOUS if kind is JointType.REVOLUTE and lower > upper else kind
 
 
-def _composed(outer: Frame | tuple[Sequence[float], Sequence[float]], inner: Frame) -> Frame:
-    """`inner`, given relative to `outer`, in outer's frame."""
+def _compose(outer: Frame | tuple[Sequence[float], Sequence[float]], inner: Frame) -> Frame:
+    """Convert `inner`, a frame relative to `outer`, to the frame that `outer` is in."""
     (x, y, z), turn = outer
     if inner == _AT_ORIGIN:
         return Vector(x, y, z), Quaternion(*turn)
@@ -192,7 +192,7 @@ def _composed(outer: Frame | tuple[Sequence[float], Sequence[float]], inner: Fra
     return Vector(x + moved.x, y + moved.y, z + moved.z), product(turn, inner[1])
 
 
-def _inverse(frame: Frame) -> Frame:
+def _invert(frame: Frame) -> Frame:
     position, (x, y, z, w) = frame
     back = Quaternion(-x, -y, -z, w)
     moved = rotated(back, position)

@@ -1,9 +1,9 @@
-"""How Bullet is reached: loaded at the first world, and silent on stdout and stderr from then on.
+"""Load Bullet when the first world is entered, and keep its output away from stdout and stderr.
 
-Bullet speaks with C's `printf` and cannot be told not to: a greeting at import, warnings when it loads a body. For that
-moment C's own `stdout` and `stderr` pointers stand on memory. Python and child processes write to the file descriptors,
-not through those pointers, so what others print meanwhile is not touched; and what Bullet said is at hand when a
-description does not load.
+Bullet prints with C's `printf`, which cannot be switched off: a greeting at import, warnings when it loads a body.
+Meanwhile this module points C's own `stdout` and `stderr` to a buffer in memory. Python and child processes write to
+the file descriptors and not through those pointers, so their output is not affected. The buffer holds Bullet's error
+message if a description does not load.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from typing import Any
 
 __all__ = ["engine", "captured"]
 
-_ONE_AT_A_TIME = Lock()  # a process has one C stdout
+_STREAMS_LOCK = Lock()  # a process has one C stdout
 
 
 @cache
 def engine() -> Any:
-    """The module `pybullet`, imported at the first call."""
-    found = find_spec("pybullet")
-    if found is not None and found.origin is not None:
-        # Loaded before it is imported: the C++ runtime that comes with it keeps the streams it finds when it starts,
-        # and would keep, and at exit flush, the memory that is gone by then.
-        ctypes.CDLL(found.origin)
+    """Return the module `pybullet`, imported at the first call."""
+    spec = find_spec("pybullet")
+    if spec is not None and spec.origin is not None:
+        # Load the library before the streams are redirected: its C++ runtime keeps the streams it finds when it
+        # starts, and would flush the freed memory buffer at exit.
+        ctypes.CDLL(spec.origin)
     with captured():
         import pybullet
     return pybullet
@@ -36,19 +36,19 @@ def engine() -> Any:
 
 @contextmanager
 def captured() -> Iterator[list[str]]:
-    """Inside, what C code prints is kept from stdout and stderr; afterwards the list holds it as one text.
+    """Capture what C code prints inside the context; afterwards the list holds it as one string.
 
-    Threads wait for each other here; not reentrant.
+    One thread at a time can capture, others block; not reentrant. Without glibc nothing is captured.
     """
-    words: list[str] = []
+    output: list[str] = []
     libc = ctypes.CDLL(None)
     if not hasattr(libc, "gnu_get_libc_version"):  # only glibc lets its streams be assigned
-        yield words
+        yield output
         return
     libc.open_memstream.restype = ctypes.c_void_p
     text, size = ctypes.c_char_p(), ctypes.c_size_t()
     streams = [ctypes.c_void_p.in_dll(libc, name) for name in ("stdout", "stderr")]
-    with _ONE_AT_A_TIME:
+    with _STREAMS_LOCK:
         memory: int | None = libc.open_memstream(ctypes.byref(text), ctypes.byref(size))
         if memory is None:
             raise MemoryError
@@ -56,10 +56,10 @@ def captured() -> Iterator[list[str]]:
         for stream in streams:
             stream.value = memory
         try:
-            yield words
+            yield output
         finally:
             for stream, value in zip(streams, before, strict=True):
                 stream.value = value
             libc.fclose(ctypes.c_void_p(memory))
-            words.append((text.value or b"").decode(errors="replace"))
+            output.append((text.value or b"").decode(errors="replace"))
             libc.free(text)

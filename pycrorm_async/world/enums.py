@@ -1,4 +1,4 @@
-"""The closed vocabularies of the world and of plans; members are recorded by name (values as in reference systems)."""
+"""Enumerations of the world and of plans. Members are recorded by name; their values are those of PyCRAM."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["Arms", "Grasp", "GripperState", "ObjectType", "JointType", "WorldMod
 
 
 class Arms(IntEnum):
-    """Which arm; BOTH for actions that move both."""
+    """An arm of the robot; BOTH for actions that move both."""
 
     LEFT = 1
     RIGHT = 2
@@ -16,7 +16,7 @@ class Arms(IntEnum):
 
 
 class Grasp(IntEnum):
-    """From which side of the object the gripper comes."""
+    """The side of the object from which the gripper approaches."""
 
     FRONT = 0
     LEFT = 1
@@ -25,14 +25,14 @@ class Grasp(IntEnum):
 
 
 class GripperState(IntEnum):
-    """What a gripper is told to do."""
+    """The goal of a gripper motion."""
 
     OPEN = 1
     CLOSE = 2
 
 
 class ObjectType(IntEnum):
-    """What kind of thing an object is."""
+    """The kind of an object."""
 
     METALMUG = 1
     PRINGLES = 2
@@ -48,7 +48,7 @@ class ObjectType(IntEnum):
 
 
 class JointType(IntEnum):
-    """How a joint moves."""
+    """The kind of a joint's motion."""
 
     REVOLUTE = 0
     PRISMATIC = 1
@@ -61,7 +61,7 @@ class JointType(IntEnum):
 
 
 class WorldMode(Enum):
-    """With a window, or without."""
+    """Whether Bullet opens a window: GUI does, DIRECT does not."""
 
     GUI = "GUI"
     DIRECT = "DIRECT"

@@ -1,4 +1,4 @@
-"""What a call on the world can be refused for. All are `CallerError`: the message says what to change."""
+"""Errors of calls on the world. All are `CallerError`: each message names what to change."""
 
 from __future__ import annotations
 
@@ -24,47 +24,47 @@ __all__ = [
 
 
 class WorldError(CallerError):
-    """The root of what the world refuses."""
+    """Root of the errors of this package."""
 
 
 class WorldUnavailable(WorldError):
-    """Bullet gives no world: no display for a window, or too many worlds at once."""
+    """Bullet cannot open a world: a window without a display, or too many worlds at once."""
 
 
 class WorldClosed(WorldError):
-    """The world was not entered yet, or was left; names, types, last poses and joints can still be read."""
+    """The world is not entered yet or is closed; names, types, last poses and joints can still be read."""
 
 
 class NoWorld(WorldError):
-    """No world is entered in this context, and none was given."""
+    """No world is entered in this context, and the call has no world argument."""
 
     def __init__(self, wanted_for: str) -> None:
-        super().__init__(f"no world for {wanted_for}: act inside `with BulletWorld() as world:`")
+        super().__init__(f"no world is entered for {wanted_for}: call it inside `with BulletWorld() as world:`")
 
 
 class ObjectRefused(WorldError):
-    """An object was to be made with a name that is no str, or a type that is no `ObjectType`."""
+    """An object's name is not a str, or its type is not an `ObjectType`."""
 
 
 class ObjectNotInWorld(WorldError):
     """No object of that name is in the world, or it was removed."""
 
     def __init__(self, name: str, present: tuple[str, ...]) -> None:
-        super().__init__(f"{name!r} is not in the world; there are: {', '.join(present) or 'no objects'}")
+        super().__init__(f"{name!r} is not in the world; its objects are: {', '.join(present) or 'none'}")
         self.name = name
         self.present = present
 
 
 class DuplicateName(WorldError):
-    """An object of that name is in the world already."""
+    """The world already contains an object of that name."""
 
     def __init__(self, name: str) -> None:
-        super().__init__(f"an object named {name!r} is in the world already; choose another name or remove it")
+        super().__init__(f"the world already contains an object named {name!r}; choose another name or remove it")
         self.name = name
 
 
 class DescriptionNotLoadable(WorldError):
-    """No body can be made from a description; `reason` is what is wrong with it."""
+    """Bullet cannot load a description; `reason` names the fault."""
 
     def __init__(self, name: str, reason: str) -> None:
         super().__init__(f"the description of {name!r} cannot be loaded: {reason}")
@@ -76,7 +76,8 @@ class UnknownJoint(WorldError):
     """The object has no movable joint of that name."""
 
     def __init__(self, object_name: str, joint: str, present: tuple[str, ...]) -> None:
-        super().__init__(f"{object_name!r} has no movable joint {joint!r}; it has: {', '.join(present) or 'none'}")
+        joints = ", ".join(present) or "none"
+        super().__init__(f"{object_name!r} has no movable joint {joint!r}; its joints are: {joints}")
         self.object_name = object_name
         self.joint = joint
 
@@ -85,17 +86,17 @@ class UnknownLink(WorldError):
     """The object has no link of that name."""
 
     def __init__(self, object_name: str, link: str, present: tuple[str, ...]) -> None:
-        super().__init__(f"{object_name!r} has no link {link!r}; it has: {', '.join(present)}")
+        super().__init__(f"{object_name!r} has no link {link!r}; its links are: {', '.join(present)}")
         self.object_name = object_name
         self.link = link
 
 
 class JointLimitExceeded(WorldError):
-    """A joint position is outside the joint's hard limits (rad or m), or not finite; nothing was moved."""
+    """A joint position is outside the joint's hard limits (rad or m), or not finite; no joint was moved."""
 
     def __init__(self, object_name: str, joint: str, value: float, limits: tuple[float, float]) -> None:
         lower, upper = max(limits[0], -COORDINATE_MAX), min(limits[1], COORDINATE_MAX)
-        super().__init__(f"{object_name!r}: {joint} cannot be {value:g}; its limits are {lower:g} to {upper:g}")
+        super().__init__(f"{object_name!r}: {joint} cannot be set to {value:g}; its limits are {lower:g} to {upper:g}")
         self.object_name = object_name
         self.joint = joint
         self.value = value
@@ -103,18 +104,18 @@ class JointLimitExceeded(WorldError):
 
 
 class PoseRefused(WorldError):
-    """An object cannot be put at a pose in another frame than "map", or with a number that is not finite."""
+    """An object's new pose is in another frame than "map", or has a number that is not finite."""
 
     def __init__(self, object_name: str, pose: Pose, reason: str) -> None:
-        super().__init__(f"{object_name!r} cannot be put at {pose!r}: {reason}")
+        super().__init__(f"{object_name!r} cannot be moved to {pose!r}: {reason}")
         self.object_name = object_name
         self.pose = pose
         self.reason = reason
 
 
 class AttachmentRefused(WorldError):
-    """Two objects cannot be attached or detached in this way."""
+    """Two objects cannot be attached to or detached from each other."""
 
 
 class CostmapMismatch(WorldError):
-    """Two costmaps of different place, size or resolution cannot be combined."""
+    """Two costmaps of different origin, size or resolution cannot be multiplied."""

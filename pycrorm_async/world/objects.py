@@ -1,4 +1,4 @@
-"""A thing in the world: where it is, how its joints are, what it carries; every change is told to the observers once.
+"""Objects of a world: poses, joints and attachments. Each motion notifies the observers once per changed object.
 
 >>> with BulletWorld() as world:
 ...     milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9]))
@@ -38,18 +38,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Object"]
 
-_PAST_LIMIT_MAX = 1e-6  # rad or m: what rounding may put a joint past its limit
+_PAST_LIMIT_MAX = 1e-6  # rad or m; tolerates positions that rounding puts past a limit
 
 
 class Object:
-    """One object of one world. Two objects are equal only if they are the same.
+    """One object of one world, compared by identity.
 
     Args:
         name: unique in its world.
-        object_type: what kind of thing it is; ROBOT also makes it `world.robot`.
-        description: URDF text, or the path of a .urdf file; left out, the built-in shape for that name and type.
-        pose: of the root link's frame, in "map"; the origin, if left out. `reset` brings it back there.
-        world: the world it is put into; the entered one of this context, if left out.
+        object_type: the kind of object; the first one of type ROBOT becomes `world.robot`.
+        description: URDF text, or the path of a .urdf file; None means the built-in shape for that name and type.
+        pose: pose of the root link's frame, in "map"; None means the origin. `reset` restores it.
+        world: the world to add it to; None means the current world of this context.
         color: red, green, blue, opacity, 0 to 1.
 
     Raises:
@@ -63,9 +63,9 @@ class Object:
     description_text: str
     robot_description: RobotDescription | None
     body: Body
-    """For the world's own parts only: moving it tells nobody."""
+    """The body in Bullet, for this package only: moving it notifies no observer."""
     copy_of: Object | None
-    """In a copied world: the object of the other world that this one was made from."""
+    """In a copied world, the object of the original world that this one is a copy of."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class Object:
         self.object_type = object_type
         self.world = world
         self.copy_of = None
-        self.original_pose = _accepted(name, pose if pose is not None else Pose())
+        self.original_pose = _check_pose(name, pose if pose is not None else Pose())
         self.description_text = urdf_text(
             name, built_in_urdf(name, object_type) if description is None else description
         )
@@ -99,30 +99,30 @@ class Object:
     def __repr__(self) -> str:
         return f"Object({self.name!r}, {self.object_type.name}, {self.pose!r})"
 
-    # --- where it is ------------------------------------------------------------------------------------------
+    # --- pose and extent --------------------------------------------------------------------------------------
 
     @property
     def pose(self) -> Pose:
-        """The very pose that was set last, or that it was carried to. Costs nothing; also readable later."""
+        """The pose that was set last, or to which the object was carried, unrounded. Readable after removal."""
         return self.body.pose
 
     def set_pose(self, pose: Pose) -> None:
-        """Put the root link's frame there; what is attached comes along.
+        """Move the root link's frame to this pose, together with the objects attached to it.
 
-        An object that is itself attached stays so, at its new place relative to the parent.
+        An object that is attached to a parent stays attached, at its new pose relative to the parent.
 
         Raises:
-            PoseRefused, WorldClosed, ObjectNotInWorld: nothing was moved.
+            PoseRefused, WorldClosed, ObjectNotInWorld: before anything is moved.
         """
         self.check_present()
-        self.body.place(_accepted(self.name, pose))
+        self.body.place(_check_pose(self.name, pose))
         attachments = self.world.attachments
-        if (held := attachments.of(self)) is not None:
-            attachments.put(held.parent, self, held.link)
-        self.world.tell_moved([self, *attachments.carry(self)])
+        if (attachment := attachments.of(self)) is not None:
+            attachments.put(attachment.parent, self, attachment.link)
+        self.world.notify_moved([self, *attachments.carry(self)])
 
     def link_pose(self, link: str | None = None) -> Pose:
-        """Where a link's frame is in "map"; that of the root link, without a name. Raises `UnknownLink`."""
+        """Return the pose of a link's frame in "map"; None means the root link. Raises `UnknownLink`."""
         if link is None or link == self.body.root:
             return self.body.pose
         self._check_link(link)
@@ -131,9 +131,9 @@ class Object:
         return Pose(position, orientation)
 
     def link_pose_at(self, link: str, positions: Mapping[str, float]) -> Pose:
-        """Where a link's frame would be in "map" if these joints (rad or m) stood there; moves nothing.
+        """Return the pose that a link's frame would have in "map" at these joint positions (rad or m).
 
-        Limits are not looked at. Raises `UnknownLink`, `UnknownJoint`.
+        Nothing is moved and limits are not checked. Raises `UnknownLink`, `UnknownJoint`.
         """
         self._check_link(link)
         for joint in positions:
@@ -143,9 +143,9 @@ class Object:
         return Pose(position, orientation)
 
     def bounding_box(self, link: str | None = None) -> BoundingBox:
-        """The box along map's axes around the whole object, or around one link, without margin.
+        """Return the box along the axes of "map" around the whole object or one link, without margin.
 
-        What has no collision shape has a box of size zero where its frame is. Raises `UnknownLink`.
+        Without a collision shape it is a box of size zero at the frame's origin. Raises `UnknownLink`.
         """
         links = self.body.links if link is None else (self._check_link(link),)
         self.check_present()
@@ -155,94 +155,96 @@ class Object:
             return BoundingBox(position, position)
         return box
 
-    # --- its joints -------------------------------------------------------------------------------------------
+    # --- joints -----------------------------------------------------------------------------------------------
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """The joints that can be moved."""
+        """The names of the movable joints."""
         return tuple(self.body.positions)
 
     @property
     def links(self) -> tuple[str, ...]:
-        """All links, the root first."""
+        """The names of all links, the root first."""
         return self.body.links
 
     def joint_position(self, joint: str) -> float:
-        """As it was set last, rad or m. Costs nothing. Raises `UnknownJoint`."""
+        """Return the position that was set last, rad or m. Raises `UnknownJoint`."""
         try:
             return self.body.positions[joint]
         except KeyError:
             raise UnknownJoint(self.name, joint, self.joints) from None
 
     def joint_positions(self) -> dict[str, float]:
-        """All of them, a copy."""
+        """Return the positions of all movable joints by name, rad or m; a copy."""
         return dict(self.body.positions)
 
     def joint_limits(self, joint: str) -> tuple[float, float]:
-        """Lower and upper hard limit, rad or m; infinite for a continuous joint. Raises `UnknownJoint`."""
+        """Return the lower and upper hard limit, rad or m; infinite for a continuous joint. Raises `UnknownJoint`."""
         try:
             return self.body.limits[joint]
         except KeyError:
             raise UnknownJoint(self.name, joint, self.joints) from None
 
     def joint_type(self, joint: str) -> JointType:
-        """How it moves; fixed joints are known here too. Raises `UnknownJoint`."""
+        """Return the type of a joint, also of a fixed one. Raises `UnknownJoint`."""
         try:
             return self.body.joint_types[joint]
         except KeyError:
             raise UnknownJoint(self.name, joint, self.joints) from None
 
     def joints_above(self, link: str | None) -> tuple[str, ...]:
-        """The movable joints between a link and the root, nearest first. Raises `UnknownLink`."""
+        """Return the movable joints between a link and the root, nearest first. Raises `UnknownLink`."""
         return () if link is None else self.body.movable_above[self._check_link(link)]
 
     def set_joint_position(self, joint: str, position: float) -> None:
-        """One joint; see `set_joint_positions`."""
+        """Set one joint; see `set_joint_positions`."""
         self.set_joint_positions({joint: position})
 
     def set_joint_positions(self, positions: Mapping[str, float]) -> None:
-        """Set joints, rad or m, in one motion; what is attached to the links they move comes along.
+        """Set joints, rad or m, in one motion, and carry along the objects attached to the links they move.
+
+        All errors are raised before anything is moved.
 
         Raises:
-            JointLimitExceeded: one is outside its hard limits (by more than 1e-6) or not finite.
-            UnknownJoint, WorldClosed, ObjectNotInWorld: nothing was moved, in all cases.
+            JointLimitExceeded: a position is outside its hard limits (by more than 1e-6) or not finite.
+            UnknownJoint, WorldClosed, ObjectNotInWorld.
         """
         self.check_present()
-        wanted = {joint: float(position) for joint, position in positions.items()}
-        for joint, position in wanted.items():
+        targets = {joint: float(position) for joint, position in positions.items()}
+        for joint, position in targets.items():
             lower, upper = self.joint_limits(joint)
             within = lower - _PAST_LIMIT_MAX <= position <= upper + _PAST_LIMIT_MAX
             if not (within and abs(position) <= COORDINATE_MAX):
                 raise JointLimitExceeded(self.name, joint, position, (lower, upper))
-        if wanted:
-            self.body.turn(wanted)
-            carried = self.world.attachments.carry(self, wanted)
-            self.world.tell_turned(self, wanted)
-            self.world.tell_moved(carried)
+        if targets:
+            self.body.turn(targets)
+            carried = self.world.attachments.carry(self, targets)
+            self.world.notify_joints(self, targets)
+            self.world.notify_moved(carried)
 
-    # --- what it carries --------------------------------------------------------------------------------------
+    # --- attachments ------------------------------------------------------------------------------------------
 
     @property
     def attachments(self) -> dict[Object, str | None]:
-        """What is attached to it, each with the link it moves with (None: the root link)."""
+        """The attached objects, each with the link it moves with (None: the root link)."""
         return {each.child: each.link for each in self.world.attachments.on(self)}
 
     @property
     def attached_to(self) -> Object | None:
-        """What it is attached to."""
-        held = self.world.attachments.of(self)
-        return None if held is None else held.parent
+        """The object that this one is attached to."""
+        attachment = self.world.attachments.of(self)
+        return None if attachment is None else attachment.parent
 
     def attach(self, child: Object, link: str | None = None) -> None:
-        """From now on `child`, where it is, moves with `link` (None: the root link).
+        """Attach `child` at its current pose to `link` (None: the root link), so that it moves with it.
 
         Raises:
-            AttachmentRefused: it is attached already, to this or another object, or it carries this one.
+            AttachmentRefused: the child is attached already, to this or another object, or it carries this one.
             UnknownLink, WorldClosed, ObjectNotInWorld.
         """
         self.check_present()
         if not isinstance(child, Object):
-            raise AttachmentRefused(f"what is attached to {self.name!r} is an Object, not {child!r}")
+            raise AttachmentRefused(f"only an Object can be attached to {self.name!r}, got {child!r}")
         child.check_present()
         if link is not None:
             self._check_link(link)
@@ -251,42 +253,42 @@ class Object:
             observer.object_attached(self, child, link)
 
     def detach(self, child: Object) -> None:
-        """It no longer moves with this object and stays where it is. Raises `AttachmentRefused` if it did not."""
+        """Detach `child`, which keeps its pose. Raises `AttachmentRefused` if it is not attached to this object."""
         self.check_present()
-        ended = self.world.attachments.remove(self, child)
+        attachment = self.world.attachments.remove(self, child)
         for observer in self.world.observers:
-            observer.object_detached(self, child, ended.link)
+            observer.object_detached(self, child, attachment.link)
 
     def detach_all(self) -> None:
-        """Detach all it carries, and itself from what it hangs on."""
+        """Detach all children, and the object itself from its parent."""
         for child in self.attachments:
             self.detach(child)
         if (parent := self.attached_to) is not None:
             parent.detach(self)
 
-    # --- beginning again, and the end -------------------------------------------------------------------------
+    # --- reset and removal ------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Detached from everything, joints 0, at its original pose; what is so already is neither touched nor told."""
+        """Detach the object, set its joints to 0, and move it to its original pose; notify of differences only."""
         self.check_present()
         self.detach_all()
-        turned = {joint: 0.0 for joint, position in self.body.positions.items() if position != 0.0}
-        if turned:
-            self.body.turn(turned)
+        joints = {joint: 0.0 for joint, position in self.body.positions.items() if position != 0.0}
+        if joints:
+            self.body.turn(joints)
         moved = self.body.pose != self.original_pose
         if moved:
             self.body.place(self.original_pose)
-        if turned:
-            self.world.tell_turned(self, turned)
+        if joints:
+            self.world.notify_joints(self, joints)
         if moved:
-            self.world.tell_moved([self])
+            self.world.notify_moved([self])
 
     def remove(self) -> None:
-        """Take it out of the world, detached first; its last pose and joints can still be read."""
+        """Detach the object and remove it from the world; its last pose and joints can still be read."""
         self.world.remove(self)
 
     def check_present(self) -> None:
-        """Raise `WorldClosed` or, once it is removed, `ObjectNotInWorld`: then it can only be read."""
+        """Raise `WorldClosed` if the world is closed, `ObjectNotInWorld` if the object was removed."""
         _ = self.world.client
         if not self.world.has(self):
             raise ObjectNotInWorld(self.name, tuple(present.name for present in self.world.objects))
@@ -298,19 +300,19 @@ class Object:
 
 
 def _check_identity(name: object, object_type: object) -> None:
-    """Raise `ObjectRefused`. What is written down of an object begins with these two."""
+    """Raise `ObjectRefused` unless both have the right type; every record of an object holds them."""
     if not isinstance(name, str):
-        raise ObjectRefused(f"the name of an object is a str, not {name!r}")
+        raise ObjectRefused(f"an object's name must be a str, got {name!r}")
     if not isinstance(object_type, ObjectType):
-        raise ObjectRefused(f"the type of object {name!r} is one of ObjectType, not {object_type!r}")
+        raise ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
 
 
-def _accepted(name: str, pose: Pose) -> Pose:
-    """The same pose, if the thing of that name can be put there."""
+def _check_pose(name: str, pose: Pose) -> Pose:
+    """Return the pose. Raises `PoseRefused` if the object cannot be moved to it."""
     if not isinstance(pose, Pose):
-        raise PoseRefused(name, pose, "it is no Pose")
+        raise PoseRefused(name, pose, "it is not a Pose")
     if pose.frame != "map":
-        raise PoseRefused(name, pose, f"it is given in {pose.frame!r}: transform it into 'map' first")
+        raise PoseRefused(name, pose, f"its frame is {pose.frame!r}: transform it to 'map' first")
     if not all(abs(value) <= COORDINATE_MAX for value in (*pose.position, *pose.orientation)):
-        raise PoseRefused(name, pose, f"its numbers must be finite, and none larger than {COORDINATE_MAX:g}")
+        raise PoseRefused(name, pose, f"its numbers must be finite and at most {COORDINATE_MAX:g}")
     return pose

@@ -1,7 +1,22 @@
-"""Who may look at a world: observers of one world's changes, and watchers that learn which worlds are entered.
+"""Protocols for observing worlds: observers of one world's changes, and watchers of worlds that are entered.
 
-The world knows nothing of those who look. `current_world` is the world of the innermost `with BulletWorld()` of this
-task; `watcher` is told when a world is entered and left in its context.
+Theory of operation
+-------------------
+
+Two context variables connect the world to its users, so that the world package imports none of them. `current_world`
+is the world of the innermost `with BulletWorld()` of the current task; a world entered with `BulletWorld.connect` is
+visible in every context of the process that has none of its own. `watcher` is the `WorldWatcher` of the current
+context; the memory's hooks set one.
+
+A world reads `watcher` once, when it is entered, calls its `world_entered`, and keeps it, so that the same watcher
+gets `world_left` even if the context has another one by then. If `world_entered` raises, the world closes and the
+exception reaches the caller: a watcher can refuse a world. Copies of a world are entered without a watcher.
+
+A world calls its observers in the order in which they were added, synchronously in the thread that changed the world,
+and only after the motion is complete, when all poses and joints, also those of carried objects, are set. A world
+belongs to one thread at a time, so its calls do not overlap, and observers need no lock of their own for it. The tuple
+of observers is replaced and never mutated, so an observer may add or remove observers while it is called. Trials that
+are undone, for example of inverse kinematics or collision queries, go to `Body` directly and notify no observer.
 """
 
 from __future__ import annotations
@@ -19,46 +34,45 @@ __all__ = ["WorldObserver", "WorldWatcher", "current_world", "watcher"]
 
 
 class WorldObserver(Protocol):
-    """Told of every change the world's own setters make, once per motion, after it is complete.
+    """Receives every change made by the world's setters, once per motion, after the motion is complete.
 
-    Never of trials (inverse kinematics, saved states tried out). Called in the thread that made the change. What an
-    observer raises reaches that caller, so it must not raise.
+    The world calls it in the thread that made the change. It must not raise: an exception would reach that caller.
     """
 
     def object_added(self, added: Object) -> None:
-        """It is in the world, with pose and joints."""
+        """Called after an object was added, with its pose and joints set."""
         ...
 
     def object_removed(self, removed: Object) -> None:
-        """It was taken out; its last pose can still be read."""
+        """Called after an object was removed; its last pose can still be read."""
         ...
 
     def object_moved(self, moved: Object) -> None:
-        """Its pose is new: it was set, or it was carried by what it is attached to."""
+        """Called after an object's pose was set, or changed because its parent carried it."""
         ...
 
     def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
-        """These joints (by name, rad or m) were set by one motion."""
+        """Called after one motion set these joints (by name, rad or m)."""
         ...
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        """From now on `child` moves with `link` of `parent` (None: its base)."""
+        """Called after `child` was attached to `link` of `parent` (None: its root link)."""
         ...
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        """It no longer does."""
+        """Called after `child` was detached from `link` of `parent`."""
         ...
 
 
 class WorldWatcher(Protocol):
-    """Learns of worlds that are entered in its context."""
+    """Receives the worlds that are entered and left in its context."""
 
     def world_entered(self, world: BulletWorld) -> None:
-        """`with BulletWorld()` begins. What it raises refuses the entering."""
+        """Called when `with BulletWorld()` begins; an exception closes the world and reaches the caller."""
         ...
 
     def world_left(self, world: BulletWorld) -> None:
-        """It is over; its objects are still readable."""
+        """Called when the world is left, before it closes; its objects are still readable."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""A pose is a frozen value: position in metres, unit quaternion xyzw, the frame both are in, and when it was made.
+"""A pose is a frozen value: position in metres, unit quaternion xyzw, the frame of both, and the time of creation.
 
 >>> Pose([1.3, 0.7, 0.95]).position.z
 0.95
@@ -31,7 +31,7 @@ __all__ = [
 
 
 class Vector(NamedTuple):
-    """Metres."""
+    """A position or direction, metres."""
 
     x: float
     y: float
@@ -39,7 +39,7 @@ class Vector(NamedTuple):
 
 
 class Quaternion(NamedTuple):
-    """A rotation; unit length inside a `Pose`."""
+    """A rotation as quaternion; unit length inside a `Pose`."""
 
     x: float
     y: float
@@ -50,11 +50,11 @@ class Quaternion(NamedTuple):
 IDENTITY = Quaternion(0.0, 0.0, 0.0, 1.0)
 
 COORDINATE_MAX = 1e9
-"""Metres, or rad: nothing is set to more, either way. So no sum of what is set is ever infinite."""
+"""Bounds the absolute value of coordinates (m) and joint positions (rad or m), so that no sum of them is infinite."""
 
 
 def product(a: Sequence[float], b: Sequence[float]) -> Quaternion:
-    """Hamilton product a ⊗ b of two xyzw quaternions: first b, then a."""
+    """Return the Hamilton product a ⊗ b of two xyzw quaternions: the rotation b followed by a."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return Quaternion(
@@ -66,7 +66,7 @@ def product(a: Sequence[float], b: Sequence[float]) -> Quaternion:
 
 
 def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
-    """The vector v turned by the unit quaternion q."""
+    """Rotate the vector v by the unit quaternion q."""
     qx, qy, qz, qw = q
     x, y, z = v
     tx, ty, tz = 2 * (qy * z - qz * y), 2 * (qz * x - qx * z), 2 * (qx * y - qy * x)
@@ -78,27 +78,27 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
 
 def yaw_quaternion(angle: float) -> Quaternion:
-    """A turn by `angle` rad about z."""
+    """Return the rotation by `angle` rad about z."""
     return Quaternion(0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
 
 
 class MalformedPose(CallerError, ValueError):
-    """A pose was made of something else than numbers, a frame's name and whole nanoseconds."""
+    """The arguments of a pose are not numbers, a frame's name and whole nanoseconds."""
 
 
 @dataclass(frozen=True, slots=True, init=False, repr=False)
 class Pose:
-    """Where something is and how it is turned. Equality leaves the time out.
+    """A position and an orientation in a frame. Equality ignores the time.
 
     Args:
         position: x, y, z in metres.
         orientation: quaternion x, y, z, w of any length but zero; stored with length one.
-        frame: name of the frame both are given in.
-        time_ns: UTC in ns since 1970; now, if left out.
+        frame: name of the frame of both.
+        time_ns: UTC in ns since 1970; None means now.
 
     Raises:
-        MalformedPose: a wrong number of components, or no numbers; a quaternion of length zero; a frame that is no
-            str; a time that is no whole number of 64 bits. It is a ValueError too.
+        MalformedPose: a wrong number of components, components that are not numbers, a quaternion of length zero, a
+            frame that is not a str, or a time that is not an integer of 64 bits. It is a ValueError too.
     """
 
     position: Vector
@@ -118,12 +118,12 @@ class Pose:
             x, y, z = position
             put(self, "position", Vector(float(x), float(y), float(z)))
         except (TypeError, ValueError, OverflowError):
-            raise MalformedPose(f"a position is three numbers x, y, z in metres, not {position!r}") from None
+            raise MalformedPose(f"a position needs three numbers x, y, z in metres, got {position!r}") from None
         try:
             qx, qy, qz, qw = orientation
             length = math.hypot(qx, qy, qz, qw)
         except (TypeError, ValueError, OverflowError):
-            raise MalformedPose(f"an orientation is four numbers x, y, z, w, not {orientation!r}") from None
+            raise MalformedPose(f"an orientation needs four numbers x, y, z, w, got {orientation!r}") from None
         if length == 0:
             raise MalformedPose("an orientation needs a quaternion of length other than zero")
         unit = abs(length - 1.0) < 1e-15
@@ -134,7 +134,7 @@ class Pose:
             Quaternion(float(qx * scale), float(qy * scale), float(qz * scale), float(qw * scale)),
         )
         if not isinstance(frame, str):
-            raise MalformedPose(f"a pose's frame is a name, not {frame!r}")
+            raise MalformedPose(f"a pose's frame must be a str, got {frame!r}")
         put(self, "frame", frame)
         put(self, "time_ns", SYSTEM_CLOCK.wall_ns() if time_ns is None else _nanoseconds(time_ns))
 
@@ -142,24 +142,24 @@ class Pose:
         return f"Pose(position={list(self.position)}, orientation={list(self.orientation)}, frame={self.frame!r})"
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """The pose that `inner`, given relative to this one, has in this one's frame."""
+        """Convert `inner`, a pose relative to this one, to this pose's frame."""
         moved = rotated(self.orientation, inner.position)
         x, y, z = self.position
         return Pose((x + moved.x, y + moved.y, z + moved.z), product(self.orientation, inner.orientation), self.frame)
 
     def inverse(self) -> Pose:
-        """The pose P for which `self @ P` is the identity."""
+        """Return the pose P for which `self @ P` is the identity."""
         x, y, z, w = self.orientation
         back = Quaternion(-x, -y, -z, w)
         moved = rotated(back, self.position)
         return Pose((-moved.x, -moved.y, -moved.z), back, self.frame)
 
     def relative_to(self, other: Pose) -> Pose:
-        """This pose as seen from `other`; both in the same frame."""
+        """Return this pose relative to `other`; both must be in the same frame."""
         return other.inverse() @ self
 
     def distance(self, other: Pose) -> float:
-        """Metres between the two positions."""
+        """Return the distance between the two positions, m."""
         return math.dist(self.position, other.position)
 
     @property
@@ -170,13 +170,13 @@ class Pose:
 
 
 def _nanoseconds(time: object) -> int:
-    """A whole number that the log can hold; what it could not, it would refuse with the whole episode."""
+    """Check that the time fits the log's 64 bits; the log would refuse the whole episode for a larger one."""
     try:
-        whole = operator.index(time)  # type: ignore[arg-type]  # asking is the check
+        whole = operator.index(time)  # type: ignore[arg-type]  # the call is the check
     except TypeError:
         whole = _NS_END
     if not -_NS_END <= whole < _NS_END:
-        raise MalformedPose(f"a pose's time is a whole number of ns since 1970, not {time!r}")
+        raise MalformedPose(f"a pose's time must be a whole number of ns since 1970 below 2**63, got {time!r}")
     return whole
 
 

@@ -1,6 +1,6 @@
-"""How a world was, as a value: poses, joint positions and attachments of its objects by name, and the way back to it.
+"""Save the state of a world as a frozen value and restore it: poses, joint positions and attachments by object name.
 
-Not Bullet's own saving of states, which costs ten times as much and knows no attachments.
+Bullet's own saving of states is not used: it costs ten times as much and does not include attachments.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["WorldState", "ObjectState", "saved", "restore"]
+__all__ = ["WorldState", "ObjectState", "save", "restore"]
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectState:
-    """One object: where it was, how its joints were, and what it hung on (parent's name, link), if on anything."""
+    """The state of one object: pose, joint positions (rad or m), and parent's name and link if it was attached."""
 
     pose: Pose
     joints: Mapping[str, float]
@@ -32,76 +32,77 @@ class ObjectState:
 
 @dataclass(frozen=True, slots=True)
 class WorldState:
-    """All objects by name. Stays valid whatever happens to the world."""
+    """The states of all objects by name; later changes of the world do not affect it."""
 
     objects: Mapping[str, ObjectState]
 
 
 class _Differences(NamedTuple):
-    turned: list[tuple[Object, dict[str, float]]]
-    moved: list[Object]
+    joints: list[tuple[Object, dict[str, float]]]
+    poses: list[Object]
 
 
-def saved(world: BulletWorld) -> WorldState:
-    """How the world is now."""
-    held = {each.child: (each.parent.name, each.link) for each in world.attachments}
+def save(world: BulletWorld) -> WorldState:
+    """Return the current state of the world."""
+    parents = {each.child: (each.parent.name, each.link) for each in world.attachments}
     return WorldState(
         MappingProxyType(
             {
-                thing.name: ObjectState(thing.pose, MappingProxyType(thing.joint_positions()), held.get(thing))
-                for thing in world.objects
+                obj.name: ObjectState(obj.pose, MappingProxyType(obj.joint_positions()), parents.get(obj))
+                for obj in world.objects
             }
         )
     )
 
 
 def restore(world: BulletWorld, state: WorldState) -> None:
-    """Make the objects of `state` as they were; tells what differed, after all of it is done.
+    """Restore the objects of `state`; observers get the changes after all poses and joints are set.
 
-    An object that was added since stays where it is, and is detached from the others. Raises `ObjectNotInWorld` if
-    one of the state's objects is gone, `UnknownJoint` if another one has its name now, `PoseRefused` and
-    `JointLimitExceeded` if a state that was made by hand holds what is not finite; then nothing was touched.
+    An object that was added since keeps its pose and is detached from the restored ones. Raises `ObjectNotInWorld` if
+    an object of the state was removed, `UnknownJoint` if its name now belongs to an object without that joint,
+    `PoseRefused` and `JointLimitExceeded` if a hand-made state has numbers that are not finite. These are raised
+    before anything is changed.
     """
-    then = {world.object(name): was for name, was in state.objects.items()}
-    for thing, was in then.items():
-        _check(thing, was)
+    states = {world.object(name): object_state for name, object_state in state.objects.items()}
+    for obj, object_state in states.items():
+        _check(obj, object_state)
     for each in world.attachments:
-        if each.child in then or each.parent in then:
-            wanted = then[each.child].attached_to if each.child in then else None
-            if wanted != (each.parent.name, each.link):
+        if each.child in states or each.parent in states:
+            attached_to = states[each.child].attached_to if each.child in states else None
+            if attached_to != (each.parent.name, each.link):
                 each.parent.detach(each.child)
-    differences = _apply(then)
-    for thing, joints in differences.turned:
-        world.tell_turned(thing, joints)
-    world.tell_moved(differences.moved)
-    for child, was in then.items():
-        if was.attached_to is not None:
-            parent, link = world.object(was.attached_to[0]), was.attached_to[1]
+    differences = _apply(states)
+    for obj, joints in differences.joints:
+        world.notify_joints(obj, joints)
+    world.notify_moved(differences.poses)
+    for child, object_state in states.items():
+        if object_state.attached_to is not None:
+            parent, link = world.object(object_state.attached_to[0]), object_state.attached_to[1]
             if child.attached_to is parent:
                 world.attachments.put(parent, child, link)
             else:
                 parent.attach(child, link)
 
 
-def _check(thing: Object, was: ObjectState) -> None:
-    """Raise if the object cannot be so."""
-    if not all(map(math.isfinite, (*was.pose.position, *was.pose.orientation))):
-        raise PoseRefused(thing.name, was.pose, "its numbers must be finite")
-    for joint, position in was.joints.items():
-        limits = thing.joint_limits(joint)
+def _check(obj: Object, object_state: ObjectState) -> None:
+    """Raise if the object cannot take this state."""
+    if not all(map(math.isfinite, (*object_state.pose.position, *object_state.pose.orientation))):
+        raise PoseRefused(obj.name, object_state.pose, "its numbers must be finite")
+    for joint, position in object_state.joints.items():
+        limits = obj.joint_limits(joint)
         if not math.isfinite(position):
-            raise JointLimitExceeded(thing.name, joint, position, limits)
+            raise JointLimitExceeded(obj.name, joint, position, limits)
 
 
-def _apply(then: Mapping[Object, ObjectState]) -> _Differences:
+def _apply(states: Mapping[Object, ObjectState]) -> _Differences:
     differences = _Differences([], [])
-    for thing, was in then.items():
-        now = thing.body.positions
-        joints = {joint: value for joint, value in was.joints.items() if now[joint] != value}
+    for obj, object_state in states.items():
+        positions = obj.body.positions
+        joints = {joint: value for joint, value in object_state.joints.items() if positions[joint] != value}
         if joints:
-            thing.body.turn(joints)
-            differences.turned.append((thing, joints))
-        if thing.pose != was.pose:
-            thing.body.place(was.pose)
-            differences.moved.append(thing)
+            obj.body.turn(joints)
+            differences.joints.append((obj, joints))
+        if obj.pose != object_state.pose:
+            obj.body.place(object_state.pose)
+            differences.poses.append(obj)
     return differences

@@ -1,8 +1,8 @@
-"""What must hold of a URDF before Bullet sees it, because Bullet dies of some faults instead of naming them.
+"""Check a URDF before Bullet loads it, because some faults crash Bullet instead of raising an error.
 
-Two roots or two joints of one name end the process inside Bullet; a mesh that is missing is named by Bullet only on
-stdout; an origin that is not finite puts links nowhere. So the tree of links, the names, the mesh files and the origins
-are checked here; the rest is left to Bullet.
+Two roots or two joints of one name end the process inside Bullet. Bullet reports a missing mesh only on stdout. An
+origin that is not finite gives links poses that are not finite. This module checks the tree of links, the names, the
+mesh files and the origins; Bullet checks the rest.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ __all__ = ["urdf_text"]
 
 
 def urdf_text(name: str, description: str | Path) -> str:
-    """The URDF as text with every mesh as an absolute path, checked.
+    """Read and check a URDF and return its text with the absolute path of every mesh.
 
     Args:
-        name: of the object it is for; only for the message.
-        description: URDF text (it begins with "<"), or the path of a .urdf file. `package://x/y` is looked for as
-            `x/y` in the folders above the file; other relative names start at the file's folder.
+        name: the object's name, used in the error message only.
+        description: URDF text (it begins with "<"), or the path of a .urdf file. `package://x/y` is searched as `x/y`
+            in the folders above the file; other relative names start at the file's folder.
 
     Raises:
-        DescriptionNotLoadable: with the reason.
+        DescriptionNotLoadable: the URDF has a fault, which the message names.
     """
     if isinstance(description, str) and description.lstrip().startswith("<"):
         text, folder = description, Path.cwd()
@@ -42,31 +42,31 @@ def urdf_text(name: str, description: str | Path) -> str:
         _check(robot)
         meshes = list(robot.iter("mesh"))
         for mesh in meshes:
-            mesh.set("filename", str(_found(mesh.get("filename", ""), folder)))
+            mesh.set("filename", str(_find_mesh(mesh.get("filename", ""), folder)))
     except (ParseError, _Fault) as fault:
         raise DescriptionNotLoadable(name, str(fault)) from fault
     return tostring(robot, encoding="unicode") if meshes else text
 
 
 class _Fault(Exception):
-    """What is wrong; never seen outside, where it becomes a `DescriptionNotLoadable`."""
+    """A fault of a URDF; `urdf_text` converts it to a `DescriptionNotLoadable`."""
 
 
-def _found(reference: str, folder: Path) -> Path:
-    """Where a mesh file is; raises `_Fault` if it is nowhere."""
+def _find_mesh(reference: str, folder: Path) -> Path:
+    """Return the path of a mesh file. Raises `_Fault` if it does not exist."""
     if reference.startswith("package://"):
         relative = reference.removeprefix("package://")
-        places = [above / relative for above in (folder, *folder.parents)]
+        candidates = [above / relative for above in (folder, *folder.parents)]
     else:
-        places = [folder / reference.removeprefix("file://")]
-    for place in places:
-        if place.is_file():
-            return place
-    raise _Fault(f"mesh {reference} is not at {' nor at '.join(map(str, places[:3]))}")
+        candidates = [folder / reference.removeprefix("file://")]
+    for candidate in candidates:
+        if candidate.is_file():
+            return candidate
+    raise _Fault(f"mesh {reference} is not at {' nor at '.join(map(str, candidates[:3]))}")
 
 
 def _check(robot: Element) -> None:
-    """One tree of uniquely named links under <robot>."""
+    """Raise `_Fault` unless <robot> holds one tree of links, unique names and finite origins."""
     if robot.tag != "robot":
         raise _Fault(f"its root element is <{robot.tag}>, not <robot>")
     links = [link.get("name", "") for link in robot.findall("link")]
@@ -80,13 +80,13 @@ def _check(robot: Element) -> None:
         parent, child = _end(joint, "parent"), _end(joint, "child")
         for end in (parent, child):
             if end not in links:
-                raise _Fault(f"joint {joint.get('name')!r} names a link {end!r} that is not there")
+                raise _Fault(f"joint {joint.get('name')!r} names a link {end!r} that does not exist")
         if child in above:
             raise _Fault(f"link {child!r} has two parents")
         above[child] = parent
     roots = [link for link in links if link not in above]
     if len(roots) != 1:
-        raise _Fault(f"it must have one root link, and has {len(roots)}: {', '.join(roots) or 'a circle'}")
+        raise _Fault(f"it must have one root link, and has {len(roots)}: {', '.join(roots) or 'a cycle'}")
     for link in links:
         _climb(link, above)
     for element in robot.iter():
@@ -98,7 +98,7 @@ def _check(robot: Element) -> None:
 
 
 def _numbers(element: Element) -> Iterator[float]:
-    """What is given of places and directions; words that are no numbers are Bullet's affair."""
+    """Yield the numbers of the element's origin; Bullet checks words that are not numbers."""
     for word in f"{element.get('xyz', '')} {element.get('rpy', '')}".split():
         try:
             yield float(word)
@@ -111,7 +111,7 @@ def _climb(link: str, above: dict[str, str]) -> None:
     while link in above:
         link = above[link]
         if link in passed:
-            raise _Fault(f"links are joined in a circle at {link!r}")
+            raise _Fault(f"links are joined in a cycle at {link!r}")
         passed.add(link)
 
 
@@ -124,5 +124,5 @@ def _unique(kind: str, names: Iterable[str]) -> None:
 
 
 def _end(joint: Element, end: str) -> str:
-    found = joint.find(end)
-    return "" if found is None else found.get("link", "")
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")

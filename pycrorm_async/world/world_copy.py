@@ -1,4 +1,4 @@
-"""A second world like the first, to try things out in: what is done there is done to nothing else.
+"""Copy a world, so that a plan can act in the copy without changing the original.
 
 >>> with BulletWorld() as world:
 ...     milk = Object("milk", ObjectType.MILK)
@@ -23,56 +23,57 @@ __all__ = ["copied", "counterpart", "original", "related"]
 
 @contextmanager
 def copied(world: BulletWorld) -> Iterator[BulletWorld]:
-    """A copy of the world as it is now, without a window; `current_world` of this context inside, closed afterwards.
+    """Copy the world as it is now, without a window, and enter the copy; it closes with the context.
 
-    Every object is there with its name, type, description, poses, joints and attachments, exactly, but for its colour.
-    Copying is quiet: neither the watcher nor the observers of either world are told, until somebody observes the copy.
-    A copy can be copied. The PR2 in its kitchen takes some 25 ms.
+    Inside the context the copy is `current_world`. Each object is copied exactly, with name, type, description, poses,
+    joints and attachments; only its colour is not. Copying calls neither the watcher nor the observers of either world;
+    the copy starts without observers. A copy can be copied. Copying the PR2 in its kitchen takes about 25 ms.
 
     Raises:
-        WorldClosed: the world was left. WorldUnavailable: Bullet opens no further one.
+        WorldClosed: the world is closed. WorldUnavailable: Bullet cannot open another world.
     """
     _ = world.client
     with BulletWorld(WorldMode.DIRECT, copy_of=world) as copy:
-        twins = {thing: _twin(thing, copy) for thing in world.objects}
+        copies = {obj: _copy_object(obj, copy) for obj in world.objects}
         for each in world.attachments:
-            copy.attachments.keep(Attachment(twins[each.parent], twins[each.child], each.link, each.relative))
+            copy.attachments.keep(Attachment(copies[each.parent], copies[each.child], each.link, each.relative))
         yield copy
 
 
-def counterpart(thing: Object, world: BulletWorld) -> Object | None:
-    """What stands for the object in that world: itself, its copy, or what it is a copy of, however often copied.
+def counterpart(obj: Object, world: BulletWorld) -> Object | None:
+    """Return the object that corresponds to `obj` in `world`: itself, a copy of it, or the object it is a copy of.
 
-    None if there is nothing: it was removed there, or added only elsewhere, or the worlds have nothing in common.
+    Copies of copies count too. None if that object was removed, if `obj` was added after the copy was made, or if the
+    worlds are not related.
     """
-    if thing.world is world:
-        return thing if world.has(thing) else None
-    first = _first(thing)
+    if obj.world is world:
+        return obj if world.has(obj) else None
+    first = _first(obj)
     return next((each for each in world.objects if _first(each) is first), None)
 
 
 def related(one: BulletWorld, other: BulletWorld) -> bool:
-    """Whether they are the same world, or copies of the same one."""
+    """Return whether both are the same world, or copies of the same one."""
     return original(one) is original(other)
 
 
 def original(world: BulletWorld) -> BulletWorld:
-    """The world that is no copy: this one, or what it is a copy of, however often copied."""
+    """Return the world at the root of a chain of copies; a world that is not a copy is its own root."""
     while world.copy_of is not None:
         world = world.copy_of
     return world
 
 
-def _twin(thing: Object, copy: BulletWorld) -> Object:
-    twin = Object(thing.name, thing.object_type, thing.description_text, thing.original_pose, world=copy)
-    twin.copy_of = thing
-    twin.robot_description = thing.robot_description
-    twin.body.place(thing.pose)
-    twin.body.turn(thing.joint_positions())
-    return twin
+def _copy_object(obj: Object, copy: BulletWorld) -> Object:
+    object_copy = Object(obj.name, obj.object_type, obj.description_text, obj.original_pose, world=copy)
+    object_copy.copy_of = obj
+    object_copy.robot_description = obj.robot_description
+    object_copy.body.place(obj.pose)
+    object_copy.body.turn(obj.joint_positions())
+    return object_copy
 
 
-def _first(thing: Object) -> Object:
-    while thing.copy_of is not None:
-        thing = thing.copy_of
-    return thing
+def _first(obj: Object) -> Object:
+    while obj.copy_of is not None:
+        obj = obj.copy_of
+    return obj

@@ -180,7 +180,7 @@ def test_a_plan_with_what_cannot_be_recorded_runs_to_its_end_with_a_warning(
 
 def test_a_plan_with_nan_in_a_pose_fails_with_a_memory_as_it_does_without(folder: Path) -> None:
     done = pycrorm("run", "plans.py:nan_in_a_pose", cwd=folder)
-    assert "the plan plans.py:nan_in_a_pose failed: PoseRefused: 'pr2' cannot be put at Pose" in done.stderr
+    assert "the plan plans.py:nan_in_a_pose failed: PoseRefused: 'pr2' cannot be moved to Pose" in done.stderr
     assert "NavigateAction.target_location is recorded as missing" in done.stderr
     assert (done.returncode, "Traceback" in done.stderr) == (1, False)
     assert answer("show", "last", cwd=folder)["episode"]["status"] == "ERROR"

@@ -329,7 +329,7 @@ MISTAKES: dict[str, tuple[Callable[[Lab], Awaitable[object]], str, str]] = {
     "a pose in another frame": (
         lambda _: NavigateActionPerformable(Pose([1, 0, 0], frame="table")).perform(),
         "PoseRefused",
-        "'pr2' cannot be put at",
+        "'pr2' cannot be moved to",
     ),
     "a grasp that is none": (
         lambda scene: resolved(PickUpAction(scene.milk, [Arms.LEFT], ["front"])),  # type: ignore[list-item]  # the fault here

@@ -170,11 +170,11 @@ def test_a_refusal_says_which_limit_stands_against_it() -> None:
         return refused.value.reason
 
     at_the_shoulder = Pose([-0.05 + 0.1 + 0.18, 0.188, 0.79])
-    assert reason(at_the_shoulder) == ("too near: from shoulder to wrist 0.200 m or less, where the arm needs 0.359 m")
+    assert reason(at_the_shoulder) == ("too near: from shoulder to wrist 0.200 m or less, but the arm needs 0.359 m")
     behind = Pose([-0.05 + 0.97 * math.cos(-2), 0.188 + 0.97 * math.sin(-2), 0.79], yaw_quaternion(-2))
-    assert reason(behind).startswith("its wrist would come there only with l_shoulder_pan_joint outside its ")
+    assert reason(behind).startswith("its wrist would reach the target only with l_shoulder_pan_joint outside its ")
     from_above = Pose([0.6, 0.2, 0.9], GRASP_ORIENTATIONS[Grasp.TOP])
-    assert reason(from_above).startswith("the posture that comes nearest has l_")
+    assert reason(from_above).startswith("the best posture has l_")
     assert "outside its soft limits" in reason(from_above)
 
 

@@ -190,7 +190,7 @@ def test_objects_are_found_by_name_and_in_order(world: BulletWorld, witness: Wit
     assert world.objects == (bowl, robot)
     assert world.object("bowl") is bowl
     assert world.robot is robot
-    with pytest.raises(ObjectNotInWorld, match="'spoon' is not in the world; there are: bowl, mover"):
+    with pytest.raises(ObjectNotInWorld, match="'spoon' is not in the world; its objects are: bowl, mover"):
         world.object("spoon")
     assert world.description == "BulletWorld (DIRECT): bowl (BOWL), mover (ROBOT)"
     world.remove(robot)
@@ -325,7 +325,7 @@ def test_a_state_made_by_hand_that_is_not_finite_is_refused_and_nothing_moves(
     witness.told.clear()
     with pytest.raises(PoseRefused, match="'cup'"):
         world.restore_state(WorldState({"crane": elsewhere, "cup": nowhere}))
-    with pytest.raises(JointLimitExceeded, match="'crane': turning cannot be inf"):
+    with pytest.raises(JointLimitExceeded, match="'crane': turning cannot be set to inf"):
         world.restore_state(WorldState({"cup": dataclasses.replace(cup_now, pose=THERE), "crane": turned}))
     assert witness.told == []
     assert world.save_state().objects["crane"] == crane_now

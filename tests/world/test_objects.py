@@ -158,7 +158,7 @@ def test_a_joint_outside_its_limits_is_refused_and_nothing_moves(
 def test_a_joint_without_limits_is_refused_in_words_that_make_sense(world: BulletWorld) -> None:
     with pytest.raises(JointLimitExceeded) as refused:
         crane().set_joint_position("turning", math.inf)
-    assert str(refused.value) == "'crane': turning cannot be inf; its limits are -1e+09 to 1e+09"
+    assert str(refused.value) == "'crane': turning cannot be set to inf; its limits are -1e+09 to 1e+09"
 
 
 def test_rounding_past_a_limit_is_let_through_and_never_clamped(world: BulletWorld) -> None:
@@ -187,7 +187,7 @@ def test_unknown_names_are_refused_with_those_that_exist(world: BulletWorld) -> 
     [
         (Pose([0, 0, math.nan]), "finite"),
         (Pose([math.inf, -math.inf, 0]), "finite"),
-        (Pose([0, 0, -1.1e9]), "none larger than 1e+09"),
+        (Pose([0, 0, -1.1e9]), "at most 1e+09"),
         (Pose([0, 0, 0], [0, math.nan, 0, 1]), "finite"),
         (Pose([0, 0, 0], [math.inf, 0, 0, 1]), "finite"),
         (Pose([1, 2, 3], frame="pr2/base_link"), "'pr2/base_link'"),
@@ -203,9 +203,9 @@ def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(
         thing.set_pose(pose)
     assert refused.value.object_name == "crane"
     assert refused.value.pose is pose
-    assert str(refused.value).startswith(f"'crane' cannot be put at {pose!r}: ")
+    assert str(refused.value).startswith(f"'crane' cannot be moved to {pose!r}: ")
     assert (thing.pose, milk.pose) == (LEANING, Pose())
-    with pytest.raises(PoseRefused, match=r"'crane' cannot be put at \[1, 2, 3\]: it is no Pose"):
+    with pytest.raises(PoseRefused, match=r"'crane' cannot be moved to \[1, 2, 3\]: it is not a Pose"):
         thing.set_pose([1, 2, 3])  # type: ignore[arg-type]  # the fault this test is about
     with pytest.raises(PoseRefused, match="'cup'"):
         Object("cup", ObjectType.JEROEN_CUP, pose=pose)
@@ -225,10 +225,10 @@ def test_what_is_carried_from_the_farthest_place_there_is_stays_finite(world: Bu
 @pytest.mark.parametrize(
     ("name", "object_type", "words"),
     [
-        (None, ObjectType.MILK, "the name of an object is a str, not None"),
-        (b"milk", ObjectType.MILK, "the name of an object is a str, not b'milk'"),
-        ("milk", "MILK", "the type of object 'milk' is one of ObjectType, not 'MILK'"),
-        ("milk", 3, "the type of object 'milk' is one of ObjectType, not 3"),
+        (None, ObjectType.MILK, "an object's name must be a str, got None"),
+        (b"milk", ObjectType.MILK, "an object's name must be a str, got b'milk'"),
+        ("milk", "MILK", "the type of object 'milk' must be an ObjectType, got 'MILK'"),
+        ("milk", 3, "the type of object 'milk' must be an ObjectType, got 3"),
     ],
 )
 def test_an_object_has_a_name_and_a_type(

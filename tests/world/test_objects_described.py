@@ -80,10 +80,10 @@ FAULTS = {
     "another element": ("<foo/>", "its root element is <foo>"),
     "no link": ('<robot name="a"/>', "it has no link"),
     "two roots": ('<robot name="a"><link name="l"/><link name="m"/></robot>', "one root link, and has 2: l, m"),
-    "a circle": (two_joints("j l m", "k m l"), "joined in a circle"),
+    "a circle": (two_joints("j l m", "k m l"), "joined in a cycle"),
     "two joints of one name": (two_joints("j r m", "j r l"), "2 joints are named 'j'"),
     "two parents": (two_joints("j r m", "k l m"), "'m' has two parents"),
-    "a joint to nowhere": (two_joints("j r m", "k r z"), "names a link 'z' that is not there"),
+    "a joint to nowhere": (two_joints("j r m", "k r z"), "names a link 'z' that does not exist"),
     "a link without a name": ('<robot name="a"><link/></robot>', "a link has no name"),
     "a mesh that is missing": (with_mesh("package://parts/none.stl"), "mesh package://parts/none.stl is not at"),
     "a joint without limits": (

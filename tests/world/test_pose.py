@@ -28,18 +28,18 @@ def test_no_quaternion_at_all_is_refused() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"position": [0, 0]}, r"three numbers x, y, z in metres, not \[0, 0\]"),
-        ({"position": None}, "three numbers x, y, z in metres, not None"),
+        ({"position": [0, 0]}, r"three numbers x, y, z in metres, got \[0, 0\]"),
+        ({"position": None}, "three numbers x, y, z in metres, got None"),
         ({"position": ["a", "b", "c"]}, "three numbers x, y, z in metres"),
         ({"position": [0, 0, 10**400]}, "three numbers x, y, z in metres"),
-        ({"position": Pose()}, "three numbers x, y, z in metres, not Pose"),
-        ({"orientation": [0, 0, 1]}, r"four numbers x, y, z, w, not \[0, 0, 1\]"),
-        ({"orientation": "none"}, "four numbers x, y, z, w, not 'none'"),
-        ({"frame": None}, "a pose's frame is a name, not None"),
-        ({"frame": 3}, "a pose's frame is a name, not 3"),
+        ({"position": Pose()}, "three numbers x, y, z in metres, got Pose"),
+        ({"orientation": [0, 0, 1]}, r"four numbers x, y, z, w, got \[0, 0, 1\]"),
+        ({"orientation": "none"}, "four numbers x, y, z, w, got 'none'"),
+        ({"frame": None}, "a pose's frame must be a str, got None"),
+        ({"frame": 3}, "a pose's frame must be a str, got 3"),
         ({"time_ns": 1.5e18}, "whole number of ns since 1970"),
-        ({"time_ns": "now"}, "whole number of ns since 1970, not 'now'"),
-        ({"time_ns": 2**63}, "whole number of ns since 1970, not 9223372036854775808"),
+        ({"time_ns": "now"}, "whole number of ns since 1970 below 2..63, got 'now'"),
+        ({"time_ns": 2**63}, "whole number of ns since 1970 below 2..63, got 9223372036854775808"),
     ],
 )
 def test_what_is_no_pose_is_refused_in_a_line_that_says_what_is_wrong(arguments: dict[str, Any], said: str) -> None:

@@ -1,1 +1,1 @@
-"""Built-in models: primitives, a kitchen, a robot."""
+"""Built-in models as URDF text: primitive shapes, a kitchen, a PR2."""

@@ -1,14 +1,14 @@
-"""The built-in kitchen: a counter with a sink area, an island, drawers that slide and a fridge whose door turns.
+"""Generate the built-in kitchen: a counter with a sink area, an island, sliding drawers and a fridge with a door.
 
-Seen from the origin, where the robot starts (x ahead, y to the left, metres):
+Layout as seen from the origin, where the robot starts (x ahead, y to the left, metres):
 
     ahead, front at x 1.05, 0.6 deep    fridge y -1.25..-0.60 | counter -0.55..0.85, top 0.848 | sink area 0.85..1.75,
                                         top 0.812; a wall behind all three
     behind, front at x -1.10, 0.7 deep  island y 0.20..1.80, top 0.900
 
-The thesis' cereal (1.3, 0.7, 0.95) and milk (1.3, 1, 0.9) stand on the counter and in the sink area. Surfaces have
-their frame in the middle of the top face, handles in their own middle with x pointing into the furniture, so that a
-gripper that comes from the front has the handle's orientation. A drawer or door at 0 is closed.
+The thesis' cereal (1.3, 0.7, 0.95) and milk (1.3, 1, 0.9) are on the counter and in the sink area. A surface's frame is
+in the middle of its top face; a handle's frame is in its middle with x pointing into the furniture, so that a gripper
+approaching from the front has the handle's orientation. A drawer or door at joint position 0 is closed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class _Block(NamedTuple):
 
 
 def kitchen_urdf() -> str:
-    """The kitchen as URDF text, the same every time."""
+    """Return the kitchen as URDF text; deterministic."""
     parts = [
         f'<link name="kitchen">{INERTIA}</link>',
         *_part("kitchen_wall", "kitchen", (1.65, 0.0, 0.0), [_Block((0.0, 0.1), (-1.25, 1.75), (0.0, 2.2), _PALE)]),
@@ -56,7 +56,7 @@ def kitchen_urdf() -> str:
 
 
 def _cupboard(name: str, *, x: tuple[float, float], y: tuple[float, float], top: float) -> Iterable[str]:
-    """A closed body up to the worktop, and the worktop as `<name>_surface`."""
+    """Yield a closed body up to the worktop, and the worktop as `<name>_surface`."""
     half = ((x[1] - x[0]) / 2, (y[1] - y[0]) / 2)
     middle = ((x[0] + x[1]) / 2, (y[0] + y[1]) / 2)
     sides = (-half[0], half[0]), (-half[1], half[1])
@@ -71,7 +71,7 @@ def _tap() -> Iterable[str]:
 
 
 def _drawer(name: str, *, front: tuple[float, float], turn: float, z: tuple[float, float]) -> Iterable[str]:
-    """An open box 0.6 wide and 0.45 deep that slides out of the front by `<name>_joint`, and `<name>_handle`."""
+    """Yield an open box 0.6 m wide and 0.45 m deep that `<name>_joint` slides out of the front, and `<name>_handle`."""
     height, side = z[1] - z[0], 0.30
     inner = (_PANEL_M, 0.45)
     blocks = [
@@ -88,7 +88,7 @@ def _drawer(name: str, *, front: tuple[float, float], turn: float, z: tuple[floa
 
 
 def _fridge() -> Iterable[str]:
-    """A hollow body open to the front, a shelf, and a door that is hinged on the right."""
+    """Yield a hollow body open to the front, a shelf, and a door hinged on the right."""
     wall, width, depth, height = 0.03, 0.65, 0.60, 1.60
     across, deep = (0.0, width), (0.0, depth)
     blocks = [
@@ -108,7 +108,7 @@ def _fridge() -> Iterable[str]:
 
 
 def _part(name: str, parent: str, at: tuple[float, float, float], blocks: Iterable[_Block]) -> Iterable[str]:
-    """A link that is fixed to its parent."""
+    """Yield a link and the joint that fixes it to its parent."""
     yield _link(name, blocks)
     yield _joint(name, parent, "fixed", at, 0.0)
 
@@ -132,7 +132,7 @@ def _joint(
     axis: tuple[int, int, int] | None = None,
     travel: float = 0.0,
 ) -> str:
-    """`<link>_joint`, at that place of the parent and turned about z; a moving one goes from 0 to `travel`."""
+    """Return `<link>_joint` at that position of the parent, rotated about z; it moves from 0 to `travel` if it can."""
     motion = ""
     if axis is not None:
         motion = f'<axis xyz="{numbers(axis)}"/><limit lower="0" upper="{travel}" effort="100" velocity="1"/>'

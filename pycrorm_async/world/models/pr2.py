@@ -1,11 +1,11 @@
-"""The PR2 as a model Bullet can load: from boxes made here (`pr2_urdf`), or from meshes (`pr2_mesh_urdf_path`).
+"""Provide the PR2 as a model for Bullet: generated from boxes (`pr2_urdf`), or from meshes (`pr2_mesh_urdf_path`).
 
-Both have the same root, links, joints and measures as far as plans go. The built-in one needs no file and loads in
-milliseconds; the mesh one comes with the optional package example-robot-data and stops earlier at two joints (wrist
-flex -2.094, torso 0.31).
+Both have the same root, links, joints and dimensions as far as plans use them. The generated one needs no file and
+loads in milliseconds; the mesh model is in the optional package example-robot-data and has narrower limits of two
+joints (wrist flex -2.094 rad, torso 0.31 m).
 
-The root link `base_footprint` lies on the floor. The mass of every link sits in its origin, so that Bullet's frames are
-the model's. Shapes are about as large as the robot's: meant for bounding boxes, rays and pictures.
+The root link `base_footprint` is on the floor. The mass of every link is in its origin, so that Bullet's frames are the
+model's. The shapes are about as large as the robot's: precise enough for bounding boxes, rays and pictures.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _MESH_MODEL = "cmeel.prefix/share/example-robot-data/robots/pr2_description/urdf
 
 
 def pr2_urdf() -> str:
-    """A PR2 of boxes as URDF text, with the real one's names and measures and no file beside it.
+    """Return a PR2 of boxes as URDF text, with the names and dimensions of the real one; it refers to no other file.
 
-    Hard limits are in it; the rolls of forearm and wrist are continuous.
+    It declares the hard limits; the rolls of forearm and wrist are continuous.
     """
     robot = Element("robot", name=PR2.name)
     _link(robot, "base_footprint")
@@ -51,14 +51,14 @@ def pr2_urdf() -> str:
     _head(robot)
     for arm in PR2.arms.values():
         _arm(robot, arm)
-    indent(robot)  # Bullet cannot read a long file in one line
+    indent(robot)  # Bullet cannot read a long file that has a single line
     return tostring(robot, encoding="unicode")
 
 
 def pr2_mesh_urdf_path() -> Path:
-    """Where the optional package example-robot-data keeps the PR2's mesh model.
+    """Return the path of the PR2's mesh model in the optional package example-robot-data.
 
-    Bullet finds its meshes from there without a search path. Loading prints warnings about frames without a mass.
+    Its meshes are located relative to that path. Bullet warns about frames without a mass when it loads the model.
 
     Raises:
         MissingExtra: the package, or the model in it, is not installed.
@@ -67,15 +67,15 @@ def pr2_mesh_urdf_path() -> Path:
         path = Path(str(distribution("example-robot-data").locate_file(_MESH_MODEL)))
     except PackageNotFoundError:
         raise MissingExtra(
-            "the PR2's mesh model is not installed: pip install 'pycrorm-async[pr2]'; the built-in model needs nothing"
+            "the PR2's mesh model is not installed: pip install 'pycrorm-async[pr2]', or use the built-in model"
         ) from None
     if not path.is_file():
-        raise MissingExtra(f"example-robot-data has no PR2 at {path}: pip install 'pycrorm-async[pr2]'")
+        raise MissingExtra(f"example-robot-data contains no PR2 at {path}: pip install 'pycrorm-async[pr2]'")
     return path
 
 
 def _head(robot: Element) -> None:
-    """Pan and tilt, and the stereo camera on top: 1.27 m above the floor at torso height 0."""
+    """Add pan, tilt and the stereo camera on top, which is 1.27 m above the floor at torso height 0."""
     _moving(
         robot,
         PR2.head_pan_joint,
@@ -110,13 +110,13 @@ def _head(robot: Element) -> None:
         "wide_stereo_link",
         PR2.camera_link,
         (0, 0, 0),
-        turned=_OPTICAL,
+        rotation=_OPTICAL,
     )
     _link(robot, PR2.camera_link)
 
 
 def _arm(robot: Element, arm: ArmDescription) -> None:
-    """Seven joints from the torso to the wrist, then the gripper."""
+    """Add the seven joints from the torso to the wrist, and the gripper."""
     prefix = arm.tool_frame[0]
     pan, lift, roll, elbow, forearm_roll, wrist, wrist_roll = (
         joint.removesuffix("_joint") + "_link" for joint in arm.joints
@@ -125,35 +125,35 @@ def _arm(robot: Element, arm: ArmDescription) -> None:
     to_lift, to_elbow, to_wrist = (
         (length, 0.0, 0.0) for length in (arm.shoulder_offset_m, arm.upper_arm_m, arm.forearm_m)
     )
-    here = (0.0, 0.0, 0.0)
-    chain = (  # parent, child, where the joint sits in the parent, axis
+    origin_of_parent = (0.0, 0.0, 0.0)
+    chain = (  # parent, child, origin of the joint in the parent, axis
         ("torso_lift_link", pan, arm.shoulder, _Z),
         (pan, lift, to_lift, _Y),
-        (lift, roll, here, _X),
+        (lift, roll, origin_of_parent, _X),
         (upper_arm, elbow, to_elbow, _Y),
-        (elbow, forearm_roll, here, _X),
+        (elbow, forearm_roll, origin_of_parent, _X),
         (forearm, wrist, to_wrist, _Y),
-        (wrist, wrist_roll, here, _X),
+        (wrist, wrist_roll, origin_of_parent, _X),
     )
     for joint, (parent, child, origin, axis) in zip(arm.joints, chain, strict=True):
         _moving(robot, joint, parent, child, origin, axis, arm.hard_limits[joint])
-    _fixed(robot, f"{prefix}_upper_arm_joint", roll, upper_arm, here)
-    _fixed(robot, f"{prefix}_forearm_joint", forearm_roll, forearm, here)
+    _fixed(robot, f"{prefix}_upper_arm_joint", roll, upper_arm, origin_of_parent)
+    _fixed(robot, f"{prefix}_forearm_joint", forearm_roll, forearm, origin_of_parent)
 
     _link(robot, pan, (0.2, 0.2, 0.5), (0.02, 0, -0.2), _WHITE)
-    _link(robot, lift, (0.22, 0.16, 0.22), here, _GREY)
+    _link(robot, lift, (0.22, 0.16, 0.22), origin_of_parent, _GREY)
     _link(robot, roll)
     _link(robot, upper_arm, (0.3, 0.14, 0.14), (0.22, 0, 0), _WHITE)
-    _link(robot, elbow, (0.14, 0.1, 0.14), here, _GREY)
+    _link(robot, elbow, (0.14, 0.1, 0.14), origin_of_parent, _GREY)
     _link(robot, forearm_roll)
     _link(robot, forearm, (0.22, 0.11, 0.11), (0.18, 0, 0), _WHITE)
-    _link(robot, wrist, (0.07, 0.05, 0.08), here, _GREY)
+    _link(robot, wrist, (0.07, 0.05, 0.08), origin_of_parent, _GREY)
     _link(robot, wrist_roll)
     _gripper(robot, arm, prefix, wrist_roll)
 
 
 def _gripper(robot: Element, arm: ArmDescription, prefix: str, wrist_roll: str) -> None:
-    """Palm, two fingers that swing outwards, and the tool frame between their tips."""
+    """Add the palm, two fingers that swing outwards, and the tool frame between their tips."""
     palm = f"{prefix}_gripper_palm_link"
     _fixed(robot, f"{prefix}_gripper_palm_joint", wrist_roll, palm, (0, 0, 0))
     _link(robot, palm, (0.1, 0.1, 0.05), (0.07, 0, 0), _DARK)
@@ -174,7 +174,7 @@ def _gripper(robot: Element, arm: ArmDescription, prefix: str, wrist_roll: str) 
         _link(robot, link, (0.12, 0.02, 0.03), (0.06, side * 0.005, 0), _GREY)
 
 
-# --- the four shapes of element a URDF is made of ---------------------------------------------------------------
+# --- elements of a URDF -----------------------------------------------------------------------------------------
 
 
 def _link(
@@ -184,7 +184,7 @@ def _link(
     centre: Sequence[float] = (0, 0, 0),
     rgba: str = _GREY,
 ) -> None:
-    """A box around `centre`, or, without a size, a frame."""
+    """Add a link: a box around `centre`, or, without a size, a frame only."""
     link = SubElement(robot, "link", name=name)
     link.append(fromstring(INERTIA))  # noqa: S314  our own text
     if size is None:
@@ -204,9 +204,9 @@ def _fixed(
     child: str,
     origin: Sequence[float],
     *,
-    turned: Sequence[float] = (0, 0, 0),
+    rotation: Sequence[float] = (0, 0, 0),
 ) -> None:
-    _joint(robot, "fixed", name, parent, child, origin, turned)
+    _joint(robot, "fixed", name, parent, child, origin, rotation)
 
 
 def _moving(
@@ -218,7 +218,7 @@ def _moving(
     axis: Sequence[float],
     bounds: Bounds,
 ) -> None:
-    """Continuous where the bounds are infinite, prismatic for the torso, revolute otherwise."""
+    """Add a movable joint: continuous if the bounds are infinite, prismatic for the torso, revolute otherwise."""
     endless = math.isinf(bounds.upper)
     kind = "continuous" if endless else "prismatic" if name == PR2.torso_joint else "revolute"
     joint = _joint(robot, kind, name, parent, child, origin, (0, 0, 0))
@@ -236,11 +236,11 @@ def _joint(
     parent: str,
     child: str,
     origin: Sequence[float],
-    turned: Sequence[float],
+    rotation: Sequence[float],
 ) -> Element:
     joint = SubElement(robot, "joint", name=name, type=kind)
     SubElement(joint, "parent", link=parent)
     SubElement(joint, "child", link=child)
-    # `numbers` rounds to a millionth: no longer a right angle
-    SubElement(joint, "origin", xyz=numbers(origin), rpy=" ".join(map(repr, turned)))
+    # `numbers` rounds to 1e-6, which would turn right angles into other angles: write the rotation in full.
+    SubElement(joint, "origin", xyz=numbers(origin), rpy=" ".join(map(repr, rotation)))
     return joint

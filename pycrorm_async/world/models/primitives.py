@@ -1,7 +1,7 @@
-"""The built-in shapes: URDF text made here, so that nothing is read, downloaded or licensed from elsewhere.
+"""Generate the built-in shapes as URDF text, so that no file has to be read, downloaded or licensed.
 
-Small things are one link, a box or an upright cylinder; their extents are those of the things that the thesis' plans
-handle (metres, around the origin of the thing).
+A small object is one link, a box or an upright cylinder, with the extent of the objects in the thesis' plans (metres,
+around the object's origin).
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from pycrorm_async.world.errors import DescriptionNotLoadable
 __all__ = ["built_in_urdf", "box_urdf", "cylinder_urdf", "shape", "numbers", "INERTIA"]
 
 INERTIA = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-"""Of every link, so that Bullet does not miss one; nothing is ever stepped, so its numbers do not matter."""
+"""The inertia of every link: Bullet warns about links without one. Its values do not matter because the simulation is
+never stepped."""
 
 Range = tuple[float, float]
 WHITE = (1.0, 1.0, 1.0, 1.0)
@@ -35,7 +36,7 @@ class _Cylinder(NamedTuple):
     color: tuple[float, float, float, float]
 
 
-_THINGS: dict[ObjectType, _Box | _Cylinder] = {
+_SHAPES: dict[ObjectType, _Box | _Cylinder] = {
     ObjectType.MILK: _Box((-0.033, 0.033), (-0.033, 0.033), (-0.088, 0.106), (0.3, 0.5, 0.9, 1.0)),
     ObjectType.BREAKFAST_CEREAL: _Box((-0.075, 0.073), (-0.03, 0.028), (-0.102, 0.122), (0.2, 0.7, 0.3, 1.0)),
     ObjectType.SPOON: _Box((-0.108, 0.108), (-0.023, 0.023), (-0.0095, 0.0095), (0.7, 0.7, 0.75, 1.0)),
@@ -49,14 +50,14 @@ _THINGS: dict[ObjectType, _Box | _Cylinder] = {
 
 
 def built_in_urdf(name: str, object_type: ObjectType) -> str:
-    """The description of an object that was given none: by its type; for robots and environments by name.
+    """Return the built-in description of an object: by type, for robots and environments by name.
 
     Raises:
-        DescriptionNotLoadable: there is no robot or environment of that name here.
+        DescriptionNotLoadable: no built-in robot or environment has that name.
     """
     if object_type is ObjectType.ROBOT or object_type is ObjectType.ENVIRONMENT:
         return _by_name(name, object_type)
-    shape = _THINGS[object_type]
+    shape = _SHAPES[object_type]
     if isinstance(shape, _Box):
         return box_urdf(name, x=shape.x, y=shape.y, z=shape.z, color=shape.color)
     return cylinder_urdf(name, radius=shape.radius, z=shape.z, color=shape.color)
@@ -74,24 +75,24 @@ def _by_name(name: str, object_type: ObjectType) -> str:
     raise DescriptionNotLoadable(
         name,
         f"no {object_type.name} of that name is built in ('pr2' is the robot, 'kitchen' the environment); "
-        "give a description: URDF text or the path of a .urdf file",
+        "pass a description: URDF text or the path of a .urdf file",
     )
 
 
 def box_urdf(name: str, *, x: Range, y: Range, z: Range, color: Sequence[float] = WHITE) -> str:
-    """A thing of one link: the box between these bounds, metres."""
+    """Return an object of one link: the box between these bounds, m."""
     size, middle = zip(*((high - low, (low + high) / 2) for low, high in (x, y, z)), strict=True)
     return _one_link(name, f'<box size="{numbers(size)}"/>', middle, color)
 
 
 def cylinder_urdf(name: str, *, radius: float, z: Range, color: Sequence[float] = WHITE) -> str:
-    """A thing of one link: the upright cylinder around its z axis between these heights, metres."""
+    """Return an object of one link: the upright cylinder around its z axis between these heights, m."""
     geometry = f'<cylinder radius="{radius:g}" length="{numbers([z[1] - z[0]])}"/>'
     return _one_link(name, geometry, (0.0, 0.0, (z[0] + z[1]) / 2), color)
 
 
 def shape(geometry: str, middle: Sequence[float], color: Sequence[float]) -> str:
-    """A part of a <link>: that geometry around `middle`, seen and touched alike."""
+    """Return the <visual> and <collision> elements of a link: the same geometry around `middle`."""
     origin = f'<origin xyz="{numbers(middle)}"/>'
     return (
         f"<visual>{origin}<geometry>{geometry}</geometry>"
@@ -101,7 +102,7 @@ def shape(geometry: str, middle: Sequence[float], color: Sequence[float]) -> str
 
 
 def numbers(values: Sequence[float]) -> str:
-    """As URDF writes them, to a micrometre, without a minus before zero."""
+    """Format numbers for URDF, rounded to 1e-6, without negative zero."""
     return " ".join(f"{round(value, 6) + 0.0:g}" for value in values)
 
 

@@ -1,1 +1,1 @@
-"""Questions about a world: boxes, contacts, visibility, free space."""
+"""Query a world without changing it: bounding boxes, collisions, visibility, free space."""

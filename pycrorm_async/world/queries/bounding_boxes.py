@@ -1,7 +1,7 @@
-"""What room a thing takes: axis-aligned boxes reckoned from its collision shapes, without Bullet's margin.
+"""Compute axis-aligned bounding boxes from collision shapes, without the margin that Bullet adds to its own.
 
-Bullet's own boxes are a margin too large; these are exact for boxes, spheres, cylinders and capsules, and for meshes
-those of the convex hull that Bullet makes of them.
+They are exact for boxes, spheres, cylinders and capsules; a mesh has the box of the convex hull that Bullet makes of
+it.
 """
 
 from __future__ import annotations
@@ -21,59 +21,60 @@ __all__ = ["BoundingBox", "Frame", "Solid", "solids_of", "box_around", "rotation
 
 Array = NDArray[np.float64]
 Frame = tuple[Vector, Quaternion]
-"""A position and a unit quaternion, where a `Pose` would be too slow to make."""
+"""A position and a unit quaternion, used in inner loops where creating a `Pose` would be too slow."""
 
 
 class BoundingBox(NamedTuple):
-    """The smallest box along the axes of "map" that holds something: its lowest and its highest corner, metres."""
+    """The smallest box along the axes of "map" around a shape: its lowest and its highest corner, m."""
 
     min: Vector
     max: Vector
 
     @property
     def centre(self) -> Vector:
-        """The middle."""
+        """The centre of the box, m."""
         return Vector(*((low + high) / 2 for low, high in zip(self.min, self.max, strict=True)))
 
     @property
     def size(self) -> Vector:
-        """Edge lengths along x, y, z."""
+        """Edge lengths along x, y and z, m."""
         return Vector(*(high - low for low, high in zip(self.min, self.max, strict=True)))
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A convex shape in its link's frame: the hull of `points`, swelled by `radius`.
+    """A convex shape in its link's frame: the hull of `points`, grown by `radius`.
 
-    With an `axis` it swells only across that direction (a cylinder: two points and their discs), else all around.
+    With an `axis` it grows only perpendicular to that direction (a cylinder: two points and their discs), otherwise in
+    all directions.
     """
 
     points: Array
     radius: float = 0.0
     axis: Array | None = None
     is_box: bool = False
-    """Its points are then in the order of `_CORNERS`."""
+    """If True, the points are in the order of `_CORNERS`."""
 
     def box(self, rotation: Array, position: Array) -> tuple[Array, Array]:
-        """Lowest and highest corner where the link's frame is at (rotation matrix, position)."""
+        """Return the lowest and the highest corner for a link's frame at this rotation matrix and position."""
         corners = self.points @ rotation.T + position
-        swell: Array | float = self.radius
+        growth: Array | float = self.radius
         if self.axis is not None:
             along = rotation @ self.axis
-            swell = self.radius * np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
-        return corners.min(axis=0) - swell, corners.max(axis=0) + swell
+            growth = self.radius * np.sqrt(np.clip(1.0 - along * along, 0.0, 1.0))
+        return corners.min(axis=0) - growth, corners.max(axis=0) + growth
 
     @cached_property
     def inner_points(self) -> Array:
-        """Points spread evenly through the shape, none on its surface; at most 128, the same every time."""
+        """Points spread evenly inside the shape, none on its surface; at most 128, deterministic."""
         middle = self.points.mean(axis=0)
         if self.is_box:
             return np.asarray(middle + _GRID @ (self.points[[4, 2, 1]] - self.points[0]) / 2)
         if self.radius:
-            out = _BALL if self.axis is None else _BALL - np.outer(_BALL @ self.axis, self.axis)
+            offsets = _BALL if self.axis is None else _BALL - np.outer(_BALL @ self.axis, self.axis)
             along = _ALONG if len(self.points) > 1 else _ALONG[:1]
             cores = self.points[0] + np.outer(along, self.points[-1] - self.points[0])
-            return np.concatenate([core + self.radius * out for core in cores])
+            return np.concatenate([core + self.radius * offsets for core in cores])
         anchors = self.points[:: max(1, len(self.points) // 15)][:15]
         pairs = itertools.combinations_with_replacement(anchors, 2)
         return np.array([middle + ((first + second) / 2 - middle) * 0.9 for first, second in pairs])
@@ -86,9 +87,9 @@ _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> tuple[Solid, ...]:
-    """The collision shapes of one link, in the link's frame; `inertial` is where in it Bullet's own frame is.
+    """Return the collision shapes of one link in the link's frame; `inertial` is Bullet's frame relative to it.
 
-    To be asked while the body stands where it was loaded.
+    Call it before the body is moved from the pose at which it was loaded.
     """
     shapes = bullet.getCollisionShapeData(body, link, physicsClientId=client)
     rotation, position = rotation_matrix(inertial[1]), np.array(inertial[0])
@@ -96,10 +97,10 @@ def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -
     for index, shape in enumerate(shapes):
         kind, size, centre, turn = shape[2], shape[3], np.array(shape[5]), rotation_matrix(shape[6])
         if kind == bullet.GEOM_MESH:
-            # Bullet gives the vertices of a link's first convex shape only, already turned into its inertial frame
+            # Bullet returns the vertices of a link's first convex shape only, in the link's inertial frame.
             vertices = bullet.getMeshData(body, link, physicsClientId=client)[1] if index == 0 else ()
             if not vertices:
-                return (_as_bullet_has_it(bullet, client, body, link, inertial),)
+                return (_bullet_box(bullet, client, body, link, inertial),)
             solids.append(Solid(np.array(vertices) @ rotation.T + position))
         else:
             solids += _primitive(bullet, kind, size, rotation @ centre + position, rotation @ turn)
@@ -118,8 +119,8 @@ def _primitive(bullet: Any, kind: int, size: Sequence[float], centre: Array, rot
     return []
 
 
-def _as_bullet_has_it(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> Solid:
-    """Bullet's own box around a link, some millimetres too large, for meshes it does not give away."""
+def _bullet_box(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> Solid:
+    """Return Bullet's own box around a link, a few millimetres too large, for meshes without accessible vertices."""
     low, high = bullet.getAABB(body, link, physicsClientId=client)
     if link < 0:
         placed = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
@@ -131,7 +132,7 @@ def _as_bullet_has_it(bullet: Any, client: int, body: int, link: int, inertial: 
 
 
 def box_around(placed: Iterable[tuple[Frame, Iterable[Solid]]]) -> BoundingBox | None:
-    """The box around all the solids, each at its link's frame; None if there are none."""
+    """Return the box around all solids, each at its link's frame; None without solids."""
     corners = [
         corner
         for (position, turn), solids in placed
@@ -145,7 +146,7 @@ def box_around(placed: Iterable[tuple[Frame, Iterable[Solid]]]) -> BoundingBox |
 
 
 def rotation_matrix(turn: Sequence[float]) -> Array:
-    """The 3 by 3 matrix of a unit quaternion xyzw."""
+    """Return the rotation matrix of a unit quaternion xyzw, shape (3, 3)."""
     x, y, z, w = turn
     return np.array(
         [

@@ -1,4 +1,4 @@
-"""What a robot would run into with its joints elsewhere: asked of Bullet, told to nobody."""
+"""Compute the collisions a robot would have at given joint positions, without notifying observers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["touched_at", "TOUCH_M"]
 
 TOUCH_M = 1e-3
-"""Things that reach into each other by less only touch: what stands on a table does."""
+"""Penetrations up to this depth count as contact, not as collision: an object standing on a table has one."""
 
 
 def touched_at(
@@ -24,37 +24,37 @@ def touched_at(
     links: Collection[str],
     carried: Iterable[Object] = (),
 ) -> list[tuple[str, Object]]:
-    """What these links of the robot, and what they carry, would reach into with these joints (rad or m) there.
+    """Return the objects that the links and carried objects would collide with at these joint positions (rad or m).
 
-    Pairs of a link, or the name of what is carried, and the object it meets. Nothing is moved. The floor, the robot
-    itself and what hangs on it do not count.
+    The result holds pairs of a link's name, or a carried object's name, and the object it collides with. The floor, the
+    robot itself and objects attached to it do not count. All joints and poses are restored.
     """
     attached = robot.world.attachments.below(robot)
     others = [each for each in robot.world.objects if each is not robot and each not in attached]
-    found: list[tuple[str, Object]] = []
-    with _as_if(robot, positions, carried):
+    collisions: list[tuple[str, Object]] = []
+    with _moved(robot, positions, carried):
         for other in others:
-            found += [(link, other) for link in links if _overlap(robot, other, robot.body.link_number(link))]
-            found += [(thing.name, other) for thing in carried if _overlap(thing, other)]
-    return found
+            collisions += [(link, other) for link in links if _overlap(robot, other, robot.body.link_number(link))]
+            collisions += [(obj.name, other) for obj in carried if _overlap(obj, other)]
+    return collisions
 
 
 @contextmanager
-def _as_if(robot: Object, positions: Mapping[str, float], carried: Iterable[Object]) -> Iterator[None]:
-    """Bullet has the joints there, and what they carry; afterwards all is where it was."""
+def _moved(robot: Object, positions: Mapping[str, float], carried: Iterable[Object]) -> Iterator[None]:
+    """Move the joints and the carried objects in Bullet, and restore them at the end of the context."""
     body = robot.body
-    before = {joint: body.positions[joint] for joint in positions}
-    held = [(thing, thing.pose, robot.attachments[thing]) for thing in carried]
-    relative = [pose.relative_to(robot.link_pose(link)) for _, pose, link in held]
+    original_positions = {joint: body.positions[joint] for joint in positions}
+    originals = [(obj, obj.pose, robot.attachments[obj]) for obj in carried]
+    relative_poses = [pose.relative_to(robot.link_pose(link)) for _, pose, link in originals]
     try:
         body.turn(positions)
-        for (thing, _, link), seen in zip(held, relative, strict=True):
-            thing.body.place(robot.link_pose(link) @ seen)
+        for (obj, _, link), relative_pose in zip(originals, relative_poses, strict=True):
+            obj.body.place(robot.link_pose(link) @ relative_pose)
         yield
     finally:
-        body.turn(before)
-        for thing, pose, _ in held:
-            thing.body.place(pose)
+        body.turn(original_positions)
+        for obj, pose, _ in originals:
+            obj.body.place(pose)
 
 
 def _overlap(one: Object, other: Object, link: int | None = None) -> bool:

@@ -1,4 +1,4 @@
-"""Where is a good place: square grids of values in [0, 1] over the floor or a surface, to be multiplied and asked.
+"""Costmaps rate positions on the floor or on a surface: square grids of values in [0, 1] that can be multiplied.
 
 >>> ground = Pose([1.3, 0.7, 0.0])
 >>> places = OccupancyCostmap(world, ground) * GaussianCostmap(ground)
@@ -6,8 +6,9 @@
 True
 
 `map[i, j]` is the cell whose middle is i + 0.5 - size/2 cells along x and j + 0.5 - size/2 along y from the origin. The
-grid lies along the axes of "map", however the origin is turned. The same world gives the same map. Obstacles are the
-boxes around links, so the maps err on the side of the obstacle. As in the thesis' system, cells are 2 cm by default.
+grid is aligned with the axes of "map" whatever the origin's orientation. Maps are deterministic. Obstacles are the
+boxes around links, so a map may mark free cells as occupied but not the reverse. As in the thesis' system, cells are
+2 cm wide by default.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ if TYPE_CHECKING:
 __all__ = ["Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"]
 
 Map = NDArray[np.float64]
-_TALLEST_M = 2.0  # what begins above this is over every robot's head
+_TALLEST_M = 2.0  # boxes that begin above this height are above every robot
 _ROUNDING = 1e-9
 
 
 class Costmap:
-    """A square of values; 0 is out of the question, 1 is best.
+    """A square grid of values; 0 excludes a cell, 1 is best.
 
     Attributes:
-        map: (size, size) values in [0, 1], read-only.
-        origin: the middle of the square; its height and its orientation are those of the poses given.
-        resolution_m: the edge of a cell.
+        map: values in [0, 1], shape (size, size), read-only.
+        origin: the middle of the square; poses from `best` have its height and orientation.
+        resolution_m: the edge length of a cell, m.
     """
 
     def __init__(self, values: Map, origin: Pose, *, resolution_m: float) -> None:
@@ -51,19 +52,19 @@ class Costmap:
 
     @property
     def size_cells(self) -> int:
-        """Cells along an edge."""
+        """Number of cells along an edge."""
         return len(self.map)
 
     def __mul__(self, other: Costmap) -> Costmap:
-        """Cell by cell; raises `CostmapMismatch` unless origin, size and resolution are the same."""
+        """Multiply cell by cell. Raises `CostmapMismatch` unless origin, size and resolution are the same."""
         mine = (self.origin.position, self.size_cells, self.resolution_m)
         theirs = (other.origin.position, other.size_cells, other.resolution_m)
         if mine != theirs:
-            raise CostmapMismatch(f"maps at {mine} and {theirs} (origin, cells, metres a cell) do not fit")
+            raise CostmapMismatch(f"cannot multiply costmaps {mine} and {theirs} (origin, cells, m per cell)")
         return Costmap(self.map * other.map, self.origin, resolution_m=self.resolution_m)
 
     def value_at(self, x: float, y: float) -> float:
-        """The value of the cell in which the point lies; 0 outside the square."""
+        """Return the value of the cell that contains the point; 0 outside the square."""
         middle = self.origin.position
         row = math.floor((x - middle.x) / self.resolution_m + self.size_cells / 2)
         column = math.floor((y - middle.y) / self.resolution_m + self.size_cells / 2)
@@ -72,9 +73,9 @@ class Costmap:
         return float(self.map[row, column])
 
     def best(self, count_max: int) -> list[Pose]:
-        """The middles of the best cells, the highest value first, those of value 0 never.
+        """Return the middles of the best cells, the highest value first; cells of value 0 are left out.
 
-        Cells of one value come by their distance from the origin, then by x, then by y.
+        Cells of equal value are ordered by their distance from the origin, then by x, then by y.
         """
         values = self.map.ravel()
         steps = _steps(self.size_cells)
@@ -96,8 +97,8 @@ class Costmap:
 class OccupancyCostmap(Costmap):
     """1 where the floor is free, 0 where a link's box, grown sideways by the distance, covers the cell's middle.
 
-    What begins above 2 m or does not rise above the floor is no obstacle. Left out, `ignore` is the robot and what it
-    carries; `also` are boxes to stay clear of although nothing is there now.
+    A box that begins above 2 m, or does not rise above the floor, is not an obstacle. `ignore` defaults to the robot
+    and the objects it carries; `also` holds additional boxes, for example of an open door.
     """
 
     def __init__(
@@ -112,14 +113,14 @@ class OccupancyCostmap(Costmap):
         also: Iterable[BoundingBox] = (),
     ) -> None:
         values = np.ones((size_cells, size_cells))
-        for box in (*_obstacles(world, ignore), *filter(_in_the_way, also)):
+        for box in (*_obstacles(world, ignore), *filter(_is_obstacle, also)):
             cells = _cells(box, origin, size_cells, resolution_m, grown_m=distance_to_obstacle_m)
             values[cells] = 0.0
         super().__init__(values, origin, resolution_m=resolution_m)
 
 
 class GaussianCostmap(Costmap):
-    """Falls off from 1 at the origin with the distance, as a normal density of that width does."""
+    """1 at the origin, decreasing with the distance like a normal density of width `sigma_cells`."""
 
     def __init__(
         self, origin: Pose, *, sigma_cells: float = 15.0, size_cells: int = 200, resolution_m: float = 0.02
@@ -129,10 +130,10 @@ class GaussianCostmap(Costmap):
 
 
 class VisibilityCostmap(Costmap):
-    """From which share of the heights between two limits the middle of the target can be seen above each cell.
+    """The share of five evenly spaced camera heights above each cell from which the target's middle is visible.
 
-    Five heights, evenly spaced. What is in the way are the boxes around the links of all objects but the target and
-    those in `ignore` (left out: the robot and what it carries). The origin, left out, is on the floor below the target.
+    Obstacles are the boxes around the links of all objects except the target and those in `ignore`, which defaults to
+    the robot and the objects it carries. The origin defaults to the point on the floor below the target.
     """
 
     def __init__(
@@ -147,25 +148,25 @@ class VisibilityCostmap(Costmap):
         resolution_m: float = 0.02,
         ignore: Iterable[Object] | None = None,
     ) -> None:
-        seen = target.bounding_box().centre if isinstance(target, Object) else target.position
-        origin = origin if origin is not None else Pose((seen.x, seen.y, 0.0))
-        ignored = _or_robot(world, ignore) | ({target} if isinstance(target, Object) else set())
+        target_point = target.bounding_box().centre if isinstance(target, Object) else target.position
+        origin = origin if origin is not None else Pose((target_point.x, target_point.y, 0.0))
+        ignored = _ignored_objects(world, ignore) | ({target} if isinstance(target, Object) else set())
         boxes = list(_obstacles(world, ignored))
         x = origin.position.x + _steps(size_cells)[:, None] * resolution_m
         y = origin.position.y + _steps(size_cells)[None, :] * resolution_m
         heights = np.linspace(min_height_m, max_height_m, 5)
-        free = [~_hidden(x, y, float(height), seen, boxes) for height in heights]
-        super().__init__(np.mean(free, axis=0), origin, resolution_m=resolution_m)
+        visible = [~_hidden(x, y, float(height), target_point, boxes) for height in heights]
+        super().__init__(np.mean(visible, axis=0), origin, resolution_m=resolution_m)
 
 
 class SemanticCostmap(Costmap):
-    """1 on top of a link's box, 0 beside it; the origin is the middle of the top, so poses lie on the surface.
+    """1 on top of a link's box, 0 outside it; the origin is the middle of the top, so poses lie on the surface.
 
-    As large as the surface's longer side.
+    The square's edge is the longer side of the surface.
     """
 
-    def __init__(self, thing: Object, link: str, *, resolution_m: float = 0.02) -> None:
-        box = thing.bounding_box(link)
+    def __init__(self, obj: Object, link: str, *, resolution_m: float = 0.02) -> None:
+        box = obj.bounding_box(link)
         origin = Pose((box.centre.x, box.centre.y, box.max.z))
         size_cells = max(1, math.ceil(max(box.size.x, box.size.y) / resolution_m - _ROUNDING))
         values = np.zeros((size_cells, size_cells))
@@ -174,14 +175,14 @@ class SemanticCostmap(Costmap):
 
 
 def _steps(size_cells: int) -> Map:
-    """How many cells the middles of the cells are from the origin, along one axis."""
+    """Return the distances of the cells' middles from the origin along one axis, in cells."""
     return np.arange(size_cells, dtype=np.float64) + (0.5 - size_cells / 2)
 
 
 def _cells(
     box: BoundingBox, origin: Pose, size_cells: int, resolution_m: float, *, grown_m: float = 0.0
 ) -> tuple[slice, slice]:
-    """The cells whose middles lie in the box, or on its edge, seen from above."""
+    """Return the cells whose middles lie inside the box or on its edge, viewed from above."""
     slices = []
     for low, high, middle in zip(box.min[:2], box.max[:2], origin.position[:2], strict=True):
         first = (low - grown_m - middle) / resolution_m + size_cells / 2 - 0.5
@@ -191,38 +192,38 @@ def _cells(
 
 
 def _obstacles(world: BulletWorld, ignore: Iterable[Object] | None) -> Iterator[BoundingBox]:
-    """The boxes of the links that stand on the floor or hang below 2 m."""
-    ignored = _or_robot(world, ignore)
-    for thing in world.objects:
-        if thing not in ignored:
-            for link in thing.links:
-                box = thing.bounding_box(link)
-                if _in_the_way(box):
+    """Yield the boxes of all links that are obstacles."""
+    ignored = _ignored_objects(world, ignore)
+    for obj in world.objects:
+        if obj not in ignored:
+            for link in obj.links:
+                box = obj.bounding_box(link)
+                if _is_obstacle(box):
                     yield box
 
 
-def _in_the_way(box: BoundingBox) -> bool:
+def _is_obstacle(box: BoundingBox) -> bool:
     return any(box.size) and box.max.z > 0.0 and box.min.z < _TALLEST_M
 
 
-def _or_robot(world: BulletWorld, ignore: Iterable[Object] | None) -> set[Object]:
+def _ignored_objects(world: BulletWorld, ignore: Iterable[Object] | None) -> set[Object]:
     if ignore is not None:
         return set(ignore)
     robot = world.robot
     return set() if robot is None else {robot, *world.attachments.below(robot)}
 
 
-def _hidden(x: Map, y: Map, height: float, seen: Vector, boxes: Iterable[BoundingBox]) -> NDArray[np.bool_]:
-    """For every cell whether a box is met on the straight way from (x, y, height) to the point to be seen."""
+def _hidden(x: Map, y: Map, height: float, target: Vector, boxes: Iterable[BoundingBox]) -> NDArray[np.bool_]:
+    """Return for every cell whether a box intersects the segment from (x, y, height) to the target."""
     hidden = np.zeros(np.broadcast_shapes(x.shape, y.shape), dtype=bool)
     with np.errstate(divide="ignore", invalid="ignore"):
         for box in boxes:
             enter, leave = np.zeros(1), np.ones(1)
             eye = (x, y, np.full(1, height))
-            for start, end, low, high in zip(eye, seen, box.min, box.max, strict=True):
+            for start, end, low, high in zip(eye, target, box.min, box.max, strict=True):
                 way = end - start
                 to_low, to_high = (low - start) / way, (high - start) / way
-                # a way along the faces gives 0/0: it is inside exactly when the start is
+                # A segment parallel to the faces gives 0/0: it is between them exactly if its start is.
                 inside = (start > low) & (start < high)
                 near = np.where(way == 0, np.where(inside, -np.inf, np.inf), np.minimum(to_low, to_high))
                 far = np.where(way == 0, np.where(inside, np.inf, -np.inf), np.maximum(to_low, to_high))

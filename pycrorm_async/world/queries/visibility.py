@@ -1,4 +1,4 @@
-"""What is seen from where: rays cast through Bullet's world."""
+"""Compute visibility by casting rays through Bullet's world."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["first_met", "met_towards", "visible_share"]
 
-_RAYS_AT_ONCE = 16_000  # Bullet takes 16,384
+_RAYS_AT_ONCE = 16_000  # Bullet accepts at most 16,384 rays per call
 
 
 def first_met(
@@ -28,66 +28,66 @@ def first_met(
     *,
     ignore: AbstractSet[Object],
 ) -> list[Object | None]:
-    """For every ray the first object it meets, as `BulletWorld.ray_test` promises."""
+    """Return the first object on every ray, see `BulletWorld.ray_test`."""
     if len(starts) != len(ends):
-        raise ValueError(f"{len(starts)} starts and {len(ends)} ends are no rays")
-    by_number = {thing.body.number: thing for thing in world.objects}
-    with _looked_through(world, ignore):
+        raise ValueError(f"every ray needs a start and an end, got {len(starts)} starts and {len(ends)} ends")
+    by_number = {obj.body.number: obj for obj in world.objects}
+    with _transparent(world, ignore):
         return [by_number.get(number) for number in _hits(world.client, starts, ends)]
 
 
 @contextmanager
-def _looked_through(world: BulletWorld, ignore: AbstractSet[Object]) -> Iterator[None]:
-    """Inside, rays pass through these objects.
+def _transparent(world: BulletWorld, ignore: AbstractSet[Object]) -> Iterator[None]:
+    """Let rays pass through these objects inside the context, by removing them from all of Bullet's collision groups.
 
-    They are taken out of all of Bullet's groups. To begin a ray anew behind each surface it meets does not do: Bullet
-    may let a ray that begins just inside a shape meet it at once, again and again.
+    Casting a new ray from behind each hit would not work: Bullet may let a ray that starts just inside a shape hit the
+    same shape again and again.
     """
-    through = [thing for thing in ignore if world.has(thing)]
+    transparent = [obj for obj in ignore if world.has(obj)]
     try:
-        for thing in through:
-            _group(thing, 0)
+        for obj in transparent:
+            _group(obj, 0)
         yield
     finally:
-        for thing in through:
-            _group(thing, 1)
+        for obj in transparent:
+            _group(obj, 1)
 
 
-def _group(thing: Object, group: int) -> None:
-    for link in range(-1, len(thing.body.links) - 1):
-        engine().setCollisionFilterGroupMask(thing.body.number, link, group, -1, physicsClientId=thing.body.client)
+def _group(obj: Object, group: int) -> None:
+    for link in range(-1, len(obj.body.links) - 1):
+        engine().setCollisionFilterGroupMask(obj.body.number, link, group, -1, physicsClientId=obj.body.client)
 
 
-def visible_share(world: BulletWorld, thing: Object, eye: Sequence[float], *, ignore: AbstractSet[Object]) -> float:
-    """The share of rays into the object's shapes that reach it, as `BulletWorld.visible` promises."""
-    met = met_towards(world, thing, eye, ignore=ignore)
-    return sum(found is thing for found in met) / len(met) if met else 0.0
+def visible_share(world: BulletWorld, obj: Object, eye: Sequence[float], *, ignore: AbstractSet[Object]) -> float:
+    """Return the share of rays into the object's shapes that reach it, see `BulletWorld.visible`."""
+    hits = met_towards(world, obj, eye, ignore=ignore)
+    return sum(hit is obj for hit in hits) / len(hits) if hits else 0.0
 
 
 def met_towards(
-    world: BulletWorld, thing: Object, eye: Sequence[float], *, ignore: AbstractSet[Object]
+    world: BulletWorld, obj: Object, eye: Sequence[float], *, ignore: AbstractSet[Object]
 ) -> list[Object | None]:
-    """What each ray from the eye into the object's shapes meets first: the object itself, or what hides it.
+    """Return the first object on each ray from the eye into the object's shapes: the object itself or an occluder.
 
-    None for the floor. Empty for an object without shapes.
+    None stands for the floor. The list is empty for an object without shapes.
     """
-    thing.check_present()
-    points = [point for link, solids in thing.body.solids.items() if solids for point in _placed(thing, link)]
-    return first_met(world, [eye] * len(points), points, ignore=ignore - {thing}) if points else []
+    obj.check_present()
+    points = [point for link, solids in obj.body.solids.items() if solids for point in _inner_points(obj, link)]
+    return first_met(world, [eye] * len(points), points, ignore=ignore - {obj}) if points else []
 
 
-def _placed(thing: Object, link: str) -> list[list[float]]:
-    """The inner points of a link's shapes, in "map"."""
-    position, turn = thing.body.link_frame(link)
-    inner = np.concatenate([solid.inner_points for solid in thing.body.solids[link]])
+def _inner_points(obj: Object, link: str) -> list[list[float]]:
+    """Return the inner points of a link's shapes in "map", m."""
+    position, turn = obj.body.link_frame(link)
+    inner = np.concatenate([solid.inner_points for solid in obj.body.solids[link]])
     placed: list[list[float]] = (inner @ rotation_matrix(turn).T + np.array(position)).tolist()
     return placed
 
 
 def _hits(client: int, starts: Sequence[Sequence[float]], ends: Sequence[Sequence[float]]) -> list[int]:
-    """For every ray the number of the body it meets first."""
-    found: list[int] = []
+    """Return Bullet's number of the first body on every ray."""
+    numbers: list[int] = []
     for begin in range(0, len(starts), _RAYS_AT_ONCE):
         chunk = slice(begin, begin + _RAYS_AT_ONCE)
-        found += [hit[0] for hit in engine().rayTestBatch(starts[chunk], ends[chunk], physicsClientId=client)]
-    return found
+        numbers += [hit[0] for hit in engine().rayTestBatch(starts[chunk], ends[chunk], physicsClientId=client)]
+    return numbers

@@ -1,1 +1,1 @@
-"""Robots: their description and inverse kinematics."""
+"""Describe robots and solve their inverse kinematics."""

@@ -1,9 +1,10 @@
-"""All postures that bring an arm's tool frame to a target, as a curve over the angle of its first joint.
+"""Compute all postures that bring an arm's tool frame to a target, as a curve over the angle of its first joint.
 
-An arm of seven joints has one more than a pose needs. With the shoulder pan given the rest follows in closed form: the
-distance of the wrist from the shoulder fixes the elbow, the wrist's sideways offset the roll of the upper arm (two
-ways), its height the lift, and the hand's orientation the last three joints. `pan_windows` says where to look, `curve`
-follows all pans at once, `wrist_angles` completes a posture. Pure geometry in the axes of the torso; no policy.
+An arm of seven joints has one more than a pose needs. For a fixed shoulder pan the rest follows in closed form: the
+distance of the wrist from the shoulder determines the elbow, the wrist's sideways offset the roll of the upper arm (two
+solutions), its height the lift, and the hand's orientation the last three joints. `pan_windows` returns the ranges of
+pan to search, `curve` computes the postures for an array of pans, `wrist_angles` completes a posture. The module is
+pure geometry in the axes of the torso; `kinematics` chooses among the postures.
 """
 
 from __future__ import annotations
@@ -27,36 +28,36 @@ _TINY = 1e-12
 
 
 class Reach(NamedTuple):
-    """A target as the arm sees it."""
+    """A target in the axes of the torso."""
 
     wrist: Vector
-    """From the origin of the pan joint, m."""
+    """Position of the wrist relative to the origin of the pan joint, m."""
     turn: Quaternion
-    """Of the hand."""
+    """Orientation of the hand."""
     ahead: Vector
-    """Along the hand, length one."""
+    """Unit vector along the hand."""
 
 
 class Curve(NamedTuple):
-    """Postures by pan (columns) and by the two ways to roll the upper arm (rows)."""
+    """Postures, rad: one column per pan, one row for each of the two rolls of the upper arm."""
 
     lift: Floats
     roll: Floats
     elbow: Floats
-    """One row: the same both ways."""
+    """One row, because the elbow is the same for both rolls."""
     margin: Floats
-    """How far the joint nearest to a limit is inside it, rad; negative: how far the worst one is outside."""
+    """Distance of the joint nearest to a limit from that limit, rad; negative if a joint is outside its limits."""
 
 
 def reach(arm_description: ArmDescription, tool: Vector, turn: Quaternion) -> Reach:
-    """What it takes to bring the tool frame to `tool` (m from the origin of the pan joint), turned so."""
+    """Convert a tool frame at `tool` (m from the origin of the pan joint) with rotation `turn` to a `Reach`."""
     ahead = rotated(turn, (1.0, 0.0, 0.0))
     wrist = Vector(*(at - arm_description.tool_m * along for at, along in zip(tool, ahead, strict=True)))
     return Reach(wrist, turn, ahead)
 
 
 def hand(arm_description: ArmDescription, angles: Sequence[float]) -> tuple[Vector, Quaternion]:
-    """Where seven joint angles bring the tool frame, m from the origin of the pan joint, and how it is turned."""
+    """Return the tool frame's position (m from the origin of the pan joint) and rotation at seven joint angles."""
     pan, lift, _, _, forearm_roll, flex, wrist_roll = angles
     at_pan = _about_z(pan)
     at_elbow = _elbow_turn(angles)
@@ -74,10 +75,10 @@ def hand(arm_description: ArmDescription, angles: Sequence[float]) -> tuple[Vect
 
 
 def pan_windows(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> list[Bounds]:
-    """The ranges of pan, within its limits, at which the elbow is within its own.
+    """Return the ranges of pan, within its limits, at which the elbow is within its limits.
 
-    The lift axis circles round the pan axis: how far it is from the wrist, and with it the elbow, depends only on how
-    far pan is turned away from the wrist, to either side.
+    The lift axis moves on a circle around the pan axis, so its distance from the wrist, and with it the elbow angle,
+    depends only on the absolute angle between pan and the direction of the wrist.
     """
     swing = _swing(arm_description, wrist, bounds)
     if swing is None:
@@ -96,7 +97,7 @@ def pan_windows(arm_description: ArmDescription, wrist: Vector, bounds: Sequence
 
 
 def _swing(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> Bounds | None:
-    """How far pan must and may be turned away from the wrist for the elbow's sake; None: no turn is right."""
+    """Return the least and greatest angle between pan and wrist that the elbow's limits allow; None if none does."""
     folded, stretched = stretches_m(arm_description, bounds)
     across, offset = math.hypot(wrist.x, wrist.y), arm_description.shoulder_offset_m
     middle = across * across + wrist.z * wrist.z + offset * offset
@@ -108,38 +109,38 @@ def _swing(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Boun
 
 
 def stretches_m(arm_description: ArmDescription, bounds: Sequence[Bounds]) -> tuple[float, float]:
-    """From shoulder to wrist with the elbow at its lower limit, and at its upper one."""
+    """Return the distances from shoulder to wrist with the elbow at its lower and at its upper limit, m."""
     a, b = arm_description.upper_arm_m, arm_description.forearm_m
     folded, stretched = (math.sqrt(a * a + b * b + 2 * a * b * math.cos(angle)) for angle in bounds[ELBOW])
     return folded, stretched
 
 
 def curve(arm_description: ArmDescription, reach: Reach, pan: Floats, bounds: Sequence[Bounds]) -> Curve:
-    """For every pan the four joints up to the elbow, and the margin of these and the wrist's flex.
+    """Return for every pan the joints up to the elbow, and the margin of these and of the wrist's flex.
 
-    Where no posture exists the nearest one stands in, with a negative margin.
+    Where no posture exists, the nearest one is returned with a negative margin.
     """
     a, b = arm_description.upper_arm_m, arm_description.forearm_m
     (x, y, z), (ahead_x, ahead_y, ahead_z) = reach.wrist, reach.ahead
     cos_pan, sin_pan = np.cos(pan), np.sin(pan)
-    forth, aside = cos_pan * x + sin_pan * y - arm_description.shoulder_offset_m, cos_pan * y - sin_pan * x
+    forward, sideways = cos_pan * x + sin_pan * y - arm_description.shoulder_offset_m, cos_pan * y - sin_pan * x
 
-    cos_elbow = _within_one((forth * forth + aside * aside + (z * z - a * a - b * b)) / (2 * a * b))
+    cos_elbow = _within_one((forward * forward + sideways * sideways + (z * z - a * a - b * b)) / (2 * a * b))
     elbow = -np.arccos(cos_elbow)
     sin_elbow = -np.sqrt(1.0 - cos_elbow * cos_elbow)
 
-    # The bent forearm leaves the upper arm's axis by so much; the roll turns that aside.
-    leaves = np.maximum(-b * sin_elbow, _TINY)
-    sin_roll = -aside / leaves
+    # The wrist's distance from the upper arm's axis; the roll turns part of it sideways.
+    offset = np.maximum(-b * sin_elbow, _TINY)
+    sin_roll = -sideways / offset
     missing = 1.0 - np.abs(sin_roll)
     sin_roll = _within_one(sin_roll)
     cos_roll = np.sqrt(1.0 - sin_roll * sin_roll)
     cos_roll = np.array((cos_roll, -cos_roll))
     roll, roll_margin = _nearest_turn(np.arctan2(sin_roll, cos_roll), bounds[ROLL])
-    lift = np.arctan2(leaves * cos_roll, a + b * cos_elbow) - np.arctan2(z, forth)
+    lift = np.arctan2(offset * cos_roll, a + b * cos_elbow) - np.arctan2(z, forward)
     lift, lift_margin = _nearest_turn(lift, bounds[LIFT])
 
-    # Flex is the angle between forearm and hand, here in axes that turn with pan.
+    # Flex is the angle between forearm and hand, computed in axes that rotate with pan.
     cos_lift, sin_lift = np.cos(lift), np.sin(lift)
     out = -sin_elbow * cos_roll
     cos_flex = (
@@ -156,26 +157,26 @@ def curve(arm_description: ArmDescription, reach: Reach, pan: Floats, bounds: Se
 
 
 def wrist_angles(upper: Sequence[float], turn: Quaternion) -> tuple[float, float, float]:
-    """Forearm roll, flex (not above 0) and wrist roll that turn the hand so when pan, lift, roll, elbow are `upper`.
+    """Return the forearm roll, flex (<= 0) and wrist roll that rotate the hand to `turn`, rad.
 
-    The rolls are in [-π, π].
+    `upper` holds pan, lift, roll and elbow. The rolls are in [-π, π].
     """
     x, y, z, w = _elbow_turn(upper)
     x, y, z, w = product((-x, -y, -z, w), turn)
-    # About x, then y, then x: the quaternion holds half the sum and half the difference of the outer two angles.
+    # Rotations about x, y, x: the quaternion gives half the sum and half the difference of the outer two angles.
     total, difference = math.atan2(x, w), math.atan2(-z, -y)
     flex = -2 * math.atan2(math.hypot(y, z), math.hypot(x, w))
     return math.remainder(total + difference, math.tau), flex, math.remainder(total - difference, math.tau)
 
 
 def _elbow_turn(angles: Sequence[float]) -> Quaternion:
-    """How the forearm is turned before its own roll."""
+    """Return the rotation of the forearm before its own roll."""
     upper = product(product(_about_z(angles[PAN]), _about_y(angles[LIFT])), _about_x(angles[ROLL]))
     return product(upper, _about_y(angles[ELBOW]))
 
 
 def _within_one(value: Floats) -> Floats:
-    """np.clip, without what that costs on small arrays."""
+    """Clip to [-1, 1]; np.clip is slower on small arrays."""
     return np.minimum(np.maximum(value, -1.0), 1.0)
 
 
@@ -184,7 +185,7 @@ def _margin(angle: Floats, bound: Bounds) -> Floats:
 
 
 def _nearest_turn(angle: Floats, bound: Bounds) -> tuple[Floats, Floats]:
-    """The same angles, by whole turns as near to the middle of the range as can be, and their margins."""
+    """Shift the angles by whole turns as near to the middle of the range as possible; return them and their margins."""
     middle = (bound.upper + bound.lower) / 2
     away = angle - middle
     away -= math.tau * np.rint(away / math.tau)

@@ -1,8 +1,8 @@
-"""What a plan has to know of a robot: its joints and frames by name, its measures, its limits, its named postures.
+"""Describe robots for plans: joints and frames by name, dimensions, limits, named postures.
 
-A `RobotDescription` is a constant; where the robot stands and how its joints are is the world's affair. Lengths are in
-metres, angles in rad. The PR2's measures are those of its public model, so plans run on the built-in shape and on the
-mesh model alike (`world.robot_urdf`).
+A `RobotDescription` is a constant; the robot's current pose and joint positions are in the world. Lengths are in
+metres, angles in rad. The PR2's dimensions are those of its public model, so that plans run on the built-in shape and
+on the mesh model alike (`world.models.pr2`).
 
 >>> PR2.arms[Arms.LEFT].tool_frame
 'l_gripper_tool_frame'
@@ -34,12 +34,12 @@ __all__ = [
 
 
 class Limits(Enum):
-    """Which of a joint's two ranges an arm keeps to."""
+    """One of the two ranges of an arm's joints."""
 
     SOFT = "SOFT"
-    """The range the robot's own controllers and arm services keep to, some way inside the stops."""
+    """The range that the robot's own controllers and arm services use, inside the mechanical stops."""
     HARD = "HARD"
-    """The range up to the mechanical stops; what the model (URDF) declares."""
+    """The range up to the mechanical stops, as declared in the model (URDF)."""
 
 
 class Bounds(NamedTuple):
@@ -53,34 +53,34 @@ class Bounds(NamedTuple):
 class ArmDescription:
     """An arm of seven joints: pan, lift, roll at the shoulder, flex, roll at the elbow, flex, roll at the wrist.
 
-    Pan turns about z, lift and both flexes about y, the rolls about x; with all joints 0 the arm is stretched along x.
+    Pan rotates about z, lift and both flexes about y, the rolls about x; with all joints 0 the arm points along x.
     """
 
     joints: tuple[str, str, str, str, str, str, str]
-    """From the shoulder to the wrist."""
+    """Ordered from the shoulder to the wrist."""
     tool_frame: str
-    """The link an inverse kinematics target is for: between the finger tips, x along the fingers."""
+    """The link that inverse kinematics brings to the target: between the finger tips, x along the fingers."""
     shoulder: Vector
     """Origin of the pan joint in the torso link."""
     shoulder_offset_m: float
-    """From the pan axis to the lift axis."""
+    """Distance from the pan axis to the lift axis."""
     upper_arm_m: float
     forearm_m: float
     tool_m: float
-    """From the wrist to the tool frame."""
+    """Distance from the wrist to the tool frame."""
     soft_limits: Mapping[str, Bounds]
     hard_limits: Mapping[str, Bounds]
     gripper_joints: Mapping[GripperState, Mapping[str, float]]
     park: Mapping[str, float]
-    """The arm folded out of the way. Continuous joints may be several turns from zero."""
+    """Posture with the arm folded. Continuous joints may be several turns from zero."""
 
     def limits(self, limits: Limits) -> Mapping[str, Bounds]:
-        """Joint name → range."""
+        """Return the range of each joint by name."""
         return self.soft_limits if limits is Limits.SOFT else self.hard_limits
 
 
 class FieldOfView(NamedTuple):
-    """Whole angles of a camera's picture, rad, half of each to either side of its axis."""
+    """Full angles of a camera's image, rad; half of each is on either side of its axis."""
 
     horizontal: float
     vertical: float
@@ -95,17 +95,17 @@ class RobotDescription:
     torso_origin: Vector
     """Origin of the torso link in the root link, at torso height 0."""
     torso_limits: Bounds
-    """Hard limits; a plan may use all of it, also what lies outside the torso's soft range."""
+    """Hard limits; plans may use the whole range, also outside the torso's soft limits."""
     arms: Mapping[Arms, ArmDescription]
     head_pan_joint: str
     head_pan_link: str
     head_tilt_joint: str
     head_tilt_link: str
     camera_link: str
-    """Optical frame: z looks ahead, x to the right, y down."""
+    """Optical frame: z points ahead, x to the right, y down."""
     camera_view_rad: FieldOfView
     camera_height_m: Bounds
-    """Between the lowest and the highest torso."""
+    """Camera height above the floor with the torso at its lowest and at its highest position, m."""
 
 
 FINGER_OPEN_RAD = 0.548
@@ -125,14 +125,14 @@ GRASP_ORIENTATIONS: Mapping[Grasp, Quaternion] = MappingProxyType(
         Grasp.TOP: _unit(0, 1, 0, 1),
     }
 )
-"""How the gripper is turned, in the object's axes: `object.orientation ⊗ GRASP_ORIENTATIONS[grasp]`.
+"""Orientation of the gripper in the object's axes: `object.orientation ⊗ GRASP_ORIENTATIONS[grasp]`.
 
-In this order, not the other: only so does TOP come from above whatever the object's heading is.
+The order matters: only in this order does TOP approach from above for every heading of the object.
 """
 
 
 def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> ArmDescription:
-    """The left arm (side 1), or the right one (side -1), which is its mirror image."""
+    """Describe the left arm (side 1) or its mirror image, the right one (side -1)."""
     joints = (
         f"{prefix}_shoulder_pan_joint",
         f"{prefix}_shoulder_lift_joint",
@@ -201,11 +201,11 @@ PR2 = RobotDescription(
     head_tilt_joint="head_tilt_joint",
     head_tilt_link="head_tilt_link",
     camera_link="wide_stereo_optical_frame",
-    camera_view_rad=FieldOfView(0.99483, 0.75049),  # those that reference systems give for this camera
+    camera_view_rad=FieldOfView(0.99483, 0.75049),  # values of the reference systems for this camera
     camera_height_m=Bounds(1.27, 1.60),
 )
 
 
 def robot_description(name: str) -> RobotDescription | None:
-    """The description of the robot of that name; None for a robot not known here."""
+    """Return the description of the robot of that name; None if there is no built-in description."""
     return PR2 if name == PR2.name else None
