@@ -23,10 +23,10 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask
-from tests.proxy import Proxy, proxy_before
 from tests.store.factories import episode, run_of
 from tests.writer.fakes import CountingFold, KeptSource
 
@@ -79,7 +79,7 @@ def lost_replies(server: Server) -> Callable[[int, random.Random, Path, Step], O
     """Every COMMIT is done, and its reply is lost; then the batch is appended again."""
 
     async def swallowed(rounds: int, step: Step, url: str, records: list[Record]) -> None:
-        async with proxy_before(server) as proxy:
+        async with proxy_before(server.folder) as proxy:
             log = await EventLog.open(_through(proxy, url), create=True)
             for first in range(0, rounds * _BATCH, _BATCH):
                 proxy.swallow_reply_to(b"COMMIT")
@@ -104,7 +104,7 @@ def cut_connections(server: Server) -> Callable[[int, random.Random, Path, Step]
     """A writer's connection ends after a random number of bytes, is reset or closed, again and again."""
 
     async def drained(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> None:
-        async with proxy_before(server) as proxy:
+        async with proxy_before(server.folder) as proxy:
             log = await EventLog.open(_through(proxy, url), create=True, busy_timeout_s=2.0)
             source = KeptSource(records, closed=True)
             settings = Settings(batch_events_max=_BATCH)

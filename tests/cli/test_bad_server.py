@@ -6,9 +6,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from pycrorm_async.testing.postgresql_proxy import proxy_before
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask
-from tests.proxy import proxy_before
 from tests.store.test_postgresql_refusals import WRITTEN, guarded_in
 
 pytestmark = pytest.mark.soak
@@ -80,7 +80,7 @@ def test_a_wrong_name_of_the_database_is_one_line_and_the_right_one_stores_what_
 async def test_a_server_that_is_too_old_is_one_line_and_nothing_is_made_there(server: Server, folder: Path) -> None:
     url = server.new_database()
     [[version]] = ask(url, "SELECT current_setting('server_version_num')::int")
-    async with proxy_before(server) as proxy:
+    async with proxy_before(server.folder) as proxy:
         # A real server, of which only the answer to this question is another on the way.
         proxy.falsify(version.to_bytes(4), (130_011).to_bytes(4))
         through = proxy.url(urlsplit(url).path.removeprefix("/"), password="s3cr")

@@ -21,12 +21,12 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from tests.commands import pycrorm
 from tests.crash.chore_robot import LANES, do_chores
 from tests.crash.forked_processes import Forked
 from tests.crash.robot_processes import HANGS_S, Lab
 from tests.databases import Server, ask
-from tests.proxy import Proxy, proxy_before
 
 ROBOTS_A_MACHINE = 8
 
@@ -149,7 +149,7 @@ async def test_sixteen_robots_and_two_daemons_behind_a_failing_network_lose_and_
     async with AsyncExitStack() as stack:
         machines: list[Machine] = []
         for name in ("east", "west"):
-            proxy = await stack.enter_async_context(proxy_before(server))
+            proxy = await stack.enter_async_context(proxy_before(server.folder))
             machines.append(Machine(tmp_path / name, proxy, urlsplit(url).path.removeprefix("/"), rng))
             stack.callback(machines[-1].clear)
         await work(machines, rng, min(seconds, 60.0) if in_turn else seconds)

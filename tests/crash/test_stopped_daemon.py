@@ -13,10 +13,10 @@ import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from pycrorm_async.testing.postgresql_proxy import proxy_before
 from tests.commands import one_line_of, pycrorm
 from tests.crash.robot_processes import Lab
 from tests.databases import Server, ask
-from tests.proxy import proxy_before
 
 
 def stop_in_its_tracks(lab: Lab) -> None:
@@ -79,7 +79,7 @@ async def test_a_daemon_that_is_told_to_leave_while_its_server_is_silent_leaves_
     server: Server, tmp_path: Path
 ) -> None:
     url = server.new_database()
-    async with proxy_before(server) as proxy:
+    async with proxy_before(server.folder) as proxy:
         through = proxy.url(urlsplit(url).path.removeprefix("/"))
         lab = Lab(tmp_path, through, random.randrange(2**31))
         try:

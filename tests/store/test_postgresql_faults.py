@@ -23,10 +23,10 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import engine
+from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask, server_in
-from tests.proxy import Proxy, proxy_before
 from tests.store.factories import declaration, episode, run_of
 from tests.writer.fakes import CountingFold, KeptSource
 
@@ -82,7 +82,7 @@ def direct(server: Server) -> str:
 
 @pytest.fixture
 async def proxy(server: Server) -> AsyncIterator[Proxy]:
-    async with proxy_before(server) as between:
+    async with proxy_before(server.folder) as between:
         yield between
 
 

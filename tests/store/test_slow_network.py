@@ -11,8 +11,8 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from tests.databases import Server, ask
-from tests.proxy import Proxy, proxy_before
 
 MADE = """
     SELECT count(*) FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
@@ -26,18 +26,18 @@ async def opened(proxy: Proxy, url: str) -> EventLog:
 
 async def test_a_memory_is_made_in_far_fewer_messages_than_it_has_tables(server: Server) -> None:
     url = server.new_database()
-    async with proxy_before(server) as proxy:
+    async with proxy_before(server.folder) as proxy:
         log = await opened(proxy, url)
         await Projector(log).open()
         await log.close()
     [[made]] = ask(url, MADE)
     assert made > 200
-    assert proxy.said < made / 2  # each takes as long as the line is, there and back
+    assert proxy.requests < made / 2  # each takes as long as the line is, there and back
 
 
 async def test_a_line_that_breaks_while_replaced_views_are_cleared_away_is_told_as_such(server: Server) -> None:
     url = server.new_database()
-    async with proxy_before(server) as proxy:
+    async with proxy_before(server.folder) as proxy:
         log = await opened(proxy, url)
         await Projector(log).open()
         proxy.cut_before(b"DROP SCHEMA")

@@ -1,6 +1,11 @@
-"""A proxy between a client and a PostgreSQL server that makes the faults of a network: cuts, resets, stalls, dribbles.
+"""A TCP proxy before a PostgreSQL server makes the faults of a network: cuts, resets, stalls, lost replies.
 
-It speaks bytes, not the protocol: a fault is armed by what the client says or by how much of it has gone through.
+    async with proxy_before(Path("/run/postgresql")) as proxy:
+        async with Memory.open(proxy.url("memory")) as memory:
+            proxy.cut()
+
+The proxy copies bytes and does not know the protocol: a test arms a fault with a pattern of bytes that the client
+sends, or with a number of bytes.
 """
 
 from __future__ import annotations
@@ -17,24 +22,26 @@ from pathlib import Path
 from typing import NoReturn
 from urllib.parse import quote
 
-from tests.databases import Server
-
 __all__ = ["Proxy", "proxy_before"]
 
 _CHUNK = 1 << 16
 
 
 class Proxy:
-    """Listens on TCP; every connection to it is one to the server.
+    """Accepts TCP connections and opens a connection to the server for each.
 
-    `connections` counts those made so far, `said` how often a client spoke, `faults` the armed faults that came to
-    pass.
+    Attributes:
+        port: of the proxy, on 127.0.0.1.
+        connections: number of connections accepted so far.
+        requests: number of pieces of bytes received from clients.
+        faults: number of armed faults that happened.
+        made: faults that `trouble` made, by kind.
     """
 
     def __init__(self, server_socket: Path) -> None:
         self.port = 0
         self.connections = 0
-        self.said = 0
+        self.requests = 0
         self.faults = 0
         self.made: Counter[str] = Counter()
         self.chunk_bytes = _CHUNK
@@ -44,9 +51,9 @@ class Proxy:
         self._flowing.set()
         self._links: set[_Link] = set()
         self._pattern: bytes | None = None
-        self._seen: Callable[[_Link], None] = lambda _link: None
+        self._act: Callable[[_Link], None] = lambda _link: None
         self._budget: int | None = None
-        self._lie = (b"", b"")
+        self._replacement = (b"", b"")
 
     def url(self, database: str, *, user: str = "postgres", password: str = "") -> str:
         who = f"{user}:{quote(password, safe='')}" if password else user
@@ -55,56 +62,57 @@ class Proxy:
     # --- faults now -------------------------------------------------------------------------------------------
 
     def cut(self) -> None:
-        """Every connection ends, as when the server's process does."""
+        """Close every connection, as a server does whose process ends."""
         for link in list(self._links):
             link.end(reset=False)
 
     def reset(self) -> None:
-        """Every connection is reset, as when a machine between forgot it."""
+        """Reset every connection, as a router does that lost its state."""
         for link in list(self._links):
             link.end(reset=True)
 
     def refuse(self, *, refusing: bool = True) -> None:
-        """New connections are closed before a byte is said."""
+        """Close new connections before a byte is copied."""
         self._refusing = refusing
 
     def stall(self) -> None:
-        """Not a byte goes through any more, and nobody is told."""
+        """Copy no more bytes, and leave all connections open."""
         self._flowing.clear()
 
     def flow(self) -> None:
+        """Copy bytes again."""
         self._flowing.set()
 
     def dribble(self, chunk_bytes: int) -> None:
-        """Everything goes through, so many bytes at a time."""
+        """Copy at most this many bytes at a time."""
         self.chunk_bytes = chunk_bytes
 
     # --- faults to come ---------------------------------------------------------------------------------------
 
-    def cut_before(self, said: bytes) -> None:
-        """The next time the client says this the server does not hear it, and the connection ends."""
-        self._arm(said, lambda link: link.end(reset=False))
+    def cut_before(self, pattern: bytes) -> None:
+        """Close the connection when a client sends this for the first time; the server does not receive it."""
+        self._arm(pattern, lambda link: link.end(reset=False))
 
-    def swallow_reply_to(self, said: bytes) -> None:
-        """The next time the client says this the server does it, and the connection ends instead of its answer."""
-        self._arm(said, _Link.swallow)
+    def swallow_reply_to(self, pattern: bytes) -> None:
+        """When a client sends this for the first time, let the server do it and close before it replies."""
+        self._arm(pattern, _Link.swallow)
 
-    def falsify(self, said: bytes, heard: bytes) -> None:
-        """Whatever the server says, the client hears the one instead of the other."""
-        assert len(said) == len(heard), "the length of a message stands before it"
-        self._lie = said, heard
+    def falsify(self, original: bytes, replacement: bytes) -> None:
+        """Replace one sequence of bytes in everything the server sends by another of the same length."""
+        assert len(original) == len(replacement), "a message begins with its length, so the replacement must be as long"
+        self._replacement = original, replacement
 
     def cut_after_bytes(self, count: int) -> None:
-        """The connection ends in the middle of whatever the client says, after so many bytes of it."""
+        """Close the connection after the client has sent this many more bytes, even in the middle of a message."""
         self._budget = count
 
-    def _arm(self, said: bytes, act: Callable[[_Link], None]) -> None:
-        self._pattern, self._seen = said, act
+    def _arm(self, pattern: bytes, act: Callable[[_Link], None]) -> None:
+        self._pattern, self._act = pattern, act
 
     # --- faults of every kind ---------------------------------------------------------------------------------
 
     async def trouble(self, rng: random.Random, *, pause_s: float) -> NoReturn:
-        """One fault after the other, so long apart on average, until it is cancelled. `made` counts them."""
+        """Make faults of every kind, `pause_s` seconds apart on average, until cancelled. `made` counts them."""
         lasting: dict[str, Callable[[], None]] = {
             "stall": self.stall,
             "refuse": self.refuse,
@@ -132,22 +140,22 @@ class Proxy:
             self.heal()
 
     def heal(self) -> None:
-        """No fault now and none to come."""
+        """End the present fault and disarm all others."""
         self._pattern = self._budget = None
-        self._lie = (b"", b"")
+        self._replacement = (b"", b"")
         self._refusing = False
         self.chunk_bytes = _CHUNK
         self.flow()
 
-    # --- what a link asks -------------------------------------------------------------------------------------
+    # --- called by a link -------------------------------------------------------------------------------------
 
-    def heard(self, link: _Link, chunk: bytes) -> bytes:
-        """What of the client's bytes is passed on; may end the link."""
-        self.said += 1
+    def from_client(self, link: _Link, chunk: bytes) -> bytes:
+        """Return the part of a client's bytes that reaches the server; may end the link."""
+        self.requests += 1
         if self._pattern is not None and self._pattern in chunk:
             self._pattern = None
             self.faults += 1
-            self._seen(link)
+            self._act(link)
         if self._budget is not None:
             if len(chunk) >= self._budget:
                 chunk, self._budget = chunk[: self._budget], None
@@ -157,15 +165,16 @@ class Proxy:
                 self._budget -= len(chunk)
         return chunk
 
-    def passed_on(self, chunk: bytes) -> bytes:
-        """What the client hears of the server's bytes."""
-        said, heard = self._lie
-        return chunk.replace(said, heard) if said else chunk
+    def from_server(self, chunk: bytes) -> bytes:
+        """Return what the client receives of the server's bytes."""
+        original, replacement = self._replacement
+        return chunk.replace(original, replacement) if original else chunk
 
     async def flowing(self) -> None:
+        """Wait while the proxy is stalled."""
         await self._flowing.wait()
 
-    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
         if self._refusing:
             writer.close()
@@ -184,7 +193,7 @@ class Proxy:
 
 
 class _Link:
-    """One connection, both ways."""
+    """One connection, in both directions."""
 
     def __init__(
         self,
@@ -223,7 +232,7 @@ class _Link:
     async def _up(self) -> None:
         while chunk := await self._client[0].read(self._proxy.chunk_bytes):
             await self._proxy.flowing()
-            passed = self._proxy.heard(self, chunk)
+            passed = self._proxy.from_client(self, chunk)
             if self._client[1].is_closing():
                 return
             self._server[1].write(passed)
@@ -236,15 +245,15 @@ class _Link:
             await self._proxy.flowing()
             if self._swallowing:
                 return
-            self._client[1].write(self._proxy.passed_on(chunk))
+            self._client[1].write(self._proxy.from_server(chunk))
             await self._client[1].drain()
 
 
 @asynccontextmanager
-async def proxy_before(server: Server) -> AsyncIterator[Proxy]:
-    """A proxy before this server, in the running loop."""
-    proxy = Proxy(server.folder / ".s.PGSQL.5432")
-    listening = await asyncio.start_server(proxy._accept, "127.0.0.1", 0)
+async def proxy_before(socket_folder: Path) -> AsyncIterator[Proxy]:
+    """Run a proxy, in the running loop, before the PostgreSQL server whose Unix socket is in this folder."""
+    proxy = Proxy(socket_folder / ".s.PGSQL.5432")
+    listening = await asyncio.start_server(proxy.accept, "127.0.0.1", 0)
     proxy.port = listening.sockets[0].getsockname()[1]
     try:
         yield proxy

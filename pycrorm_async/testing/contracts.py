@@ -1,0 +1,101 @@
+"""Check the contracts of custom projections and of designators, on a real memory in a folder of the test.
+
+rows = await check_projection(GraspRate(), plan, tmp_path)
+assert [row["arm"] for row in rows["grasp_try"]] == ["LEFT"]
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Awaitable, Callable, Mapping
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from sqlalchemy import Select, column, select, table
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.memory import Memory
+from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.operations.rebuild import rebuild_projection
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.projections.custom.projection import Projection, columns_of
+from pycrorm_async.projections.custom.projection_tables import states
+from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.settings import Settings
+from pycrorm_async.store.log import EventLog
+
+__all__ = ["check_designator", "check_projection"]
+
+Rows: TypeAlias = Mapping[str, list[dict[str, Any]]]
+
+
+async def check_projection(projection: Projection, plan: Callable[[], Awaitable[object]], folder: Path) -> Rows:
+    """Record the plan, and check that the projection can fold it, live and again from the log, with the same rows.
+
+    Returns the rows of each table of the projection, ordered by id. What the plan raises is not caught.
+
+    Raises:
+        AssertionError: the projection stopped at an event, or a second fold of the log differs; the message says where.
+        CallerError: the projection has no valid name, version or tables.
+    """
+    columns_of(projection)
+    url = f"sqlite:///{folder}/projection.db"
+    async with Memory.open(url, projections=[projection]) as memory:
+        async with memory.episode(description=f"the contract of {projection.name}"):
+            await plan()
+        await memory.flush()
+    live = await _rows_of(projection, url)
+    log = await EventLog.open(shared_address(url), create=False)
+    try:
+        [state] = await states(log, [projection])
+        second = await verify(log, projections=[projection])
+    finally:
+        await log.close()
+    assert not state.parked, f"{projection.name} stopped: {', '.join(state.parked.values())}"
+    assert not second.drift, f"a second fold of {projection.name} differs, so it is not pure: {second.differences[0]}"
+    await rebuild_projection(url, projection)
+    rebuilt = await _rows_of(projection, url)
+    assert rebuilt == live, f"{projection.name} rebuilt has other rows: {rebuilt} instead of {live}"
+    return live
+
+
+async def check_designator(designator: ActionAbstract, folder: Path) -> Any:
+    """Perform an action with a memory that refuses what it cannot record, and check that its fields can be queried.
+
+    Returns the row, an instance of the mapped class. Scalars, enums and datetimes are compared with the designator's
+    fields; other fields have columns of their own that depend on their type. What `perform` raises is not caught.
+
+    Raises:
+        AssertionError: the action has no row, or a field has another value in it.
+        DeclarationRefused, Unrecordable: the class or a field cannot be recorded; the message says which and why.
+    """
+    if not dataclasses.is_dataclass(designator):
+        raise CallerError(f"{type(designator).__name__} is not a dataclass, so its fields cannot be compared")
+    settings = Settings(on_unrecordable="refuse")
+    async with Memory.open(f"sqlite:///{folder}/designator.db", settings=settings) as memory:
+        await designator.perform()
+        await memory.flush()
+        async with memory.session() as session:
+            mapped = memory.mapped(type(designator))
+            row = (await session.scalars(select(mapped).order_by(mapped.id))).first()
+    assert row is not None, f"{type(designator).__name__} has no row: does its perform() run?"
+    for field in dataclasses.fields(designator):
+        value = getattr(designator, field.name)
+        if value is None or isinstance(value, str | int | float | datetime):
+            stored = getattr(row, field.name)
+            expected = value.name if isinstance(value, Enum) and not isinstance(stored, Enum) else value
+            assert stored == expected, f"{field.name} is {stored!r} in the table instead of {expected!r}"
+    return row
+
+
+async def _rows_of(projection: Projection, url: str) -> Rows:
+    async with Reading.open(url) as reading, reading.session() as session:
+        rows: dict[str, list[dict[str, Any]]] = {}
+        for name, columns in columns_of(projection).items():
+            query: Select[*tuple[Any, ...]] = select(*map(column, columns)).select_from(table(name))
+            query = query.order_by(column("id"))
+            rows[name] = [dict(row) for row in (await session.execute(query)).mappings()]
+        return rows
