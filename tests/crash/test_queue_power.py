@@ -21,8 +21,8 @@ from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue import RecorderQueue, open_dead
 from pycrorm_async.queue.files.frame import EVENT
 from pycrorm_async.queue.files.segment import Segment, salt_of
-from pycrorm_async.queue.live.appender import Appender, Span
 from pycrorm_async.queue.live.sync_thread import SyncThread
+from pycrorm_async.queue.live.syncable_appender import Span, SyncableAppender
 from tests.queue.factories import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
 
 SECTOR = 512
@@ -152,15 +152,15 @@ def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
             machine.put_meanwhile()
             machine.cut()
 
-        begin_sync = Appender.begin_sync
+        begin_sync = SyncableAppender.begin_sync
 
-        def begun(appender: Appender) -> Span:
+        def begun(appender: SyncableAppender) -> Span:
             span = begin_sync(appender)
             machine.put_meanwhile()
             return span
 
         patch.setattr(Segment, "sync", watched)
-        patch.setattr(Appender, "begin_sync", begun)
+        patch.setattr(SyncableAppender, "begin_sync", begun)
         try:
             yield machine
         finally:

@@ -10,8 +10,8 @@ from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.queue import LiveQueue, RecorderQueue, RecoveredQueue, open_dead
 from pycrorm_async.queue.files.names import MAKING
-from pycrorm_async.queue.live.appender import Appender
 from pycrorm_async.queue.live.capacity import Capacity
+from pycrorm_async.queue.live.syncable_appender import SyncableAppender
 from pycrorm_async.settings import Settings
 
 WALL_NS = 1_700_000_000_123_456_789
@@ -102,7 +102,7 @@ class Author:
         self.folder = spool / episode_text(recorder)
         self.folder.mkdir(parents=True)
         (self.folder / "alive").touch()
-        self.appender = Appender(
+        self.appender = SyncableAppender(
             folder=self.folder,
             recorder=recorder,
             capacity=Capacity.of(settings),

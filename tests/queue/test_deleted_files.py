@@ -125,7 +125,7 @@ async def test_a_sync_is_refused_once_and_all_that_was_mapped_is_found_after_a_k
     assert (queue.synced, queue.lost, queue.folder.parent) == (count, (), before.parent)
     assert queue.folder != before
     assert queue.setback is not None
-    assert f"recording goes on in {queue.folder}, no record is lost" in queue.setback
+    assert f"recording continues in {queue.folder}, no record is lost" in queue.setback
     assert [GONE in each.getMessage() for each in caplog.records if each.levelno == logging.ERROR] == [True, True]
     put(queue, 2)
     assert await recovered(killed(queue, tmp_path)) == [(n, n) for n in range(1, count + 3)]
@@ -228,11 +228,11 @@ async def test_a_plan_goes_on_while_no_folder_can_be_made_and_all_of_it_is_there
         put(queue, 2)
         with pytest.raises(SpoolUnavailable):
             await queue.synced_to()
-    with pytest.raises(SpoolUnavailable, match="recording cannot go on in a new folder"):
+    with pytest.raises(SpoolUnavailable, match="recording cannot continue in a new folder"):
         await queue.synced_to()
     assert (queue.synced, queue.written) == (1, 7)
     assert queue.setback is not None
-    assert "cannot go on" in queue.setback
+    assert "cannot continue" in queue.setback
     spool.unlink()
     while queue.synced < 7:
         try:
@@ -253,7 +253,7 @@ async def test_a_queue_that_is_closed_while_no_folder_can_be_made_ends_and_says_
     queue.close()
     with pytest.raises(SpoolUnavailable, match=GONE):
         await queue.synced_to()
-    with pytest.raises(SpoolUnavailable, match="recording cannot go on"):
+    with pytest.raises(SpoolUnavailable, match="recording cannot continue"):
         await drain(queue)
     queue.release()
 

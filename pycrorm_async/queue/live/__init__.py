@@ -1,1 +1,1 @@
-"""The queue of a living recorder."""
+"""Record events in the queue of a living recorder."""

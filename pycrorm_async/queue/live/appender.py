@@ -1,7 +1,30 @@
-"""The end of the queue that grows: gives every record its place, sequence and time, and writes it into the mapping.
+"""Append records to mapped segments: assign position, sequence and times, and write the frame.
 
-All of it under one lock that is never held during a system call, but for the one case where records come faster than
-the sync thread can make the next segment ahead. While it is held nothing is collected (`alone.py` says why).
+**Theory of operation.** Two kinds of actors use an appender. *Producers*, any threads, call `put`. The *sync thread*
+(`sync_thread.py`) syncs, preallocates and trims segments (`syncable_appender.py`). No consumer touches it: the consumer
+reads the files.
+
+A segment is first *prepared* (allocated ahead, all zero), then *current* (producers write into it), then *sealed*
+(full, but not covered by a sync yet), and finally closed. `begun` lists the segments with records that are not deleted,
+`open` the open episodes with their last sequence and times.
+
+One lock, `_gc_lock`, protects all of this state; `gc_safe_lock.py` explains why the garbage collector is off while it
+is held. Under the lock a producer takes the next position and sequence, reads the clocks and copies the frame into the
+mapping, so that positions, sequences and times increase together and a refused event leaves no gap. A producer makes no
+system call under the lock, with one exception: when it fills the current segment before the sync thread has prepared
+the next one, it allocates that segment itself, or waits for the sync thread's allocation. `_making` keeps both from
+allocating the same segment. The order is `_gc_lock`, then `_making`; the sync thread takes only `_making` for its
+allocation, so that producers can go on, and pauses the garbage collector meanwhile, because a finalizer that records
+would wait for `_making` in the same thread.
+
+A KeyboardInterrupt can arrive at any call. The steps that write a record and update the bookkeeping make no calls, so
+either all or none of them happen. The header is written after the body: a body without a header does not decode. A kill
+between the two leaves a torn frame, which recovery truncates.
+
+A sync takes a span (`begin_sync`): the records since the previous one, their checksum and their segments. The first
+record of the next span finds `_quiet` set and wakes the sync thread, so one sync covers all records of an interval. A
+segment may be deleted only after the database stored its records and the next segment's header is on the disk, because
+that header lists the episodes open before it.
 """
 
 from __future__ import annotations
@@ -11,7 +34,6 @@ import threading
 from collections.abc import Callable, Mapping
 from functools import partial
 from gc import disable, enable, isenabled
-from itertools import pairwise
 from pathlib import Path
 from threading import get_ident
 from types import MappingProxyType
@@ -24,14 +46,12 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.frame import (
     CHECKSUM_START,
-    COMMIT_BYTES,
     DECLARATION,
     EVENT,
     HEADER_BYTES,
     NO_EPISODE,
     TYPE_BYTES_MAX,
     encode_body,
-    encode_commit,
     encode_header,
 )
 from pycrorm_async.queue.files.segment import (
@@ -46,24 +66,16 @@ from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.declarations import AppendState, Declarations
 from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
 
-__all__ = ["Appender", "Span", "SegmentStart"]
+__all__ = ["NOTHING_OPEN", "OUT_OF_RESOURCES", "Appender", "SegmentStart"]
 
 NOTHING_OPEN: Final[Mapping[EpisodeId, LastRecord]] = MappingProxyType({})
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-_NOT_NOW = _FULL | frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
-
-
-class Span(NamedTuple):
-    """What one sync covers: the records up to `position`, `records` of them new, and the files they are in."""
-
-    position: int
-    records: int
-    checksum: int
-    segments: tuple[Segment, ...]
+OUT_OF_RESOURCES: Final = _FULL | frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
+"""Errors that may pass: a put that meets one is refused as if the spool were full, and the sync thread retries."""
 
 
 class SegmentStart(NamedTuple):
-    """A segment that holds records from position `base` on; `opened` are the episodes open before them."""
+    """The beginning of a segment: `base` is the position of its first record, `opened` the episodes open before it."""
 
     number: int
     base: int
@@ -72,10 +84,10 @@ class SegmentStart(NamedTuple):
 
 
 class Appender:
-    """Appends from any thread. `wake` is called at the first record of a span, `hurry` when a segment was begun.
+    """An appender for any thread. Calls `wake` at the first record of a span and `hurry` after it began a segment.
 
-    `make_room` frees so many bytes of a disk that is full; False if there is nothing to free. The first record follows
-    position `after`, where these episodes are `opened`.
+    `make_room` frees a number of bytes on a full disk; it returns False if it has none to free. The first record gets
+    position `after` + 1; `opened` are the episodes open before it.
     """
 
     def __init__(
@@ -108,7 +120,7 @@ class Appender:
         self.open: dict[EpisodeId, tuple[int, int, int]] = dict(opened)
         self.begun: list[SegmentStart] = []
         self._refusal: Callable[[], PycrormError] | None = None
-        self.stuck: str | None = None  # why nothing will be trimmed any more
+        self.stuck: str | None = None  # why no segment will be deleted any more
         self._span_count = 0
         self._span_checksum = 0
         self._quiet = True
@@ -124,20 +136,20 @@ class Appender:
     # --- putting -----------------------------------------------------------------------------------------------
 
     def put(self, heading: Heading, payload: bytes, reserved: bool) -> int:  # noqa: FBT001  # the hot path
-        """`RecorderQueue.put_nowait`. Not from a signal handler: the lock may be this thread's own."""
+        """Append one event as `RecorderQueue.put_nowait` does."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
         body = encode_body(name, payload)
         body_checksum = crc32(body)
         kind, owner, sequence = EVENT, episode or NO_EPISODE, 0
-        alone, me = self._gc_lock, get_ident()
-        if alone.owner == me:
-            raise alone.reentered()
+        gc_lock, thread = self._gc_lock, get_ident()
+        if gc_lock.owner == thread:
+            raise gc_lock.reentered()
         try:
-            with alone.lock:
+            with gc_lock.lock:
                 try:
-                    alone.owner = me
-                    alone.paused = isenabled()
+                    gc_lock.owner = thread
+                    gc_lock.paused = isenabled()
                     disable()
                     if self._refusal is not None:
                         raise self._refusal()
@@ -147,7 +159,7 @@ class Appender:
                     elif (last := self.open.get(episode)) is not None:
                         sequence = last[0] + 1
                     elif type_name == EPISODE_STARTED:
-                        self._refuse_one_too_many()
+                        self._check_open_episodes()
                         sequence = 1
                     else:
                         raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
@@ -173,9 +185,8 @@ class Appender:
                     )
                     span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
                     buffer = self._buffer
-                    # From here to the blank line nothing is called, so no KeyboardInterrupt can come between the
-                    # steps: the record and the bookkeeping are both there or both not. The header goes last: a body
-                    # alone is no frame.
+                    # No calls from here to the blank line, so that a KeyboardInterrupt cannot separate the record from
+                    # the bookkeeping. The header comes last, because a body alone does not decode.
                     buffer[offset + HEADER_BYTES : end] = body
                     buffer[offset : offset + HEADER_BYTES] = header
                     self._offset = end
@@ -191,20 +202,20 @@ class Appender:
                         self._wake()
                         self._quiet = False
                 finally:
-                    if alone.paused:
+                    if gc_lock.paused:
                         enable()
         finally:
-            if alone.owner == me:
-                alone.owner = 0
+            if gc_lock.owner == thread:
+                gc_lock.owner = 0
         return sequence
 
-    def _refuse_one_too_many(self) -> None:
-        """Every segment's header names the open episodes: with more, the largest record would not fit beside them."""
+    def _check_open_episodes(self) -> None:
+        """Refuse an episode if the list of open episodes in a header would leave no space for the largest record."""
         if not self._capacity.takes_episode(episodes=len(self.open), declared=self.declarations.bytes):
             raise EpisodeRefused(f"{len(self.open):,} episodes are open: no more fit into a segment (segment_bytes)")
 
     def _declare(self, body: bytes, name_bytes: int, version: int, payload_bytes: int) -> None:
-        """Every segment begins with it from now on."""
+        """Repeat this declaration at the beginning of every later segment, if it fits."""
         room = self._capacity.room_to_declare(episodes=len(self.open), declared=self.declarations.bytes)
         self.declarations.add(body, name_bytes=name_bytes, version=version, payload_bytes=payload_bytes, room=room)
 
@@ -216,7 +227,7 @@ class Appender:
         return name
 
     def _find_room(self, frame_bytes: int, *, reserved: bool) -> None:
-        """A frame of this size fits at `_offset` afterwards, in a new segment if need be. Under the lock."""
+        """Make a frame of this size fit at `_offset`, in a new segment if necessary. Needs the lock."""
         largest = self._capacity.frame_bytes_max(episodes=len(self.open), declared=self.declarations.bytes)
         if frame_bytes > largest:
             raise InternalError(f"a record of {frame_bytes:,} bytes does not fit into a segment ({largest:,})")
@@ -239,7 +250,7 @@ class Appender:
         self._hurry()
 
     def _begin(self, segment: Segment) -> None:
-        """This segment is the current one from now on."""
+        """Make this segment the current one. Needs the lock."""
         base = self.position + 1
         open_before = {episode: LastRecord(*last) for episode, last in self.open.items()}
         offset = segment.begin(SegmentHeader(self._recorder, segment.number, base, open_before))
@@ -248,7 +259,7 @@ class Appender:
         repeated = self.declarations.write(segment.buffer, before, salt=salt, clock=self._clock)
         begun = [*self.begun, SegmentStart(segment.number, base, segment.path, open_before)]
         sealed = [*self._sealed, self._current] if self.begun else []
-        # As in `put`: nothing is called between these steps.
+        # As in `put`: no calls between these steps.
         self._current = segment
         self._buffer = segment.buffer
         self._offset, self.position, self._span_count, self._span_checksum = repeated
@@ -259,99 +270,10 @@ class Appender:
 
         self._set_limits()
 
-    # --- syncing -----------------------------------------------------------------------------------------------
-
-    def begin_sync(self) -> Span:
-        """What is there now; the next record begins a new span and wakes the sync thread again."""
-        return self._gc_lock.run(self._begin_sync)
-
-    def _begin_sync(self) -> Span:
-        span = Span(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
-        self._span_count = self._span_checksum = 0
-        self._quiet = True
-        return span
-
-    def append_commit(self, span: Span) -> Segment:
-        """Appends the frame that says the span is on the disk; returns the segment that holds it, to be synced."""
-        return self._gc_lock.run(partial(self._append_commit, span))
-
-    def _append_commit(self, span: Span) -> Segment:
-        frame = encode_commit(
-            position=span.position,
-            count=span.records,
-            checksum=span.checksum,
-            wall_ns=self._wall_ns(),
-            monotonic_ns=self._monotonic_ns(),
-            salt=self._salt,
-        )
-        end = self._offset + COMMIT_BYTES
-        assert end <= self._capacity.segment_bytes, "room for commit frames is kept free"
-        self._buffer[self._offset : end] = frame
-        self._offset = end
-        return self._current
-
-    def end_sync(self, span: Span) -> None:
-        """The files that were full when the span was taken are safe, whole, and need not be open any more."""
-        for segment in self._gc_lock.run(partial(self._end_sync, span)):
-            segment.close()
-
-    def _end_sync(self, span: Span) -> list[Segment]:
-        done = [segment for segment in self._sealed if segment in span.segments[:-1]]
-        self._sealed = [segment for segment in self._sealed if segment not in done]
-        return done
-
-    # --- room --------------------------------------------------------------------------------------------------
-
-    def prepare(self) -> bool:
-        """Makes the next segment ahead if there is none; True if the disk has no room for it. Raises `OSError`."""
-        if self._prepared is not None or len(self.begun) >= self._capacity.segments_max:
-            return False
-        try:
-            # Nothing may be put in this thread while it holds `_making`, and it must not hold the other lock so long.
-            self._gc_lock.hold_off()
-            with self._making:
-                refused = self._prepare()
-        finally:
-            self._gc_lock.go_on()
-        self._gc_lock.run(partial(self._prepared_or, refused))
-        return refused is not None
-
-    def _prepare(self) -> str | None:
-        if self._prepared is not None:
-            return None
-        try:
-            self._prepared = self._allocate(self._current.number + 1)
-        except OSError as error:
-            if error.errno not in _NOT_NOW:
-                raise
-            return error.strerror
-        return None
-
-    def _prepared_or(self, refused: str | None) -> None:
-        self._disk_refused = refused
-        self._set_limits()
-        self._forget_refused()
-
-    def trimmable(self, *, stored: int, safe_number: int) -> list[SegmentStart]:
-        """The segments that may go: all in them is stored, and the header after them is safe on the disk."""
-        begun = self.begun
-        return [
-            segment
-            for segment, following in pairwise(begun)
-            if following.base - 1 <= stored and following.number <= safe_number
-        ]
-
-    def trimmed(self, gone: list[SegmentStart]) -> None:
-        """These segments are deleted."""
-        self._gc_lock.run(partial(self._trimmed, gone))
-
-    def _trimmed(self, gone: list[SegmentStart]) -> None:
-        self.begun = [segment for segment in self.begun if segment not in gone]
-        self._set_limits()
-        self._forget_refused()
+    # --- space --------------------------------------------------------------------------------------------------
 
     def admits_again(self, *, reserved: bool) -> bool:
-        """Whether a record as large as the largest that was refused would be taken now."""
+        """Return whether a record as large as the largest refused one would be accepted now."""
         frame_bytes = max(self._refused_bytes, HEADER_BYTES)
         if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
             return True
@@ -359,16 +281,16 @@ class Appender:
 
     @property
     def end(self) -> int:
-        """Where the last record or commit frame ends in its segment."""
+        """Offset of the end of the last frame in the current segment."""
         return self._offset
 
     @property
     def bytes_held(self) -> int:
-        """Bytes of segments with records in them; the last one counts as far as it is written."""
+        """Bytes of the segments with records; the current one counts up to its last frame."""
         return self._gc_lock.run(lambda: (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset)
 
     def full_error(self, reason: str) -> PycrormError:
-        """What a put into a full spool raises."""
+        """Return the error that a put into a full spool raises."""
         if self.stuck is None:
             return SpoolFull(f"spool {self._folder} is full: {reason}")
         return SpoolStuck(f"spool {self._folder} is full ({reason}) and cannot be emptied: {self.stuck}")
@@ -407,24 +329,24 @@ class Appender:
 
     def _allocation_refused(self, error: OSError) -> PycrormError:
         reason = error.strerror or str(error)
-        if error.errno not in _NOT_NOW:
+        if error.errno not in OUT_OF_RESOURCES:
             return SpoolUnavailable(self._folder, reason)
         self._disk_refused = reason
         self._set_limits()
-        self._hurry()  # the sync thread tries again until there is room
+        self._hurry()  # the sync thread retries until the disk has space
         return self.full_error(reason)
 
     # --- ending ------------------------------------------------------------------------------------------------
 
     def refuse(self, refusal: Callable[[], PycrormError]) -> None:
-        """No record is taken from now on; the first reason stays."""
+        """Refuse every record from now on; the first refusal stays."""
         self._gc_lock.run(partial(self._refuse, refusal))
 
     def _refuse(self, refusal: Callable[[], PycrormError]) -> None:
         self._refusal = self._refusal or refusal
 
     def close(self) -> None:
-        """Gives up mappings and files, when refusing already."""
+        """Close mappings and files; call `refuse` first."""
         self._gc_lock.run(self._close)
 
     def _close(self) -> None:
@@ -433,7 +355,7 @@ class Appender:
                 segment.close()
 
     def abandon(self, refusal: Callable[[], PycrormError]) -> None:
-        """In a forked child: nothing here is this process's; the locks may be held by threads it does not have."""
+        """Detach in a forked child: replace the locks, whose holders may be threads that the child does not have."""
         self._gc_lock.abandon()
         self._gc_lock, self._making = GcSafeLock(), threading.Lock()
         self._refusal = refusal

@@ -1,7 +1,7 @@
-"""Whether a frame may be put: how much one recorder may hold, and what is kept back for ends and observations. Pure.
+"""Decide whether a frame may be put: limit one recorder's bytes, and reserve space for ends and observations. Pure.
 
-Space is given out in whole segments, so that the files never hold more than `spool_bytes_max`. At the end of each there
-is room for two commit frames: a sync that began before the last record came, and the one that covers it.
+Space is assigned in whole segments, so the files never exceed `spool_bytes_max`. Each segment reserves space for two
+commit frames at its end: that of a sync that began before the last record, and that of the sync that covers it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,17 @@ __all__ = ["Capacity"]
 
 _COMMITS_BYTES = 2 * COMMIT_BYTES
 _EPISODES_MIN = 16
+"""Open episodes that every segment's header has space for beside the largest record."""
 
 
 class Capacity(NamedTuple):
-    """What is allowed. `spare` below is how many segments may still be begun, `episodes` how many are open.
+    """The limits of one recorder.
 
-    With up to `episodes_max` open episodes, which every segment's header names, the largest record fits into a segment.
-    The declarations in use, which every segment begins with, take their room from that of the episodes: `declared`.
+    Every segment begins with a header that lists the open episodes, and with the declarations in use. With up to
+    `episodes_max` open episodes the largest record still fits into a segment; declarations use part of that space.
+
+    In the methods `spare` is the number of segments that may still begin, `episodes` the number of open episodes, and
+    `declared` the bytes of the declarations in use.
     """
 
     segment_bytes: int
@@ -33,7 +37,7 @@ class Capacity(NamedTuple):
 
     @classmethod
     def of(cls, settings: Settings) -> Capacity:
-        """Raises `CallerError` for settings with which a queue could fill up and never be emptied, or lose a record."""
+        """Derive the limits. Raises `CallerError` for settings that could block the queue for ever or lose a record."""
         if settings.spool_bytes_max - settings.spool_reserve_bytes < 3 * settings.segment_bytes:
             raise CallerError(
                 f"spool_bytes_max ({settings.spool_bytes_max:,}) must hold the reserve"
@@ -41,12 +45,12 @@ class Capacity(NamedTuple):
             )
         if settings.segment_bytes > SEGMENT_BYTES_MAX:
             raise CallerError(f"segment_bytes ({settings.segment_bytes:,}) must be at most {SEGMENT_BYTES_MAX:,}")
-        least = header_bytes(_EPISODES_MIN) + frame_bytes(TYPE_BYTES_MAX, settings.record_bytes_max) + _COMMITS_BYTES
-        left = settings.segment_bytes - least
+        needed = header_bytes(_EPISODES_MIN) + frame_bytes(TYPE_BYTES_MAX, settings.record_bytes_max) + _COMMITS_BYTES
+        left = settings.segment_bytes - needed
         if left < 0:
             raise CallerError(
                 f"segment_bytes ({settings.segment_bytes:,}) must hold a record of record_bytes_max"
-                f" ({settings.record_bytes_max:,}) and {_EPISODES_MIN} open episodes: {least:,} at least"
+                f" ({settings.record_bytes_max:,}) and {_EPISODES_MIN} open episodes: {needed:,} at least"
             )
         return cls(
             settings.segment_bytes,
@@ -57,24 +61,26 @@ class Capacity(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Records of a segment end here at the latest."""
+        """The largest offset at which a segment's records may end."""
         return self.segment_bytes - _COMMITS_BYTES
 
     def room_to_declare(self, *, episodes: int, declared: int) -> int:
-        """How large a declaration may be that every segment is to begin with, beside those that take `declared` bytes:
-        the largest record fits behind them and so many open episodes, and behind sixteen."""
+        """Return the largest size of a further declaration that segments can repeat.
+
+        Behind the declarations and the open episodes, at least sixteen, the largest record must still fit.
+        """
         return header_bytes(self.episodes_max) - header_bytes(max(episodes, _EPISODES_MIN)) - declared
 
     def takes_episode(self, *, episodes: int, declared: int) -> bool:
-        """Whether one more may be open."""
+        """Return whether one more episode may be open."""
         return header_bytes(episodes + 1) + declared <= header_bytes(self.episodes_max)
 
     def frame_bytes_max(self, *, episodes: int, declared: int = 0) -> int:
-        """The largest frame that fits into a segment behind its header and the declarations in use."""
+        """Return the largest frame that fits into a segment behind its header and declarations."""
         return self.end - header_bytes(episodes) - declared
 
     def ordinary_end(self, *, spare: int, episodes: int, declared: int = 0) -> int:
-        """Ordinary records of the current segment end here, so that the reserve stays free."""
+        """Return the offset at which ordinary records of the current segment must end to keep the reserve free."""
         return min(
             self.end, self.end + spare * self.frame_bytes_max(episodes=episodes, declared=declared) - self.reserve_bytes
         )
@@ -82,7 +88,7 @@ class Capacity(NamedTuple):
     def admits(
         self, frame_bytes: int, *, offset: int, spare: int, episodes: int, reserved: bool, declared: int = 0
     ) -> bool:
-        """Whether a frame may be put when the current segment is full up to `offset`."""
+        """Return whether a frame may be put when the current segment is filled up to `offset`."""
         empty = self.frame_bytes_max(episodes=episodes, declared=declared)
         free = spare * empty - frame_bytes
         if offset + frame_bytes <= self.end:

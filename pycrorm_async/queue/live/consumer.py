@@ -1,8 +1,9 @@
-"""The consumer's end of a live queue: synced records in order, read back from the folder the queue is in.
+"""Read synced records back from the folder of a live queue, in order, for the queue's one consumer.
 
-It belongs to one task of one loop. The sync thread may move the queue to another folder at any moment (`relocation.py`)
-and publishes the new `Place`. The consumer follows with its next step, from the position it has got to. A read that
-fails because of the move is made again there; the sync thread is asked to look at its files first.
+A consumer belongs to one task of one loop. The sync thread may move the queue to another folder at any time
+(`relocation.py`) and publishes the new `Place`. The consumer switches to it at its next step and continues behind its
+position. When a read fails, the consumer first asks the sync thread to check its files; if the queue then has moved,
+the consumer repeats the read in the new folder.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ __all__ = ["Consumer", "Place", "QueueView"]
 
 
 class Place(NamedTuple):
-    """The folder a queue writes in, under this recorder's id; `start` is before its first record."""
+    """The folder that a queue writes in, the recorder's id, and the cursor before the folder's first record."""
 
     folder: Path
     recorder: bytes
@@ -37,7 +38,7 @@ class Place(NamedTuple):
 
 
 class QueueView(Protocol):
-    """The queue, as its consumer sees it. All of it is another thread's and may change between two steps."""
+    """The consumer's view of its queue. Other threads change all of it, between any two steps."""
 
     @property
     def place(self) -> Place: ...
@@ -49,24 +50,24 @@ class QueueView(Protocol):
     def failure(self) -> PycrormError | None: ...
 
     def ends_at(self, position: int) -> bool:
-        """Whether nothing comes after this position any more."""
+        """Return whether no record will follow this position."""
         ...
 
-    async def look(self) -> None:
-        """Done when the files were compared with those in the folder; a queue that is displaced has moved by then."""
+    async def check_files(self) -> None:
+        """Wait until the sync thread has compared its files with the folder and has moved a displaced queue."""
         ...
 
 
 class Consumer:
-    """Reads, and holds the lock `drain` from its first batch on."""
+    """The consumer; it holds the lock `drain` from its first batch on."""
 
-    def __init__(self, queue: QueueView, bell: Notifier) -> None:
+    def __init__(self, queue: QueueView, notifier: Notifier) -> None:
         self._queue = queue
-        self._notifier = bell
+        self._notifier = notifier
         self._place = queue.place
         self._drain: FileLock | None = None
         self._released = False
-        self._refused = DeadLetters(self._place.folder)
+        self._dead_letters = DeadLetters(self._place.folder)
         self.reader = _reader(self._place)
 
     @property
@@ -77,30 +78,30 @@ class Consumer:
         """As `RecorderQueue.get_batch`."""
         while True:
             try:
-                self._follow()
+                self._switch_folder()
                 return await self._batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
             except (SpoolDamaged, SpoolUnavailable) as error:
                 if error is self._queue.failure:
                     raise
                 if self._queue.place is self._place:
-                    await self._queue.look()
+                    await self._queue.check_files()
                 if self._queue.place is self._place:
                     raise self._queue.failure or error from None
 
     def dead_letter(self, records: Sequence[Record]) -> None:
         """As `RecorderQueue.dead_letter`."""
-        self._refused.put(records)
+        self._dead_letters.put(records)
 
     def release(self) -> None:
-        """Gives up files and locks. Twice is once."""
+        """Close the files and release the locks. Idempotent."""
         self._released = True
         self.reader.close()
-        self._refused.release()
+        self._dead_letters.release()
         if self._drain is not None:
             self._drain.release()
 
-    def _follow(self) -> None:
-        """Goes on in the folder where the queue is now. Where records were lost it goes on behind them."""
+    def _switch_folder(self) -> None:
+        """Continue in the queue's current folder, behind the last position; records lost in between are skipped."""
         place = self._queue.place
         if place is self._place:
             return
@@ -108,35 +109,35 @@ class Consumer:
         with wrap_os_errors(place.folder):
             reader.skip_to(self.reader.cursor.position)
         self.reader.close()
-        self._refused.release()
+        self._dead_letters.release()
         if self._drain is not None:
             self._drain.release()
-        self._drain, self._refused = None, DeadLetters(place.folder)
+        self._drain, self._dead_letters = None, DeadLetters(place.folder)
         self.reader, self._place = reader, place
 
     async def _batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
         self._take_drain()
-        await self._notifier.until(partial(self._further, self.reader.cursor.position))
+        await self._notifier.until(partial(self._has_news, self.reader.cursor.position))
         batch = self._read(None, events_max, bytes_max)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(age_s_max):
                 while not batch.complete and not self._queue.ends_at(batch.after.position):
-                    await self._notifier.until(partial(self._further, batch.after.position))
+                    await self._notifier.until(partial(self._has_news, batch.after.position))
                     batch = self._read(batch, events_max, bytes_max)
         if not batch.records and self._queue.failure is not None:
             raise self._queue.failure
         self.reader.cursor = batch.after
         return batch.records
 
-    def _further(self, position: int) -> bool:
+    def _has_news(self, position: int) -> bool:
         return self._queue.synced > position or self._queue.ends_at(position) or self._queue.place is not self._place
 
-    def _read(self, begun: Batch | None, events_max: int, bytes_max: int) -> Batch:
+    def _read(self, partial_batch: Batch | None, events_max: int, bytes_max: int) -> Batch:
         if self._queue.place is not self._place:
-            raise SpoolUnavailable(self._place.folder, "is not used any more")
+            raise SpoolUnavailable(self._place.folder, "is no longer used: the queue has moved to another folder")
         with wrap_os_errors(self._place.folder):
             last = self._queue.synced
-            return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, partial=begun)
+            return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, partial=partial_batch)
 
     def _take_drain(self) -> None:
         if self._drain is None and not self._released:

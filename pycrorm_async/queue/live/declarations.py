@@ -1,6 +1,6 @@
-"""The declarations a recorder has put, which every segment begins with: so that each can be read without those before.
+"""Repeat a recorder's declarations at the beginning of every segment, so that each segment can be read alone.
 
-They are ordinary records with positions of their own. The log keeps a declaration once, by its content.
+The repeated declarations are ordinary records with positions of their own. The log stores equal declarations once.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ __all__ = ["Declarations", "AppendState"]
 
 
 class AppendState(NamedTuple):
-    """What the frames of a segment's beginning come to: where they end, the last position, and of the span that is
-    not synced yet how many records it has and their checksum."""
+    """An appender's state behind some frames: offset, last position, count and checksum of the unsynced records."""
 
     offset: int
     position: int
@@ -26,7 +25,7 @@ class AppendState(NamedTuple):
 
 
 class Declarations:
-    """Those in use. `bytes` is what they take in each segment, `unrepeated` counts those there was no room for."""
+    """The declarations in use. `bytes` is their size in each segment; `unrepeated` counts those that did not fit."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -34,7 +33,7 @@ class Declarations:
         self._bodies: dict[bytes, tuple[int, int, int]] = {}
 
     def add(self, body: bytes, *, name_bytes: int, version: int, payload_bytes: int, room: int) -> None:
-        """One more; one that is in use already counts once, one that is larger than `room` is not repeated."""
+        """Add a declaration. Ignores one in use already; does not repeat one larger than `room` bytes."""
         if body in self._bodies:
             return
         size = HEADER_BYTES + len(body)
@@ -44,9 +43,9 @@ class Declarations:
         self._bodies[body] = name_bytes, version, payload_bytes
         self.bytes += size
 
-    def write(self, buffer: mmap.mmap, begun: AppendState, *, salt: int, clock: Clock) -> AppendState:
-        """Writes their frames from `begun` on, which stands before the first."""
-        offset, position, records, checksum = begun
+    def write(self, buffer: mmap.mmap, state: AppendState, *, salt: int, clock: Clock) -> AppendState:
+        """Write the declarations' frames from `state` on; return the state behind them."""
+        offset, position, records, checksum = state
         for body, (name_bytes, version, payload_bytes) in self._bodies.items():
             position += 1
             records += 1

@@ -1,8 +1,21 @@
-"""A lock whose holder is not disturbed: while it is held the garbage collector does not run.
+"""Provide a lock that disables garbage collection while held, so that a finalizer cannot try to acquire it again.
 
-The collector may close a suspended plan in any thread at any allocation, and the plan's `finally` records its end. In a
-thread that held the queue's lock at that moment it would wait for itself for ever. A lock that may be taken twice would
-be worse: a record inside a half-written one.
+**Theory of operation.** The garbage collector may run at any allocation, in any thread, and close a suspended plan
+there; the plan's `finally` records its end. In a thread that holds the queue's lock, this put would wait for the lock
+of its own thread for ever. A reentrant lock would be worse, because the put would write a record inside a half-written
+one. So the lock's holder disables the collector.
+
+The thread takes the lock first and disables the collector second. In the other order two threads could interleave, and
+leave the collector off for ever, or on while one of them holds the lock. `paused` records whether this lock's holder
+turned the collector off; only the holder reads or writes it.
+
+The collector is one switch for the whole process, so another queue or the program itself may turn it on while the lock
+is held. A signal handler may also run at any time. `owner` catches both: a thread that meets its own id raises
+`InternalError` instead of waiting for itself. Other threads may read a stale `owner`, but never their own id.
+
+`pause_gc` extends the pause beyond the lock, for a thread that takes a second lock which a put may need too
+(`Appender._making`). It hands the pause from `paused` to `_pause_extended` under the lock, so there is no moment in
+between at which the collector is on; `resume_gc` hands it back.
 """
 
 from __future__ import annotations
@@ -20,33 +33,28 @@ _T = TypeVar("_T")
 
 
 class GcSafeLock:
-    """One lock, and the pause of the collector that belongs to it. `Appender.put` does by itself what `run` does.
+    """A lock and the pause of the garbage collector that belongs to it. `Appender.put` inlines `run` for speed."""
 
-    The lock is taken first, then the collector is paused, for two threads that switch it without a lock could leave it
-    off, or on in the middle of the other's work. It is one switch for the whole process: another queue, or a program
-    that switches it too, may still turn it on in between. Then `owner` is what keeps a thread from waiting for itself.
-    """
-
-    __slots__ = ("_held_off", "lock", "owner", "paused")
+    __slots__ = ("_pause_extended", "lock", "owner", "paused")
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.owner = 0
         self.paused = False
-        self._held_off = False
+        self._pause_extended = False
 
     def run(self, work: Callable[[], _T]) -> _T:
-        """Does this alone. Raises `InternalError` inside work of the same thread.
+        """Do the work under the lock. Raises `InternalError` if this thread holds the lock already.
 
-        Not a context manager: a KeyboardInterrupt in an `__enter__` of ours would leave the lock behind, taken.
+        Not a context manager, because a KeyboardInterrupt in our `__enter__` would leave the lock taken.
         """
-        me = threading.get_ident()
-        if self.owner == me:
+        thread = threading.get_ident()
+        if self.owner == thread:
             raise self.reentered()
         try:
             with self.lock:
                 try:
-                    self.owner = me
+                    self.owner = thread
                     self.paused = gc.isenabled()
                     gc.disable()
                     return work()
@@ -54,30 +62,30 @@ class GcSafeLock:
                     if self.paused:
                         gc.enable()
         finally:
-            # Not before the lock is free: letting go of it allocates.
-            if self.owner == me:
+            # Reset `owner` after the release, which allocates: a finalizer that runs there must still be refused.
+            if self.owner == thread:
                 self.owner = 0
 
     def reentered(self) -> InternalError:
-        """What is raised instead of waiting for oneself."""
+        """Return the error for a thread that would wait for itself."""
         return InternalError("this thread is recording already: a signal handler or a finalizer cannot record now")
 
-    def hold_off(self) -> None:
-        """No collection until `go_on`, though the lock is free: for one thread that takes another lock inside."""
-        self.run(self._hold_off)
+    def pause_gc(self) -> None:
+        """Disable the collector until `resume_gc`, without the lock; for one thread that takes another lock inside."""
+        self.run(self._pause_gc)
 
-    def go_on(self) -> None:
-        """Undoes `hold_off`; twice is once."""
-        self.run(self._go_on)
+    def resume_gc(self) -> None:
+        """Undo `pause_gc`. Idempotent."""
+        self.run(self._resume_gc)
 
     def abandon(self) -> None:
-        """In a forked child: the thread that would end the pause may not be here."""
-        if self._held_off or (self.owner and self.paused):
+        """Enable the collector in a forked child, which may lack the thread that would end the pause."""
+        if self._pause_extended or (self.owner and self.paused):
             gc.enable()
 
-    def _hold_off(self) -> None:
-        # Both only while `run` keeps it paused, and so the pause goes from one to the other without a gap.
-        self._held_off, self.paused = self.paused, False
+    def _pause_gc(self) -> None:
+        # `run` keeps the collector off here, so handing over the pause leaves no gap.
+        self._pause_extended, self.paused = self.paused, False
 
-    def _go_on(self) -> None:
-        self._held_off, self.paused = False, self.paused or self._held_off
+    def _resume_gc(self) -> None:
+        self._pause_extended, self.paused = False, self.paused or self._pause_extended

@@ -1,10 +1,14 @@
-"""Wakes whoever waits for a change: coroutines of any loop, and blocked threads.
+"""Wake coroutines of any loop, and blocked threads, that wait for a change of shared state.
 
-A waiter asks for its ticket first, looks whether what it wants is there already, and only then waits: a ring between
-looking and waiting is not missed.
+**Theory of operation.** A waiter puts a ticket (a future) into the set, then tests its condition, and only then waits
+for the ticket. A notifier first changes the state and then completes the tickets. So a change between the waiter's test
+and its wait completes the ticket, and no change is missed.
 
-There is no lock in it, for a thread could find that it holds it itself (`alone.py`): each step on the set of tickets is
-one that no other thread comes into.
+The notifier uses no lock, because a finalizer or a signal handler could run in the thread that holds it and wait for
+itself (`gc_safe_lock.py`). Each operation on the set is atomic under the interpreter lock: `notify_all` iterates over a
+copy and removes each ticket before completing it, so of two concurrent calls only one completes a ticket, and a waiter
+that leaves at the same moment discards its ticket without harm. `set_running_or_notify_cancel` skips a ticket that its
+waiter has cancelled.
 """
 
 from __future__ import annotations
@@ -18,28 +22,28 @@ __all__ = ["Notifier"]
 
 
 class Notifier:
-    """Rings for all who wait at that moment."""
+    """Wakes all coroutines and threads that wait at the time of the call."""
 
     def __init__(self) -> None:
         self._tickets: set[Future[None]] = set()
 
     def notify_all(self) -> None:
-        """Wakes everybody. From any thread."""
+        """Wake all waiters. From any thread."""
         for ticket in list(self._tickets):
             try:
                 self._tickets.remove(ticket)
-            except KeyError:  # another ring was first, or it is no longer wanted
+            except KeyError:  # another call completed it, or its waiter has left
                 continue
             if ticket.set_running_or_notify_cancel():
                 ticket.set_result(None)
 
     @property
     def awaited(self) -> bool:
-        """Whether somebody waits now."""
+        """Whether a coroutine or a thread waits now."""
         return bool(self._tickets)
 
     async def until(self, reached: Callable[[], bool]) -> None:
-        """Done when `reached` is true; it is asked now and after every ring, in the caller's loop."""
+        """Wait until `reached` returns true; calls it now and after every notification, in the caller's loop."""
         while True:
             ticket = self._ticket()
             try:
@@ -50,7 +54,7 @@ class Notifier:
                 self._forget(ticket)
 
     def block_until(self, reached: Callable[[], bool], *, remaining_s: Callable[[], float]) -> bool:
-        """Blocks this thread until `reached` is true; False when no time remains."""
+        """Block this thread until `reached` returns true; return False when no time remains."""
         while True:
             ticket = self._ticket()
             try:

@@ -1,7 +1,23 @@
-"""The files of a live queue, and the turns of the sync thread, which alone changes them.
+"""Sync, acknowledge, trim and move the files of a live queue, in turns of the sync thread.
 
-A turn syncs what was put, acknowledges it if the files are still the ones in the folder, deletes what is stored, and
-makes the next segment ahead. Where files were deleted or replaced it moves the queue (`relocation.py`).
+**Theory of operation.** Three actors share a `QueueFiles`. The sync thread alone changes the files and, in `_turn`, the
+positions and the state of a move. Producers put through `_appender` and wait for space on `_room_notifier`. The
+consumer and callers of `synced_to` read `_synced`, `_setbacks`, `_checks` and wait on `_notifier`. Each attribute is
+written by one thread, except those a producer or the consumer only sets to request work (`_check_requested`,
+`_stored`), and each is replaced in one step, so the readers need no lock: they test their condition again after every
+notification.
+
+A turn does the following, in this order. It syncs the records put so far, appends a commit frame and syncs that. Then
+it compares the files it holds with those in the folder, because syncing a deleted file succeeds, and only then advances
+`_synced`. It exchanges positions with the drainer of another process. It deletes the segments whose records are all
+stored, and prepares the next segment.
+
+If a file was deleted or replaced, the queue is *displaced*: `_synced` stays, `synced_to` raises, and the turn moves the
+queue to another folder (`relocation.py`). It retries with growing pauses until the move succeeds or the queue is
+closed. Records that a move loses are noted in `_lost` and raised once by `synced_to`.
+
+A sync that fails is never repeated on the same files, because the kernel may have dropped the pages it could not write.
+The queue *fails*: it refuses every later put with the disk's error, and supplies the records synced before.
 """
 
 from __future__ import annotations
@@ -32,57 +48,57 @@ from pycrorm_async.queue.live.sync_thread import SyncThread
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.settings import Settings
 
-__all__ = ["QueueFiles", "LOOK_S"]
+__all__ = ["QueueFiles", "PROGRESS_INTERVAL_S"]
 
-LOOK_S = 0.05
-"""How often the sync thread looks what another process has drained, while that may make a difference."""
-_MOVE_AGAIN_S_MAX = 5.0
-"""The longest pause before a displaced queue tries again to make a folder."""
+PROGRESS_INTERVAL_S = 0.05
+"""Interval at which the sync thread reads `progress` while segments or producers wait for another process."""
+_MOVE_RETRY_S_MAX = 5.0
+"""Bounds the pause before a displaced queue tries again to create a folder."""
 
 _log = logging.getLogger("pycrorm_async")
 
 
 class QueueFiles:
-    """What the sync thread keeps of a queue. Producers and the consumer only read it (`recorder.py`)."""
+    """The part of a queue that the sync thread maintains; `RecorderQueue` adds the producers and the consumer."""
 
     def __init__(
         self, *, folder: Path, recorder: bytes, settings: Settings, clock: Clock, alive: FileLock, offered: bool
     ) -> None:
-        """`alive` is locked, and in the folder. Raises `SpoolUnavailable`."""
+        """Allocate the first segments; `alive` is the held lock in the folder. Raises `SpoolUnavailable`."""
         self._spool = folder.parent
         self._settings = settings
         self._clock = clock
-        self._left: list[FileLock] = []  # the `alive` of folders this queue has moved from
+        self._former_locks: list[FileLock] = []  # `alive` of the folders this queue has moved from
         self._log_id: str | None = None
         self._notifier = Notifier()
         self._room_notifier = Notifier()
         self._synced = 0
         self._stored = 0
         self._failure: PycrormError | None = None
-        self._displaced: SpoolUnavailable | None = None  # until it has moved
+        self._displaced: SpoolUnavailable | None = None  # set until the queue has moved
         self._setback: SpoolUnavailable | None = None
         self._setbacks = 0
         self._lost: tuple[str, ...] = ()
-        self._lost_noted = 0
-        self._unreported: SpoolUnavailable | None = None  # a loss that no call of `synced_to` has raised
-        self._asked = False
-        self._answers = 0
+        self._lost_reported = 0
+        self._unreported_loss: SpoolUnavailable | None = None  # a loss that `synced_to` has not raised yet
+        self._check_requested = False
+        self._checks = 0
         self._closed = False
-        self._gone = False
+        self._released = False
         self._safe_number = 0
         self._sync_interval_s = settings.sync_interval_ms / 1000
-        self._kept = StoredSegments(folder.parent, settings, wall_ns=clock.wall_ns)
+        self._stored_segments = StoredSegments(folder.parent, settings, wall_ns=clock.wall_ns)
         self._sync_thread = SyncThread(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
         with wrap_os_errors(folder):
             self._appender = self._appender_in(folder, recorder)
             self._disk_was_full = self._appender.prepare()
-            self._outside = DrainStatusReader(folder) if offered else None
+            self._drain_status = DrainStatusReader(folder) if offered else None
             place = Place(folder, recorder, Cursor(1, header_bytes(0), 0))
-            self._home = Home(place, alive, FileIdentity.of(folder.stat()), self._appender, self._outside)
+            self._home = Home(place, alive, FileIdentity.of(folder.stat()), self._appender, self._drain_status)
 
     @property
     def place(self) -> Place:
-        """The folder it writes in. Another one after its files were deleted or replaced (`relocation.py`)."""
+        """The folder the queue writes in; another one after its files were deleted or replaced (`relocation.py`)."""
         return self._home.place
 
     @property
@@ -95,41 +111,41 @@ class QueueFiles:
 
     @property
     def failure(self) -> PycrormError | None:
-        """Why nothing is taken any more; None while records are taken, and after `close`."""
+        """The error that makes the queue refuse records; None while it accepts them, and after `close`."""
         return self._failure
 
     @property
     def setback(self) -> str | None:
-        """What befell its files last, and where it goes on; None if nothing did."""
+        """The last loss of files or failure, with the folder where recording continues; None without one."""
         error = self._failure or self._setback
         return None if error is None else str(error)
 
     @property
     def lost(self) -> tuple[str, ...]:
-        """The records that went with deleted files, in words: they had been synced, or were to be."""
+        """Descriptions of the records lost with deleted files, whether synced or not."""
         return self._lost
 
     @property
     def written(self) -> int:
-        """Position of the last record: all up to it survive the death of the process."""
+        """Position of the last record put: records up to it survive the death of the process."""
         return self._appender.position
 
     @property
     def synced(self) -> int:
-        """All up to this position survive the death of the machine."""
+        """Last synced position: records up to it survive the death of the machine."""
         return self._synced
 
     @property
     def stored(self) -> int:
-        """All up to this position are acknowledged."""
-        if self._outside is None:
+        """Last acknowledged position."""
+        if self._drain_status is None:
             return self._stored
-        return max(self._stored, self._outside.read(synced=self._synced).stored)
+        return max(self._stored, self._drain_status.read(synced=self._synced).stored)
 
     @property
     def external_drain_status(self) -> DrainStatus | None:
-        """What the process that drains this queue says, as far as it can be true; None if it is this one."""
-        return None if self._outside is None else self._outside.read(synced=self._synced)
+        """The drain status from another process, if plausible; None if this process drains the queue."""
+        return None if self._drain_status is None else self._drain_status.read(synced=self._synced)
 
     @property
     def _over(self) -> bool:
@@ -138,23 +154,23 @@ class QueueFiles:
     # --- the sync thread ---------------------------------------------------------------------------------------
 
     def _turn(self) -> float | None:
-        """Syncs, deletes what is stored, makes the next segment ahead; in how many seconds to come again by itself."""
+        """Sync, trim, prepare the next segment; return the seconds until the next turn is needed, or None."""
         if self._failure is not None:
             return None
-        asked, self._asked = self._asked, False
+        check_requested, self._check_requested = self._check_requested, False
         try:
             if self._displaced is None:
-                self._sync(look=asked)
+                self._sync(check=check_requested)
             if self._displaced is not None and not self._move():
-                self._answer(asked=asked)
-                return min(_MOVE_AGAIN_S_MAX, self._sync_interval_s * (1 << min(self._setbacks, 10)))
-            told = self._outside is None or self._exchange(self._outside)
+                self._report_check(check_requested=check_requested)
+                return min(_MOVE_RETRY_S_MAX, self._sync_interval_s * (1 << min(self._setbacks, 10)))
+            published = self._drain_status is None or self._exchange(self._drain_status)
             self._trim()
             full = self._prepare()
-            self._answer(asked=asked)
+            self._report_check(check_requested=check_requested)
         except OSError as error:
-            if self._note_missing(self._appender.segments):  # the next turn moves
-                self._answer(asked=asked)
+            if self._note_missing(self._appender.segments):  # the next turn moves the queue
+                self._report_check(check_requested=check_requested)
                 return 0.0
             self._fail(SpoolUnavailable(self.folder, error.strerror or str(error)))
             return None
@@ -163,34 +179,34 @@ class QueueFiles:
             raise
         if full:
             return self._sync_interval_s
-        waiting = self._outside is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
-        return LOOK_S if waiting or not told else None
+        waiting = self._drain_status is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
+        return PROGRESS_INTERVAL_S if waiting or not published else None
 
-    def _exchange(self, outside: DrainStatusReader) -> bool:
-        """Tells whoever drains this queue what is synced, hears what is stored; False if it could not be told."""
-        told = self._tell(outside)
-        said = outside.read(synced=self._synced)
-        self._stored = max(self._stored, said.stored)
-        if said.note.given_up != self._appender.stuck:
-            self._appender.stuck = said.note.given_up
+    def _exchange(self, drain_status: DrainStatusReader) -> bool:
+        """Publish the synced position to the drainer and read its status; False if publishing failed."""
+        published = self._publish(drain_status)
+        status = drain_status.read(synced=self._synced)
+        self._stored = max(self._stored, status.stored)
+        if status.note.given_up != self._appender.stuck:
+            self._appender.stuck = status.note.given_up
             self._room_notifier.notify_all()
-        return told
+        return published
 
-    def _answer(self, *, asked: bool) -> None:
-        if asked:
-            self._answers += 1
+    def _report_check(self, *, check_requested: bool) -> None:
+        if check_requested:
+            self._checks += 1
             self._notifier.notify_all()
 
-    def _sync(self, *, look: bool = False) -> None:
+    def _sync(self, *, check: bool = False) -> None:
         span = self._appender.begin_sync()
         if span.records == 0:
-            if look:
+            if check:
                 self._note_missing(span.segments)
             return
         for segment in span.segments:
             segment.sync()
-        # Only now may a commit frame say so: had it been written before, a power cut in between could leave the frame
-        # on the disk without all that it speaks of, and an ordinary tail would look like damage.
+        # Append the commit frame only now: if it were synced together with its records, a power cut could keep the
+        # frame and lose a record, and an ordinary torn tail would look like damage.
         committed = self._appender.append_commit(span)
         committed.sync()
         if self._note_missing((*span.segments, committed)):
@@ -198,14 +214,14 @@ class QueueFiles:
         self._appender.end_sync(span)
         self._safe_number = span.segments[-1].number
         self._synced = span.position
-        if self._outside is not None:
-            self._tell(self._outside)  # first, so that who waited for the disk need not wait for this
+        if self._drain_status is not None:
+            self._publish(self._drain_status)  # before waiters of this process run
         self._notifier.notify_all()
 
     # --- moving ------------------------------------------------------------------------------------------------
 
     def _missing(self, segments: Sequence[Segment]) -> Path | None:
-        """The first file of ours that has lost its name to another, or to none."""
+        """Return the first of our files whose name is missing or names another file."""
         if not self._home.alive.identity.is_at(self.folder / ALIVE):
             return self.folder / ALIVE
         return next((segment.path for segment in dict.fromkeys(segments) if not segment.is_in_place), None)
@@ -226,7 +242,7 @@ class QueueFiles:
         self._notifier.notify_all()
 
     def _move(self) -> bool:
-        """Goes on in a new folder, and syncs there; False if that cannot be made now. What can be read is kept."""
+        """Move the queue to a new folder with all readable records, and sync; False if that must be retried."""
         displaced = self._displaced
         assert displaced is not None
         try:
@@ -239,38 +255,38 @@ class QueueFiles:
                     recorder=episode_id(self._clock.wall_ns(), os.urandom(10)),
                     stored=self._stored,
                     appender_in=self._appender_in,
-                    settle=self._settle,
+                    switch_home=self._switch_home,
                 )
         except (FilesError, DamageError) as error:
-            reason = f"{displaced.reason}, and recording cannot go on in a new folder: {error}"
+            reason = f"{displaced.reason}, and recording cannot continue in a new folder: {error}"
             self._note_setback(SpoolUnavailable(displaced.path, reason))
             if self._closed and self._setback is not None:
                 self._fail(self._setback)
             return False
         if self._log_id is not None:
-            with suppress(FilesError):  # the drain of this process has the right log open all the same
+            with suppress(FilesError):  # a failed note is harmless: this process drains into the right log
                 Spool(self._spool, self._settings.file_access).bind(self._log_id)
-        news = self._lost[self._lost_noted :]
-        lost = f"lost are {'; '.join(news)}" if news else "no record is lost"
-        moved = SpoolUnavailable(displaced.path, f"{displaced.reason}; recording goes on in {self.folder}, {lost}")
-        # All of it before the sync, after which `synced_to` returns.
-        self._setback, self._lost_noted = moved, len(self._lost)
-        if news:
-            self._unreported = moved
+        losses = self._lost[self._lost_reported :]
+        lost = f"lost are {'; '.join(losses)}" if losses else "no record is lost"
+        moved = SpoolUnavailable(displaced.path, f"{displaced.reason}; recording continues in {self.folder}, {lost}")
+        # Set these before the sync, because `synced_to` returns after it.
+        self._setback, self._lost_reported = moved, len(self._lost)
+        if losses:
+            self._unreported_loss = moved
         _log.error("%s", moved)
         self._displaced = None
         self._sync()
         return self._displaced is None
 
-    def _settle(self, home: Home, lost: tuple[str, ...]) -> None:
-        """Called under the lock of the appender before: from now on this is where the queue writes.
+    def _switch_home(self, home: Home, lost: tuple[str, ...]) -> None:
+        """Switch the queue to this home; called under the old appender's lock.
 
-        What is lost is noted here, because the rest of the move may fail and be made again from this folder.
+        Notes the lost records here, because the rest of the move may fail and be retried from the new folder.
         """
         self._lost += lost
         if home.alive is not self._home.alive:
-            self._left.append(self._home.alive)
-        self._home, self._appender, self._outside = home, home.appender, home.outside
+            self._former_locks.append(self._home.alive)
+        self._home, self._appender, self._drain_status = home, home.appender, home.drain_status
         self._safe_number = 0
 
     def _appender_in(
@@ -283,23 +299,23 @@ class QueueFiles:
             clock=self._clock,
             wake=self._sync_thread.wake,
             hurry=self._sync_thread.hurry,
-            make_room=self._kept.make_room,
+            make_room=self._stored_segments.make_room,
             after=after,
             opened=opened,
         )
 
-    def _tell(self, outside: DrainStatusReader) -> bool:
-        return outside.publish(synced=self._synced, closed=self._closed and self._synced == self.written)
+    def _publish(self, drain_status: DrainStatusReader) -> bool:
+        return drain_status.publish(synced=self._synced, closed=self._closed and self._synced == self.written)
 
     def _trimmable(self) -> bool:
         return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))
 
     def _trim(self) -> None:
-        gone = self._appender.trimmable(stored=self._stored, safe_number=self._safe_number)
-        for segment in gone:
-            self._kept.keep(segment.path)
-        if gone:
-            self._appender.trimmed(gone)
+        segments = self._appender.trimmable(stored=self._stored, safe_number=self._safe_number)
+        for segment in segments:
+            self._stored_segments.keep(segment.path)
+        if segments:
+            self._appender.trimmed(segments)
             self._room_notifier.notify_all()
 
     def _prepare(self) -> bool:
@@ -312,7 +328,7 @@ class QueueFiles:
         return refused
 
     def _fail(self, error: PycrormError) -> None:
-        _log.error("nothing more is recorded: %s", error)
+        _log.error("recording has stopped: %s", error)
         self._failure = error
         self._appender.refuse(lambda: error)
         self._notifier.notify_all()

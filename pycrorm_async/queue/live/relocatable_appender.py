@@ -1,4 +1,7 @@
-"""An appender whose records can be carried to another one, in another folder, while threads go on putting."""
+"""Carry an appender's records to a successor in another folder, while threads keep putting.
+
+`relocation.py` describes the whole move.
+"""
 
 from __future__ import annotations
 
@@ -21,48 +24,48 @@ from pycrorm_async.queue.files.frame import (
     encode_header,
 )
 from pycrorm_async.queue.files.segment import EPISODE_ENDED, Segment
-from pycrorm_async.queue.live.appender import Appender
+from pycrorm_async.queue.live.syncable_appender import SyncableAppender
 
 __all__ = ["RelocatableAppender", "Relocated"]
 
 _EPISODE_ENDED: Final = EPISODE_ENDED.encode()
 _LATE_BYTES: Final = 2**16
-"""What is carried while the lock is held, at most: half a millisecond's work."""
+"""Bounds the bytes carried while the lock is held and producers wait: half a millisecond of work."""
 
 
 class Relocated(InternalError):
-    """This appender takes nothing any more: its successor does. Never leaves the queue."""
+    """This appender has handed over to its successor. Never leaves the queue, which retries the put there."""
 
 
-class RelocatableAppender(Appender):
-    """Adds to an appender what it takes to be the successor of another one, and to have one."""
+class RelocatableAppender(SyncableAppender):
+    """An appender that can succeed another one and hand over to a successor."""
 
     @property
     def segments(self) -> tuple[Segment, ...]:
-        """Those that are mapped: full ones that no sync covers yet, and the current one."""
+        """The mapped segments: full ones that no sync covers yet, and the current one."""
         return self._gc_lock.run(lambda: (*self._sealed, self._current))
 
     def carry(self, record: Fields) -> None:
-        """Append a record of another appender with its own position, sequence and times."""
+        """Append a record of another appender; it keeps its position, sequence and times."""
         self._gc_lock.run(partial(self._carry, record))
 
     def hand_over(
         self, successor: RelocatableAppender, segment: Segment, offset: int, *, switch: Callable[[], None]
     ) -> bool:
-        """Carry what was put behind `offset` of this segment, refuse more with `Relocated`, and call `switch`.
+        """Carry the records behind `offset` of this segment, refuse later puts with `Relocated`, and call `switch`.
 
-        All of it is one step for the threads that put. False, with nothing done, when that would take them longer than
-        a moment. Raises `SpoolUnavailable` when the mapping does not hold what was put.
+        Holds the lock, so producers see one step. Returns False without effect if too many bytes are left for that.
+        Raises `SpoolUnavailable` if the mapping does not contain the records that were put.
         """
         return self._gc_lock.run(partial(self._hand_over, successor, segment, offset, switch))
 
     def settle(self, folder: Path) -> None:
-        """The folder was renamed to this."""
+        """Note that the folder was renamed to this path."""
         self._gc_lock.run(partial(self._settle, folder))
 
     @property
     def free_bytes(self) -> int:
-        """What fits into the current segment."""
+        """Bytes that still fit into the current segment."""
         return self._end - self._offset
 
     def _carry(self, record: Fields) -> None:
@@ -108,10 +111,11 @@ class RelocatableAppender(Appender):
                 successor.carry(record)
         if successor.position != self.position:
             raise SpoolUnavailable(
-                segment.path, f"holds records up to position {successor.position} of {self.position} that were put"
+                segment.path, f"contains records only up to position {successor.position} of {self.position}"
             )
         successor.stuck = self.stuck
-        successor.declarations = self.declarations  # not before: what is carried keeps its positions
+        # Only now: repeating declarations before would shift the positions of carried records.
+        successor.declarations = self.declarations
         if self._refusal is not None:
             successor.refuse(self._refusal)
         self._refusal = _relocated

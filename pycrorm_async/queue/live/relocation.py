@@ -1,24 +1,23 @@
-"""Move a living queue to a new folder after its files were deleted or replaced by another program.
+"""Move a living queue to a new folder after another program deleted or replaced its files.
 
-**Theory of operation.** Syncing a file that has no name any more succeeds, so the sync thread compares, after each sync
-and before it acknowledges, the files it holds (`alive`, the segments) with those that have their names. Where they
-differ the queue is *displaced*: nothing is acknowledged, and `synced()` raises. A file without a name can still be read
-by the process that has it mapped. So the sync thread makes a folder of a new recorder, carries there what it can read,
-and goes on there:
+**Theory of operation.** Syncing a file without a name succeeds. So after each sync and before it acknowledges, the sync
+thread compares the files it holds (`alive`, the segments) with the files of those names. If they differ, the queue is
+*displaced*: it acknowledges nothing, and `synced_to` raises. A process can still read a file without a name that it has
+mapped. So the sync thread creates the folder of a new recorder, carries all readable records there and continues there:
 
-1. The new folder has an unfinished name, which no process that drains looks at.
-2. Records are carried segment by segment, with their positions, sequences and times. Meanwhile threads go on putting
-   into the old mapping. What they put last is carried under the lock of the old appender, which then refuses with
-   `Relocated`; a thread that meets that puts into the new one.
-3. What was carried is made safe, and the folder gets its name. If the old one is still there, its `alive` goes with the
-   next system call: of two folders of one queue only one may be recovered, because recovery ends the open episodes.
-4. The rest of the old folder is deleted. The next sync appends the commit frame, and acknowledges.
+1. The new folder has an unfinished name, which draining processes ignore.
+2. The records are carried segment by segment, with their positions, sequences and times. Meanwhile producers keep
+   putting into the old mapping. The last records are carried under the lock of the old appender, which then refuses
+   puts with `Relocated`; a producer that meets it puts into the new appender.
+3. The carried records are synced, and the folder gets its name. If the old folder still exists, the next system call
+   deletes its `alive`: only one of the two folders may be recovered, because recovery ends the open episodes.
+4. The rest of the old folder is deleted. The next sync appends the commit frame and acknowledges.
 
-A process killed before step 3 leaves what the other program left of the old folder. The lock on the old `alive` is held
-until the process ends: wherever that file was moved to, its recorder is alive.
+A process killed before step 3 leaves what the other program left of the old folder. The process holds the lock on the
+old `alive` until it ends, so that a folder moved elsewhere still counts as alive.
 
-Records in segments that are neither mapped nor readable are lost. `Remains.lost` names them, the log gets a gap, and
-the database refuses the rest of their episodes, which is kept beside the recorder's folder (`refused.py`).
+Records in segments that are neither mapped nor readable are lost. `Remains.lost` names them. The log gets a gap there,
+so the database refuses the rest of their episodes, which become dead letters (`sources/dead_letters.py`).
 """
 
 from __future__ import annotations
@@ -45,19 +44,19 @@ from pycrorm_async.settings import FileAccess
 __all__ = ["Home", "Remains", "move"]
 
 _EPISODES_MAX = 8
-"""How many episodes one line names."""
+"""Bounds the episodes that one line of a loss names."""
 _STALLS_MAX = 100
-"""How often a mapping may hold nothing new before it counts as overwritten: a thread may be writing just then."""
+"""Bounds the passes without a new record, while a producer is writing, before the mapping counts as overwritten."""
 
 
 class Home(NamedTuple):
-    """Where a queue writes, and with what."""
+    """The folder a queue writes in, with its locks, appender and drain status."""
 
     place: Place
     alive: FileLock
     identity: FileIdentity
     appender: RelocatableAppender
-    outside: DrainStatusReader | None
+    drain_status: DrainStatusReader | None
 
     @property
     def is_in_place(self) -> bool:
@@ -66,14 +65,14 @@ class Home(NamedTuple):
 
 
 class Remains(NamedTuple):
-    """What can be carried.
+    """The records that can be carried.
 
     Attributes:
-        contents: of the segments that can be read, without a hole between them; the last one still grows.
+        contents: numbers and contents of the readable segments, contiguous; producers still write into the last one.
         after: position of the record before the first of them.
-        opened: the episodes that are open there.
-        lost: what no file holds any more, one line for each run of positions.
-        left: whether records that are not stored stay in the old folder, because a hole follows them.
+        opened: the episodes open at that position.
+        lost: one line for each run of positions that no file contains any more.
+        left: whether the old folder keeps records that are not stored, because a hole follows them.
     """
 
     contents: list[tuple[int, Buffer]]
@@ -91,80 +90,80 @@ def move(
     recorder: EpisodeId,
     stored: int,
     appender_in: Callable[[Path, bytes, int, Mapping[EpisodeId, LastRecord]], RelocatableAppender],
-    settle: Callable[[Home, tuple[str, ...]], None],
+    switch_home: Callable[[Home, tuple[str, ...]], None],
 ) -> None:
-    """Make a folder for this recorder below the spool, and go on in it.
+    """Create a folder for this recorder below the spool, and continue the queue there.
 
-    `settle` is called when the queue is there, under the lock of the appender before and with what is lost, and again
-    when the folder has its name. Raises `FilesError` and `OSError`: before the first of these calls nothing is changed,
-    and after it the queue is in a folder with an unfinished name, from which it can move once more.
+    Calls `switch_home` with the lost records under the old appender's lock when the new one has all others, and again
+    when the folder has its name. Raises `FilesError` and `OSError`: before the first call without any effect, after it
+    with the queue in a folder with an unfinished name, from which it can move again.
     """
     unfinished, alive = begin_folder(spool, episode_text(recorder), access)
     appender: RelocatableAppender | None = None
-    settled = False
+    switched = False
     try:
-        remains = _remains_of(home.appender, home.place.recorder, stored=stored)
+        remains = _find_remains(home.appender, home.place.recorder, stored=stored)
         appender = appender_in(unfinished, recorder, remains.after, remains.opened)
-        outside = None if home.outside is None else DrainStatusReader(unfinished, before=remains.after)
+        drain_status = None if home.drain_status is None else DrainStatusReader(unfinished, before=remains.after)
         place = Place(unfinished, recorder, Cursor(1, header_bytes(len(remains.opened)), remains.after))
-        moved = Home(place, alive, FileIdentity.of(unfinished.stat()), appender, outside)
+        moved = Home(place, alive, FileIdentity.of(unfinished.stat()), appender, drain_status)
 
         def switch() -> None:
-            nonlocal settled
-            settle(moved, remains.lost)
-            settled = True
+            nonlocal switched
+            switch_home(moved, remains.lost)
+            switched = True
 
         _carry(remains, home.appender, appender, recorder=home.place.recorder, switch=switch)
     finally:
-        if not settled:
+        if not switched:
             if appender is not None:
                 appender.close()
             with suppress(OSError):
                 remove_folder(unfinished)
             alive.release()
-    goes = home.place.folder if home.is_in_place and not remains.left else None
+    old_folder = home.place.folder if home.is_in_place and not remains.left else None
     try:
-        for segment in appender.segments:  # before anything of the old folder goes
+        for segment in appender.segments:  # before any file of the old folder is deleted
             segment.sync()
-        folder = finish_folder(unfinished, replaced=goes)
+        folder = finish_folder(unfinished, replaced=old_folder)
         appender.settle(folder)
-        settle(moved._replace(place=place._replace(folder=folder)), ())
+        switch_home(moved._replace(place=place._replace(folder=folder)), ())
     except BaseException:
-        _leave(home, None)
+        _close_old(home, None)
         raise
-    _leave(home, goes)
+    _close_old(home, old_folder)
 
 
-def _leave(home: Home, folder: Path | None) -> None:
-    """Close what the queue had open, and delete the old folder if it is there and all of it was carried."""
+def _close_old(home: Home, folder: Path | None) -> None:
+    """Close the old appender and drain status; delete the old folder, if given."""
     if folder is not None:
         with suppress(OSError):
             remove_folder(folder)
     home.appender.close()
-    if home.outside is not None:
-        home.outside.close()
+    if home.drain_status is not None:
+        home.drain_status.close()
 
 
-def _remains_of(appender: RelocatableAppender, recorder: bytes, *, stored: int) -> Remains:
-    """Look for what is not stored, in the mappings and in the old folder."""
+def _find_remains(appender: RelocatableAppender, recorder: bytes, *, stored: int) -> Remains:
+    """Collect the records that are not stored, from the mappings and the old folder."""
     mapped = {segment.number: segment for segment in appender.segments}
     contents: list[tuple[int, Buffer]] = []
     lost: list[str] = []
     left = False
     begun = appender.begun
-    for each, following in zip_longest(begun, begun[1:]):
+    for start, following in zip_longest(begun, begun[1:]):
         content: Buffer | None
-        if each.number in mapped:
-            content = mapped[each.number].buffer
+        if start.number in mapped:
+            content = mapped[start.number].buffer
         else:
-            content = _readable(each, recorder, last=following.base - 1)
+            content = _read_whole(start, recorder, last=following.base - 1)
         if content is not None:
-            contents.append((each.number, content))
+            contents.append((start.number, content))
             continue
-        first, last = max(each.base, stored + 1), following.base - 1
+        first, last = max(start.base, stored + 1), following.base - 1
         if first <= last:
-            lost.append(_named(first, last, each.opened, following.opened))
-        left = left or (bool(contents) and each.base - 1 > stored)
+            lost.append(_describe_loss(first, last, start.opened, following.opened))
+        left = left or (bool(contents) and start.base - 1 > stored)
         contents = []
     header = decode_header(contents[0][1])
     assert header is not None, "the current segment is mapped, and its header is whole"
@@ -179,9 +178,9 @@ def _carry(
     recorder: bytes,
     switch: Callable[[], None],
 ) -> None:
-    """Carry all that can be read and what is put meanwhile; `switch` is called when the new one has all of it.
+    """Carry all readable records and those put meanwhile; call `switch` when the new appender has them all.
 
-    Raises `FilesError`; then the old one is as it was.
+    Raises `FilesError`; then the old appender is unchanged.
     """
     for number, content in remains.contents[:-1]:
         _carry_from(content, _first_frame(content), salt_of(recorder, number), new)
@@ -191,11 +190,11 @@ def _carry(
         offset = _carry_from(segment.buffer, _first_frame(segment.buffer), salt_of(recorder, segment.number), new)
         stalls = 0
         while not old.hand_over(new, segment, offset, switch=switch):
-            following, before = _after(old, segment), offset
+            following, before = _next_segment(old, segment), offset
             offset = _carry_from(segment.buffer, offset, salt_of(recorder, segment.number), new)
             stalls = stalls + 1 if offset == before else 0
             if stalls > _STALLS_MAX:
-                raise SpoolUnavailable(segment.path, f"does not hold at byte {offset} what was put there")
+                raise SpoolUnavailable(segment.path, f"does not contain at byte {offset} the record that was put there")
             if following is not None:
                 segment = following
                 break
@@ -204,14 +203,14 @@ def _carry(
 
 
 def _first_frame(content: Buffer) -> int:
-    """Where the first frame of a segment begins."""
+    """Return the offset of a segment's first frame."""
     header = decode_header(content)
-    assert header is not None, "what is carried was read before"
+    assert header is not None, "only segments with a valid header are carried"
     return header_bytes(len(header.open))
 
 
-def _after(appender: RelocatableAppender, segment: Segment) -> Segment | None:
-    """The segment that was begun behind this one, which is full then."""
+def _next_segment(appender: RelocatableAppender, segment: Segment) -> Segment | None:
+    """Return the segment after this one, if the appender has begun it."""
     return next((each for each in appender.segments if each.number == segment.number + 1), None)
 
 
@@ -223,8 +222,8 @@ def _carry_from(content: Buffer, offset: int, salt: int, new: RelocatableAppende
     return offset
 
 
-def _readable(begun: SegmentStart, recorder: bytes, *, last: int) -> bytes | None:
-    """The content of a segment that is not mapped any more; None if it is not all there."""
+def _read_whole(begun: SegmentStart, recorder: bytes, *, last: int) -> bytes | None:
+    """Read a segment that is not mapped any more; None if a record of it is missing."""
     try:
         content = read_segment(begun.path)
     except (OSError, PycrormError):
@@ -239,8 +238,10 @@ def _readable(begun: SegmentStart, recorder: bytes, *, last: int) -> bytes | Non
     return content if position == last else None
 
 
-def _named(first: int, last: int, before: Mapping[EpisodeId, LastRecord], after: Mapping[EpisodeId, LastRecord]) -> str:
-    """The records of one segment that is gone: by position, and by event as far as an episode was open around it."""
+def _describe_loss(
+    first: int, last: int, before: Mapping[EpisodeId, LastRecord], after: Mapping[EpisodeId, LastRecord]
+) -> str:
+    """Describe a lost segment's records: their positions, and their events as far as open episodes show them."""
     events = []
     for episode in dict.fromkeys((*before, *after)):
         begin = before[episode].sequence + 1 if episode in before else 1

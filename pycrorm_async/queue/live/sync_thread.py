@@ -1,11 +1,14 @@
-"""The background thread of a live queue: when it takes its turns, and nothing about what a turn does.
+"""Run the background thread of a live queue: decide when a turn begins, not what it does.
 
-It sleeps while nobody has work for it. The first record after a turn wakes it, and it lets further ones gather for the
-sync interval, so that they share one sync; whoever waits for the disk calls `hurry` and the turn begins at once. A turn
-may ask for another one by itself; of several calls the earliest counts.
+**Theory of operation.** The thread sleeps in `_calls.get` while it has no work. A call puts a delay in seconds into
+`_calls`: `wake` the sync interval, so that further records gather and share one sync; `hurry` zero, for a waiter;
+`call_in` any other. The turn begins at the earliest time that any call asked for. Before the turn the thread empties
+`_calls`, because the turn serves all of them; a call during the turn leads to another one. A turn may itself return the
+delay until the next. After `stop` the thread takes a last turn and ends.
 
-It is woken through a `SimpleQueue` and not an `Event`: a KeyboardInterrupt in the middle of `Event.set` leaves a lock
-behind that nobody will ever open, and the plan's next event would hang.
+Calls go through a `SimpleQueue` and not an `Event`, because a KeyboardInterrupt inside `Event.set` can leave its lock
+taken for ever, and the plan's next event would hang. `SimpleQueue.put` is reentrant and holds no Python lock, so a
+producer may call it under the queue's lock, and so may a finalizer.
 """
 
 from __future__ import annotations
@@ -21,12 +24,12 @@ __all__ = ["SyncThread"]
 
 
 class SyncThread:
-    """Takes turns until stopped; a last one after that. `turn` says in how many seconds it wants another, or None."""
+    """Takes turns until stopped. `turn` returns the seconds until it wants the next turn, or None."""
 
     def __init__(self, *, name: str, interval_s: float, turn: Callable[[], float | None]) -> None:
         self._interval_s = interval_s
         self._turn = turn
-        self._calls: SimpleQueue[float] = SimpleQueue()  # how long further work may gather
+        self._calls: SimpleQueue[float] = SimpleQueue()  # seconds for which further work may gather
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=f"pycrorm sync {name}", daemon=True)
 
@@ -35,23 +38,23 @@ class SyncThread:
 
     @property
     def is_this_thread(self) -> bool:
-        """Whether the caller runs in it: what the collector closes there must not wait for what only it does."""
+        """Whether the caller runs in this thread; a finalizer here must not wait for this thread's own work."""
         return threading.current_thread() is self._thread
 
     def wake(self) -> None:
-        """There is work: a turn begins within the interval. From any thread, at any moment."""
+        """Request a turn within the sync interval. From any thread, at any time."""
         self._calls.put(self._interval_s)
 
     def call_in(self, seconds: float) -> None:
-        """There may be work by then."""
+        """Request a turn within this many seconds."""
         self._calls.put(seconds)
 
     def hurry(self) -> None:
-        """There is work and somebody waits for it: a turn begins at once, or after the one that runs now."""
+        """Request a turn at once, or right after the current one."""
         self._calls.put(0.0)
 
     def stop(self, *, timeout_s: float) -> bool:
-        """Takes the last turn and ends the thread; False if it has not ended in time."""
+        """Take the last turn and end the thread; False if it has not ended in time."""
         self._stopping = True
         self.hurry()
         self._thread.join(timeout_s)
@@ -66,7 +69,7 @@ class SyncThread:
         self._turn()
 
     def _gather(self) -> None:
-        """Waits for a call and then as long as it allows, or a later one: the turn is for all who have called."""
+        """Wait for a call and then until the earliest due time; remove all calls, because the next turn serves them."""
         due_ns = self._due_ns(self._calls.get())
         with suppress(Empty):
             while (left_ns := due_ns - monotonic_ns()) > 0:
