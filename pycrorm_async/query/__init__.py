@@ -1,1 +1,1 @@
-"""How it is asked: ordinary sessions, data frames that go around the mapped classes, and questions with a name."""
+"""Query a memory: sessions, data frames, named queries, and snapshots of an episode at a moment."""

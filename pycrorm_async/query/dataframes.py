@@ -1,8 +1,8 @@
-"""Any select as a pandas DataFrame, without making an object for each row (that costs 0.14 ms each).
+"""Return the rows of a select as a pandas DataFrame, without an object for each row (which costs 0.14 ms each).
 
-A frame holds what tables of numbers are good at: enum members as their names (`frame.arm == "LEFT"`), moments as
-datetime64[us, UTC], everything else as the database has it. A mapped class gives its columns under their attributes'
-names, without those that are loaded on demand only. Two columns of one name become `x` and `x_1`.
+Enum members become their names (`frame.arm == "LEFT"`), times datetime64[us, UTC]; all other values stay as the
+database stores them. A mapped class contributes its columns under its attributes' names, without deferred ones. Two
+columns of one name become `x` and `x_1`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _MOMENT = "moment"
 _WITH_MISSING: tuple[tuple[type, str], ...] = ((Integer, "Int64"), (Boolean, "boolean"), (Float, "float64"))
 
 
-class _Asked(NamedTuple):
-    """One column of the answer: its name, what is asked for it, and its type in the frame where a value is missing."""
+class _FrameColumn(NamedTuple):
+    """One column of the frame: its name, its SQL expression, and its dtype where a value is missing."""
 
     name: str
     expression: Any
@@ -34,7 +34,7 @@ class _Asked(NamedTuple):
 
 
 async def dataframe(connection: AsyncConnection, statement: Select[*tuple[Any, ...]]) -> pd.DataFrame:
-    """The rows of a select over columns, mapped classes, views, or a mix.
+    """Return the rows of a select over columns, mapped classes, views, or a mix.
 
     >>> frame = await dataframe(connection, select(PickUpWithContextView))
 
@@ -45,47 +45,47 @@ async def dataframe(connection: AsyncConnection, statement: Select[*tuple[Any, .
     except ImportError:
         raise MissingExtra("data frames need pandas: pip install 'pycrorm-async[learning]'") from None
 
-    asked = list(_distinct(_asked(statement)))
-    plain = statement.with_only_columns(*(each.expression for each in asked))
+    columns = list(_distinct(_columns(statement)))
+    plain = statement.with_only_columns(*(each.expression for each in columns))
     rows = (await connection.execute(plain)).all()
-    by_column: Sequence[Sequence[Any]] = list(zip(*rows, strict=True)) or [()] * len(asked)
+    by_column: Sequence[Sequence[Any]] = list(zip(*rows, strict=True)) or [()] * len(columns)
     return pd.DataFrame(
         {
             each.name: _moments(values) if each.dtype == _MOMENT else pd.Series(values, dtype=_dtype(each, values))
-            for each, values in zip(asked, by_column, strict=True)
+            for each, values in zip(columns, by_column, strict=True)
         }
     )
 
 
-def _asked(statement: Select[*tuple[Any, ...]]) -> Iterator[_Asked]:
+def _columns(statement: Select[*tuple[Any, ...]]) -> Iterator[_FrameColumn]:
     for each in statement.column_descriptions:
-        found = inspect(each["expr"], raiseerr=False)
-        if not (getattr(found, "is_mapper", False) or getattr(found, "is_aliased_class", False)):
+        entity = inspect(each["expr"], raiseerr=False)
+        if not (getattr(entity, "is_mapper", False) or getattr(entity, "is_aliased_class", False)):
             yield _column(each["name"], each["expr"], each["type"])
             continue
-        for attribute in found.mapper.column_attrs:
+        for attribute in entity.mapper.column_attrs:
             if not attribute.deferred and not attribute.key.startswith("_"):
                 yield _column(attribute.key, getattr(each["expr"], attribute.key), attribute.columns[0].type)
 
 
-def _column(name: str, expression: Any, kind: Any) -> _Asked:
-    """The column as it is stored, where making Python values of it is of no use to a frame."""
+def _column(name: str, expression: Any, kind: Any) -> _FrameColumn:
+    """Return the column; times and enums are read as stored, because a frame has no use for their Python values."""
     if isinstance(kind, Moment):
-        return _Asked(name, type_coerce(expression, BigInteger()), _MOMENT)
+        return _FrameColumn(name, type_coerce(expression, BigInteger()), _MOMENT)
     if isinstance(kind, Named):
-        return _Asked(name, type_coerce(expression, String()), "object")
+        return _FrameColumn(name, type_coerce(expression, String()), "object")
     with_missing = (dtype for types, dtype in _WITH_MISSING if isinstance(kind, types))
-    return _Asked(name, expression, next(with_missing, "object"))
+    return _FrameColumn(name, expression, next(with_missing, "object"))
 
 
-def _dtype(asked: _Asked, values: Sequence[Any]) -> str | None:
-    """Pandas' own choice where nothing is missing; without one it would make integers floats, which lose digits."""
-    return asked.dtype if not values or None in values else None
+def _dtype(column: _FrameColumn, values: Sequence[Any]) -> str | None:
+    """Return the dtype where a value is missing, because pandas would turn integers into floats and lose digits."""
+    return column.dtype if not values or None in values else None
 
 
-def _distinct(asked: Iterator[_Asked]) -> Iterator[_Asked]:
+def _distinct(columns: Iterator[_FrameColumn]) -> Iterator[_FrameColumn]:
     seen: dict[str, int] = {}
-    for each in asked:
+    for each in columns:
         count = seen[each.name] = seen.get(each.name, -1) + 1
         yield each._replace(name=f"{each.name}_{count}") if count else each
 

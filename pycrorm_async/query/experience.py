@@ -1,8 +1,8 @@
-"""What went well before, as a location designator asks for it: pick-ups that succeeded, the best way of doing it first.
+"""Rank past successful pick-ups for a location designator, the best first.
 
-How good a way is, is the share of successes among what was tried near it: with the same arm and grasp, from within
-0.1 m in the object's own frame, with the torso not more than 0.1 m higher or lower. One success and one failure are
-added to what was counted (Laplace's rule), so that a single success does not outdo many with a few failures:
+The score of a success is the share of successes among the attempts near it: with the same arm and grasp, with the robot
+within 0.1 m in the object's frame, with the torso within 0.1 m of its height. One success and one failure are added to
+the counts (Laplace's rule), so that a single success does not outrank many successes with a few failures:
 
     3 of 3 tries: (3 + 1) / (3 + 2) = 0.8       1 of 1: 0.67       2 of 3: 0.6       1 of 20: 0.09
 """
@@ -28,14 +28,15 @@ from pycrorm_async.world.pose import Pose
 __all__ = ["PickUpExperience", "Attempt", "best_first", "ATTEMPTS_MAX", "NEAR_M"]
 
 ATTEMPTS_MAX = 2_000
-"""So many attempts at most are looked at, the latest."""
+"""Bounds the attempts that are read; the latest are taken."""
 NEAR_M = 0.1
+"""The distance in m, of the base and of the torso's height, within which attempts count as near each other."""
 _SAME = 1e-4
-"""What differs by less, in m or in a quaternion's components, is the same."""
+"""The resolution, in m and in a quaternion's components, at which two poses count as equal."""
 
 
 class Attempt(NamedTuple):
-    """One pick-up; the stand is the robot's base in the object's frame."""
+    """One pick-up; `stand` is the pose of the robot's base in the object's frame."""
 
     arm: Arms
     grasp: Grasp
@@ -45,23 +46,23 @@ class Attempt(NamedTuple):
 
 
 class PickUpExperience:
-    """The pick-ups of one memory: those that were really done, ended well or failed, and are in its tables.
+    """The visible pick-ups of one memory that succeeded or failed, without simulations.
 
-    What was performed in this process is there after `await memory.flush()`.
+    Pick-ups of this process are visible after `await memory.flush()`.
     """
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
         self.over = False
-        """Set when the memory is closed."""
+        """True once the memory is closed."""
 
     async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
-        """The ways in which objects of that type were picked up, the best first; with this arm, or any.
+        """Return the ways in which objects of this type were picked up, the best first; with this arm, or with any.
 
-        The latest `ATTEMPTS_MAX` are looked at. Raises `CallerError` once the memory is closed.
+        Reads the latest `ATTEMPTS_MAX` attempts. Raises `CallerError` once the memory is closed.
         """
         if self.over:
-            raise CallerError("the memory that was to tell what went well is closed: ask while it is open")
+            raise CallerError("the memory is closed, so its experience cannot be read: ask while it is open")
         async with self._reading.session() as session:
             connection = await session.connection()
             await dialect_of(connection).in_order(connection)
@@ -76,7 +77,7 @@ class PickUpExperience:
 
 def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, ...]]:
     view = PickUpWithContextView
-    # First which, then what: the columns that are reckoned are reckoned for these only, and nothing wide is sorted.
+    # The subquery selects ids only, so that computed columns are computed for these rows only and not sorted.
     latest = select(view.id).where(view.obj_type == object_type).order_by(view.id.desc()).limit(ATTEMPTS_MAX)
     if arm is not None:
         latest = latest.where(view.arm == arm)
@@ -91,17 +92,17 @@ def _question(object_type: ObjectType, arm: Arms | None) -> Select[*tuple[Any, .
 
 
 def best_first(attempts: Sequence[Attempt]) -> list[PastSuccess]:
-    """The ways that went well, by their score, then by how often they did, then as given."""
+    """Return the successful ways, ordered by score, then by their number of successes, then as in `attempts`."""
     groups: dict[tuple[Arms, Grasp], list[Attempt]] = {}
     for each in attempts:
         groups.setdefault((each.arm, each.grasp), []).append(each)
-    found = [success for group in groups.values() for success in _scored(group)]
+    successes = [success for group in groups.values() for success in _scored(group)]
     order = {key: number for number, key in reversed(list(enumerate(map(_key, attempts))))}
-    return sorted(found, key=lambda each: (-each.score, -each.times, order[_key(each)]))
+    return sorted(successes, key=lambda each: (-each.score, -each.times, order[_key(each)]))
 
 
 def _scored(group: Sequence[Attempt]) -> list[PastSuccess]:
-    """Each way that went well once, of attempts with one arm and grasp."""
+    """Score each way that succeeded at least once, among attempts with one arm and grasp."""
     succeeded = np.array([each.succeeded for each in group])
     stands = np.array([each.stand.position for each in group])
     torsos = np.array([each.torso_height or 0.0 for each in group])
@@ -111,23 +112,23 @@ def _scored(group: Sequence[Attempt]) -> list[PastSuccess]:
         key = _key(group[number])
         times[key] = times.get(key, 0) + 1
         first.setdefault(key, number)
-    found = []
+    successes = []
     for key, number in first.items():
-        apart = np.linalg.norm(stands - stands[number], axis=1)
-        near = (apart <= NEAR_M) & (np.abs(torsos - torsos[number]) <= NEAR_M)
+        distances = np.linalg.norm(stands - stands[number], axis=1)
+        near = (distances <= NEAR_M) & (np.abs(torsos - torsos[number]) <= NEAR_M)
         score = (int(succeeded[near].sum()) + 1) / (int(near.sum()) + 2)
         arm, grasp, torso_height, stand, _ = group[number]
-        found.append(PastSuccess(arm, grasp, torso_height, stand, score, times[key]))
-    return found
+        successes.append(PastSuccess(arm, grasp, torso_height, stand, score, times[key]))
+    return successes
 
 
 def _seen_from_object(place: Sequence[float]) -> Pose:
-    """The stand; of the two quaternions of a turn, the one that has w above 0."""
+    """Return the stand, with the quaternion of its rotation that has w > 0."""
     sign = math.copysign(1.0, place[6])
     return Pose(place[:3], [sign * part for part in place[3:]], "object", time_ns=0)
 
 
 def _key(way: Attempt | PastSuccess) -> tuple[object, ...]:
-    """Equal for what is the same way of doing it."""
+    """Return a key that is equal for two attempts in the same way."""
     numbers = (*way.stand.position, *way.stand.orientation, way.torso_height or 0.0)
     return way.arm, way.grasp, way.torso_height is None, *(round(each / _SAME) for each in numbers)

@@ -1,4 +1,4 @@
-"""Questions with a name: which episodes there are, and what one of them did, as plain values ready to be printed."""
+"""Query the episodes of a memory and the task tree of one of them, as plain values ready to be printed."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ __all__ = ["EpisodeSummary", "NodeSummary", "Thinker", "episodes", "episode_name
 
 @dataclass(frozen=True)
 class Thinker:
-    """The node in which a plan was thought through.
+    """The node that performed a simulation.
 
     Attributes:
         id: the UUID of its episode.
         episode, node: the number of that episode and the id of the node; None where this database does not have it.
-        dtype: what was performed; None also at the root.
+        dtype: the node's designator type; None also at the root.
     """
 
     id: str
@@ -42,11 +42,12 @@ class EpisodeSummary:
     Attributes:
         number, id: its number in this database, its UUID.
         duration_ns: from its first to its last event; None while it runs.
-        nodes: of its task tree, the root included; `failed` of them failed, raised an error or were lost.
-        simulated: it was thought through in a copy of the world, and nothing of it happened.
-        thought_by: who thought it, as far as that is known.
-        continues: UUID of the episode of which this one is the rest.
-        continued_in: UUID of the episode that is the rest of this one.
+        nodes, failed: number of nodes in its task tree, the root included, and of those that FAILED, ended in ERROR or
+            are LOST.
+        simulated: whether it is a simulation, performed in a copy of the world.
+        thought_by: the node that performed this simulation, if recorded.
+        continues: UUID of the episode that this one continues.
+        continued_in: UUID of the episode that continues this one.
     """
 
     number: int
@@ -71,11 +72,11 @@ class NodeSummary:
 
     Attributes:
         depth: 0 at the root.
-        dtype: what was performed; None at the root.
-        duration_ns: None while it runs, and if it was LOST.
-        parameters: as they were recorded, empty at the root; a reference to an object of the world has its name too.
+        dtype: its designator type; None at the root.
+        duration_ns: None while it runs, and if it is LOST.
+        parameters: as recorded, empty at the root; a reference to an object of the world also has the object's name.
         reason, failure_message: the class and the text of the failure it ended with.
-        thoughts: numbers of the episodes that were thought through in it.
+        thoughts: numbers of the simulations that it performed.
     """
 
     id: int
@@ -94,10 +95,10 @@ class NodeSummary:
 
 
 async def episodes(connection: AsyncConnection, number: int | None = None) -> list[EpisodeSummary]:
-    """Every episode that the connection sees, the oldest first; or only the one of that number."""
-    question = _overview()
+    """Return every episode that the connection sees, the oldest first; or only the one with this number."""
+    query = _overview()
     if number is not None:
-        question = question.where(ProcessMetaData.id == number)
+        query = query.where(ProcessMetaData.id == number)
     return [
         EpisodeSummary(
             number=row.id,
@@ -117,7 +118,7 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             continues=row.continues,
             continued_in=row.continued_in,
         )
-        for row in await connection.execute(question)
+        for row in await connection.execute(query)
     ]
 
 
@@ -145,32 +146,32 @@ def _overview() -> Select[*tuple[Any, ...]]:
 
 
 async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummary:
-    """The episode of that number, or id, or first digits of its id; `last` is the newest that really happened.
+    """Return the episode with this number, id, or first digits of its id; `last` is the newest except simulations.
 
-    Raises `UnknownEpisode`, also when several ids begin like that.
+    Raises `UnknownEpisode`, also when several ids have these first digits.
     """
-    question = select(ProcessMetaData.id, ProcessMetaData.uuid, ProcessMetaData.simulated).order_by(ProcessMetaData.id)
-    known = (await connection.execute(question)).all()
-    real = [each.id for each in known if not each.simulated]
-    ids = {each.id: each.uuid for each in known}
+    query = select(ProcessMetaData.id, ProcessMetaData.uuid, ProcessMetaData.simulated).order_by(ProcessMetaData.id)
+    rows = (await connection.execute(query)).all()
+    real = [each.id for each in rows if not each.simulated]
+    ids = {each.id: each.uuid for each in rows}
     number = real[-1] if name == "last" and real else number_named(name, ids, listed=len(real))
     return (await episodes(connection, number))[0]
 
 
 async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummary]:
-    """The nodes of an episode, each before its children, children in the order they started; empty without any."""
-    table, designator, thing = TaskTreeNode.__table__, Designator.__table__, Object.__table__
-    question = (
+    """Return the nodes of an episode, each before its children, children in the order in which they started."""
+    table, designator, objects = TaskTreeNode.__table__, Designator.__table__, Object.__table__
+    query = (
         select(table, designator.c.parameters)
         .outerjoin(designator, designator.c.id == table.c.id)
         .where(table.c.process_metadata_id == number)
         .order_by(table.c.id)
     )
-    named = select(thing.c.id, thing.c.name).where(thing.c.process_metadata_id == number)
+    named = select(objects.c.id, objects.c.name).where(objects.c.process_metadata_id == number)
     names = {row.id: row.name for row in await connection.execute(named)}
-    thoughts = await _thoughts_by_node(connection, number)
+    simulations = await _simulations_by_node(connection, number)
     children: dict[int | None, list[NodeSummary]] = {}
-    for row in await connection.execute(question):
+    for row in await connection.execute(query):
         children.setdefault(row.parent_id, []).append(
             NodeSummary(
                 id=row.id,
@@ -185,37 +186,37 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 reason=row.reason,
                 failure_message=row.failure_message,
                 simulated=row.simulated,
-                thoughts=tuple(thoughts.get(row.id, ())),
+                thoughts=tuple(simulations.get(row.id, ())),
             )
         )
     return list(_depth_first(children))
 
 
-async def _thoughts_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
-    """By the id of the node of this episode that thought them, the numbers of what was thought through."""
-    thinker, thought = aliased(ProcessMetaData), ProcessMetaData
-    question = (
-        select(thought.id, thought.thought_by_node)
-        .join(thinker, thinker.uuid == thought.thought_by)
-        .where(thinker.id == number, thought.thought_by_node.is_not(None))
-        .order_by(thought.id)
+async def _simulations_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
+    """Return the numbers of the simulations of this episode, by the id of the node that performed them."""
+    thinker, simulation = aliased(ProcessMetaData), ProcessMetaData
+    query = (
+        select(simulation.id, simulation.thought_by_node)
+        .join(thinker, thinker.uuid == simulation.thought_by)
+        .where(thinker.id == number, simulation.thought_by_node.is_not(None))
+        .order_by(simulation.id)
     )
-    found: dict[int, list[int]] = {}
-    for row in await connection.execute(question):
-        found.setdefault(row_id(number, row.thought_by_node, SLOT_NODE), []).append(row.id)
-    return found
+    numbers: dict[int, list[int]] = {}
+    for row in await connection.execute(query):
+        numbers.setdefault(row_id(number, row.thought_by_node, SLOT_NODE), []).append(row.id)
+    return numbers
 
 
 def _depth_first(children: dict[int | None, list[NodeSummary]]) -> Iterator[NodeSummary]:
-    waiting = [(node, 0) for node in reversed(children.get(None, []))]
-    while waiting:
-        node, depth = waiting.pop()
+    stack = [(node, 0) for node in reversed(children.get(None, []))]
+    while stack:
+        node, depth = stack.pop()
         yield replace(node, depth=depth)
-        waiting.extend((child, depth + 1) for child in reversed(children.get(node.id, [])))
+        stack.extend((child, depth + 1) for child in reversed(children.get(node.id, [])))
 
 
 def _with_name(value: Any, number: int, names: Mapping[int, str]) -> Any:
-    """A reference to an object with the object's name; anything else as it is."""
+    """Add the object's name to a reference to an object; return other values unchanged."""
     if isinstance(value, dict) and value.keys() == {"object", "row"}:
         return {**value, "name": names.get(row_id(number, value["row"], SLOT_NODE))}
     return value

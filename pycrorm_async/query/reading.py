@@ -1,4 +1,4 @@
-"""A memory opened for asking: sessions, frames and named questions; nothing is ever written through it.
+"""Open a memory for reading: sessions, data frames and named queries. Nothing is ever written through it.
 
 async with Reading.open("sqlite:///memory.db") as reading:
     async with reading.session() as session:
@@ -39,15 +39,14 @@ __all__ = ["Reading"]
 
 
 class Reading:
-    """The asking side of one memory. Belongs to the loop it was opened in.
+    """The reading side of one memory. Belongs to the loop it was opened in.
 
-    What was only thought through (`plan.SimulatedTaskTree`) is left out of every answer. With `simulated=True` the same
-    questions see it too; `TaskTreeNode.simulated` and `ProcessMetaData.simulated` tell it from what happened. Such a
-    session or frame costs some ms more.
+    Every result excludes simulations (`plan.SimulatedTaskTree`). With `simulated=True` a session or frame includes
+    them, marked by `TaskTreeNode.simulated` and `ProcessMetaData.simulated`, and costs some ms more.
     """
 
     def __init__(self, log: EventLog | DatabaseAddress) -> None:
-        """Of an open log; or of one at an address, which is opened at the first question and closed by `close`."""
+        """Read an open log, or one at an address, which is opened at the first query and closed by `close`."""
         self._address = log if isinstance(log, DatabaseAddress) else log.address
         self._opened: EventLog | None = None
         self._opening = asyncio.Lock()
@@ -60,10 +59,10 @@ class Reading:
     @classmethod
     @asynccontextmanager
     async def open(cls, url: str) -> AsyncIterator[Self]:
-        """The memory at a URL, which must be there.
+        """Open the existing memory at a URL.
 
-        Raises `UnknownUrl`; `DatabaseUnavailable` without a memory at that place, `DatabaseForeign` for another
-        program's or a newer version's.
+        Raises `UnknownUrl`; `DatabaseUnavailable` if no memory exists there, `DatabaseForeign` for a database of
+        another program or of a newer version.
         """
         with DatabaseAddress.parse(url).located() as address:
             async with cls.open_address(address) as reading:
@@ -72,7 +71,7 @@ class Reading:
     @classmethod
     @asynccontextmanager
     async def open_address(cls, address: DatabaseAddress) -> AsyncIterator[Self]:
-        """The memory at a located address. Raises as `open` does."""
+        """Open the existing memory at a located address. Raises as `open` does."""
         reading = cls(address)
         try:
             await reading.refresh()
@@ -82,11 +81,11 @@ class Reading:
 
     @property
     def is_open(self) -> bool:
-        """Whether anything was asked yet."""
+        """Whether the log is open, which it is from the first query on."""
         return self._opened is not None
 
     async def close(self) -> None:
-        """Ends its connections and its classes. Twice is once."""
+        """Close the connections and dispose of the mapped classes. A second call has no effect."""
         async with self._opening:
             log, self._opened = self._opened, None
             self._classes.dispose()
@@ -94,7 +93,7 @@ class Reading:
                 await log.close()
 
     async def refresh(self) -> None:
-        """Learns the designator types that were declared since; every session begins with it."""
+        """Map the designator types that were declared since the last call; every session does this first."""
         await self._ready()
         declarations = await self._log.declarations()
         if declarations != self._declarations:
@@ -105,7 +104,7 @@ class Reading:
 
     @asynccontextmanager
     async def session(self, *, simulated: bool = False) -> AsyncIterator[AsyncSession]:
-        """An ordinary session. Its objects stay readable when it is over."""
+        """Open an ordinary SQLAlchemy session. Its objects stay readable after it is closed."""
         await self.refresh()
         if not simulated:
             async with self._sessions() as session:
@@ -118,32 +117,32 @@ class Reading:
             yield session
 
     async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> pd.DataFrame:
-        """The answer as a pandas DataFrame, see `pycrorm_async.query.dataframes`. Raises `MissingExtra`."""
+        """Return the rows as a pandas DataFrame, see `pycrorm_async.query.dataframes`. Raises `MissingExtra`."""
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
                 return await dataframe(connection, statement)
 
     def mapped(self, designator: str | type) -> type[Designator]:
-        """The mapped class of a dtype, a table or a designator class, as of the last `refresh`.
+        """Return the mapped class of a dtype, a table or a designator class, as of the last `refresh`.
 
-        Raises `CallerError` for a type this memory has never seen.
+        Raises `CallerError` for a type that was never declared in this memory.
         """
         return self._classes.of(designator)
 
-    # --- named questions --------------------------------------------------------------------------------------
+    # --- named queries ----------------------------------------------------------------------------------------
 
     async def episodes(self, *, simulated: bool = False) -> list[EpisodeSummary]:
-        """Every episode, the oldest first."""
+        """Return every episode, the oldest first."""
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
                 return await named_queries.episodes(connection)
 
     async def episode(self, name: str) -> EpisodeSummary:
-        """The episode of that number, or id, or first digits of its id, also one that was only thought through.
+        """Return the episode with this number, id, or first digits of its id, simulations included.
 
-        `last` is the newest that really happened. Raises `UnknownEpisode`.
+        `last` is the newest except simulations. Raises `UnknownEpisode`.
         """
         await self._ready()
         with self._log.translated():
@@ -151,7 +150,7 @@ class Reading:
                 return await named_queries.episode_named(connection, name)
 
     async def tree(self, number: int) -> list[NodeSummary]:
-        """The task tree of an episode, also of one that was only thought through; each node before its children."""
+        """Return the task tree of an episode, simulations included; each node comes before its children."""
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
@@ -160,32 +159,34 @@ class Reading:
     async def as_of(
         self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
     ) -> Moment:
-        """The task tree and the world of an episode at any moment, from the log: also while it runs, and of thoughts.
+        """Return the task tree and the world of an episode at any moment, read from the log, also while it runs.
 
         Args:
-            episode: its number, its id or the first digits of it, `last`, or as it was opened or listed.
-            time: seconds since the episode's start, by the monotonic clock; or a moment, aware, by the wall clock,
-                where what came before the first event that is later is told.
-            sequence: of the last event to be told.
+            episode: its number, its id or the first digits of it, `last`, or the object from `memory.episode` or
+                `episodes`. Simulations are included.
+            time: seconds since the episode's start by the monotonic clock; or an aware datetime by the wall clock,
+                which includes the events before the first later one.
+            sequence: of the last event to include.
 
-        Beyond the end it is the end, or how far the log is. Raises `UnknownEpisode`; `CallerError` for a moment before
-        the start, or for none or two of them; `LogDamaged`, `DatabaseForeign` for an event that cannot be understood.
+        A moment beyond the last event in the log gives the state after that event. Raises `UnknownEpisode`;
+        `CallerError` for a moment before the start, or without exactly one of `time` and `sequence`; `LogDamaged` or
+        `DatabaseForeign` for an event that cannot be read.
         """
         await self._ready()
         return await as_of(self._log, episode, time=time, sequence=sequence)
 
     async def number_of(self, episode: str) -> int:
-        """The number this database gave to the episode of that UUID. Raises `UnknownEpisode`."""
+        """Return the number that this database gave to the episode with this UUID. Raises `UnknownEpisode`."""
         await self._ready()
         number = await self._log.episode_number(parse_episode_id(episode))
         if number is None:
-            raise UnknownEpisode(f"nothing of the episode {episode} is in this database yet")
+            raise UnknownEpisode(f"this database has no event of the episode {episode} yet")
         return number
 
-    # --- inside -----------------------------------------------------------------------------------------------
+    # --- connections ------------------------------------------------------------------------------------------
 
     async def _ready(self) -> None:
-        """The log is open afterwards: what is asked of it is asked after this."""
+        """Open the log if it is not open; every query calls this first."""
         if self._opened is None:
             async with self._opening:
                 if self._opened is None:
@@ -204,7 +205,7 @@ class Reading:
 
     @property
     def _log(self) -> EventLog:
-        assert self._opened is not None, "made ready before it is asked"
+        assert self._opened is not None, "`_ready` was awaited before"
         return self._opened
 
     @asynccontextmanager
@@ -226,5 +227,5 @@ async def _generation(log: EventLog) -> Generation:
         async with log.engine.connect() as connection:
             generation = await current_generation(connection)
     if generation is None:
-        raise DatabaseUnavailable(f"{log.address} has a log and no tables yet: `pycrorm writer --once` makes them")
+        raise DatabaseUnavailable(f"{log.address} has a log but no tables yet: run `pycrorm writer --once`")
     return generation

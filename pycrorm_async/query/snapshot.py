@@ -1,11 +1,11 @@
-"""An episode at one moment: its task tree and its world as they were then, as plain values.
+"""Define the snapshot of an episode at one moment: its task tree and its world, as plain values.
 
 >>> moment = await memory.as_of("last", time=12.5)
 >>> [node.dtype for node in moment.running]
 [None, 'PickUpAction', 'MoveTCPMotion']
 >>> moment.world.object("milk").pose
 Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
->>> world.restore_state(moment.world.state)  # in a world with the same objects: all of them are as they were then
+>>> world.restore_state(moment.world.state)  # needs a world with the same objects
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ __all__ = ["Moment", "NodeThen", "WorldThen", "ObjectThen", "RobotThen", "Attach
 
 @dataclass(frozen=True, kw_only=True)
 class NodeThen(NodeSummary):
-    """A node as it was then: RUNNING, without an end, if it ended later. `thoughts` is empty.
+    """A node at that moment: RUNNING and without an end if it ended later. `thoughts` is empty.
 
     Attributes:
         sequence: of its NodeStarted.
-        start_s, end_s: since the episode's start; `end_s` is None while it runs, and if it was LOST.
+        start_s, end_s: since the episode's start; `end_s` is None while it runs, and if it is LOST.
     """
 
     sequence: int
@@ -39,15 +39,15 @@ class NodeThen(NodeSummary):
 
 @dataclass(frozen=True)
 class ObjectThen:
-    """An object as it was then.
+    """An object at that moment.
 
     Attributes:
-        id, identity_id: of its row in force and of its first row in `orm.Object`. An object that comes back under its
-            old name is another one.
+        id, identity_id: of its current row and of its first row in `orm.Object`. An object that is removed and added
+            again under its old name has a new identity.
         object_type: name of the member of `ObjectType`.
         pose: of its root link's frame, in "map".
         joints: rad or m, by name.
-        attached_to: what it moves with: the name of that object, and of its link (None: the root link).
+        attached_to: name and link of the object that it moves with; the link is None for the root link.
     """
 
     id: int
@@ -61,7 +61,7 @@ class ObjectThen:
 
 @dataclass(frozen=True)
 class RobotThen:
-    """The robot then: base pose, torso joint position in m (None for a robot not known here)."""
+    """The robot at that moment: base pose, torso joint position in m (None for a robot without a description)."""
 
     name: str
     pose: Pose
@@ -78,42 +78,42 @@ class AttachmentThen(NamedTuple):
 
 @dataclass(frozen=True)
 class WorldThen:
-    """The world then. `objects` are in the order they were added; `robot` is the first of type ROBOT."""
+    """The world at that moment. `objects` are in the order they were added; `robot` is the first of type ROBOT."""
 
     objects: tuple[ObjectThen, ...]
     robot: RobotThen | None
 
     def object(self, name: str) -> ObjectThen:
-        """The object of that name. Raises `CallerError` if there was none."""
+        """Return the object with this name. Raises `CallerError` if the world had none."""
         for each in self.objects:
             if each.name == name:
                 return each
-        present = ", ".join(each.name for each in self.objects) or "nothing"
-        raise CallerError(f"there was no object {name!r} in the world then, but {present}")
+        present = ", ".join(each.name for each in self.objects) or "none"
+        raise CallerError(f"the world had no object {name!r} at this moment; its objects: {present}")
 
     @property
     def attachments(self) -> tuple[AttachmentThen, ...]:
-        """What moved with what."""
-        held = [(each.name, each.attached_to) for each in self.objects]
-        return tuple(AttachmentThen(to[0], name, to[1]) for name, to in held if to is not None)
+        """All attachments of the world."""
+        pairs = [(each.name, each.attached_to) for each in self.objects]
+        return tuple(AttachmentThen(to[0], name, to[1]) for name, to in pairs if to is not None)
 
     @property
     def state(self) -> WorldState:
-        """The same as a world itself saves it, for `BulletWorld.restore_state`."""
+        """The world's state for `BulletWorld.restore_state`."""
         return WorldState({each.name: ObjectState(each.pose, each.joints, each.attached_to) for each in self.objects})
 
 
 @dataclass(frozen=True)
 class Moment:
-    """An episode after one of its events, and until its next one.
+    """The state of an episode after one of its events, until the next one.
 
     Attributes:
         number, id: of the episode: in this database, its UUID.
-        simulated: it was thought through in a copy of the world, and nothing of it happened.
-        sequence: of that event, the last one that had happened.
-        time_s: when, since the episode's start by the monotonic clock.
-        at: when, by the wall clock.
-        status: of the episode then.
+        simulated: whether it is a simulation, performed in a copy of the world.
+        sequence: of that event, the last one included.
+        time_s: of that event, since the episode's start by the monotonic clock.
+        at: of that event, by the wall clock.
+        status: of the episode at that moment.
         tree: the nodes that had started, each before its children, children in the order they started.
     """
 
@@ -132,7 +132,7 @@ class Moment:
 
     @property
     def running(self) -> tuple[NodeThen, ...]:
-        """The nodes that were running: the way down to what was being done, or several ways."""
+        """The running nodes: the path from the root to the current action, or several paths for concurrent ones."""
         return tuple(each for each in self.tree if each.status == "RUNNING")
 
     def __str__(self) -> str:

@@ -1,7 +1,7 @@
-"""The fold behind as-of: one event after the other into the state of a task tree and a world.
+"""Fold an episode's events into the state of its task tree and world at a moment.
 
-Pure, and as large as what it tells. StateSampled changes nothing: every pose and joint that a sample repeats had an
-event of its own when it was set, which is exact, while a sample may be older than the event before it.
+The fold is pure, and its memory grows with the state it describes. It ignores StateSampled: every pose and joint in a
+sample had an exact event of its own, while the sample may be older than the event before it.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 @dataclass(slots=True)
 class _Node:
-    """What is told of a node: of large parameters there is one copy, of the robot and of results none."""
+    """The state of a node, without the robot's state and the result, to save memory."""
 
     kind: str
     parent: int | None
@@ -57,8 +57,8 @@ class _Node:
 
 
 @dataclass(slots=True)
-class _Thing:
-    """An object in the world: `row` is the sequence of the event that put it where it is."""
+class _WorldObject:
+    """An object in the world. `row` is the sequence of the event that set its pose."""
 
     name: str
     object_type: str
@@ -69,10 +69,10 @@ class _Thing:
 
 
 class MomentFold:
-    """An episode after the events it has read.
+    """The state of an episode after the events read so far.
 
     Attributes:
-        first: its first event; None before that is read.
+        first: the first event; None before it is read.
     """
 
     def __init__(self, number: int, identity: str) -> None:
@@ -83,14 +83,14 @@ class MomentFold:
         self._last: StoredEvent | None = None
         self._status = "RUNNING"
         self._nodes: dict[int, _Node] = {}
-        self._things: dict[int, _Thing] = {}
+        self._objects: dict[int, _WorldObject] = {}
         self._names: dict[int, str] = {}
-        """Of every object that ever was there."""
+        """The names of all objects, removed ones included, by identity."""
 
     def read(self, event: StoredEvent) -> None:
-        """The next event. Raises `CannotFold`."""
+        """Apply the next event. Raises `CannotFold`."""
         if self.first is None and event.type != "EpisodeStarted":
-            raise CannotFold(f"the episode has not started, and begins with {event.type}")
+            raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
         if event.type not in _CHANGE_NOTHING:
             self._happened(event, happening_of(event))
         self.first = event if self.first is None else self.first
@@ -126,42 +126,42 @@ class MomentFold:
 
     def _ended(self, status: str) -> None:
         self._status = status
-        if status == "LOST":  # nobody saw how the nodes that were running went on
+        if status == "LOST":  # the process died, so the outcome of its running nodes is unknown
             for node in self._nodes.values():
                 if node.status == "RUNNING":
                     node.status = "LOST"
 
     def _changed(self, sequence: int, happening: Happening) -> None:
-        """Something in the world. What is told of an object that has left it changes nothing."""
+        """Apply an event of the world. Events of a removed object have no effect."""
         match happening:
             case ObjectAdded(name=name, object_type=kind, pose=pose, joints=joints):
-                self._things[sequence] = _Thing(name, kind, pose, sequence, dict(joints))
+                self._objects[sequence] = _WorldObject(name, kind, pose, sequence, dict(joints))
                 self._names[sequence] = name
             case ObjectMoved():
-                if (thing := self._thing(happening.object)) is not None:
-                    thing.pose, thing.row = happening.pose, sequence
+                if (moved := self._present(happening.object)) is not None:
+                    moved.pose, moved.row = happening.pose, sequence
             case JointsMoved():
-                if (thing := self._thing(happening.object.object)) is not None:
-                    thing.joints.update(happening.joints)
+                if (moved := self._present(happening.object.object)) is not None:
+                    moved.joints.update(happening.joints)
             case ObjectAttached() | ObjectDetached():
-                self._thing(happening.parent.object)
-                if (thing := self._thing(happening.child.object)) is not None:
+                self._present(happening.parent.object)
+                if (child := self._present(happening.child.object)) is not None:
                     attached = isinstance(happening, ObjectAttached)
-                    thing.attached_to = (happening.parent.object, happening.link) if attached else None
+                    child.attached_to = (happening.parent.object, happening.link) if attached else None
             case ObjectRemoved():
-                self._thing(happening.object.object)
-                self._things.pop(happening.object.object, None)
+                self._present(happening.object.object)
+                self._objects.pop(happening.object.object, None)
 
-    def _thing(self, identity: int) -> _Thing | None:
-        """The object, None if it has left the world. Raises `CannotFold`."""
+    def _present(self, identity: int) -> _WorldObject | None:
+        """Return the object, None if it was removed. Raises `CannotFold` for one that was never added."""
         if identity not in self._names:
             raise CannotFold(f"object {identity} was never added")
-        return self._things.get(identity)
+        return self._objects.get(identity)
 
-    # --- what it comes to -------------------------------------------------------------------------------------
+    # --- the result -------------------------------------------------------------------------------------------
 
     def moment(self, dtypes: Mapping[str, str]) -> Moment:
-        """As values, with the dtype of each declaration by its fingerprint. Raises `LogDamaged`."""
+        """Return the state as values. `dtypes`: the dtype of each declaration, by fingerprint. Raises `LogDamaged`."""
         started, first, last = self._started, self.first, self._last
         assert started is not None
         assert first is not None
@@ -185,11 +185,11 @@ class MomentFold:
         children: dict[int | None, list[int]] = {}
         for sequence, node in self._nodes.items():
             children.setdefault(node.parent, []).append(sequence)
-        waiting = [(sequence, 0) for sequence in reversed(children.get(None, []))]
-        while waiting:
-            sequence, depth = waiting.pop()
+        stack = [(sequence, 0) for sequence in reversed(children.get(None, []))]
+        while stack:
+            sequence, depth = stack.pop()
             yield self._node(sequence, depth, dtypes, start_ns)
-            waiting.extend((child, depth + 1) for child in reversed(children.get(sequence, [])))
+            stack.extend((child, depth + 1) for child in reversed(children.get(sequence, [])))
 
     def _node(self, sequence: int, depth: int, dtypes: Mapping[str, str], start_ns: int) -> NodeThen:
         node = self._nodes[sequence]
@@ -214,31 +214,33 @@ class MomentFold:
         )
 
     def _with_name(self, value: Any) -> Any:
-        """A reference to an object with the object's name; anything else as it is."""
+        """Add the object's name to a reference to an object; return other values unchanged."""
         if isinstance(value, dict) and value.keys() == {"object", "row"}:
             return {**value, "name": self._names.get(value["object"])}
         return value
 
     def _world(self) -> WorldThen:
-        objects = tuple(self._object(identity, thing) for identity, thing in self._things.items())
+        objects = tuple(self._object(identity, each) for identity, each in self._objects.items())
         robot = next((each for each in objects if each.object_type == "ROBOT"), None)
         return WorldThen(objects, _robot(robot) if robot is not None else None)
 
-    def _object(self, identity: int, thing: _Thing) -> ObjectThen:
-        at = thing.pose
+    def _object(self, identity: int, value: _WorldObject) -> ObjectThen:
+        at = value.pose
         try:
             pose = Pose(at.position, at.orientation, at.frame, at.time_ns)
         except MalformedPose as error:
-            raise LogDamaged(self.id, thing.row, str(error)) from None
-        held = thing.attached_to
+            raise LogDamaged(self.id, value.row, str(error)) from None
+        parent = value.attached_to
         return ObjectThen(
-            id=row_id(self.number, thing.row, SLOT_NODE),
+            id=row_id(self.number, value.row, SLOT_NODE),
             identity_id=row_id(self.number, identity, SLOT_NODE),
-            name=thing.name,
-            object_type=thing.object_type,
+            name=value.name,
+            object_type=value.object_type,
             pose=pose,
-            joints=thing.joints,
-            attached_to=(self._names[held[0]], held[1]) if held is not None and held[0] in self._things else None,
+            joints=value.joints,
+            attached_to=(self._names[parent[0]], parent[1])
+            if parent is not None and parent[0] in self._objects
+            else None,
         )
 
 

@@ -273,11 +273,11 @@ async def test_the_world_says_what_was_in_it_and_where_its_robot_was(reading: Re
     again = (await reading.as_of(1, sequence=18)).world.object("milk")
     assert (again.id, again.identity_id) == (row(AGAIN), row(AGAIN))
     gone = (await reading.as_of(1, sequence=16)).world
-    with pytest.raises(CallerError, match="there was no object 'milk' in the world then, but pr2"):
+    with pytest.raises(CallerError, match="the world had no object 'milk' at this moment; its objects: pr2"):
         gone.object("milk")
     empty = (await reading.as_of(1, sequence=2)).world
     assert (empty.objects, empty.robot, empty.attachments) == ((), None, ())
-    with pytest.raises(CallerError, match="there was no object 'milk' in the world then, but nothing"):
+    with pytest.raises(CallerError, match="the world had no object 'milk' at this moment; its objects: none"):
         empty.object("milk")
 
 
@@ -367,19 +367,19 @@ async def test_an_episode_of_many_events_is_read_to_the_moment(log: EventLog) ->
 @pytest.mark.parametrize(
     ("when", "message"),
     [
-        ({}, "a moment is asked for by its time or by the sequence of an event: give one of the two"),
-        ({"time": 1.0, "sequence": 1}, "a moment is asked for by its time or by the sequence of an event: give one"),
+        ({}, "a moment needs either a time or the sequence of an event: pass exactly one of them"),
+        ({"time": 1.0, "sequence": 1}, "a moment needs either a time or the sequence of an event: pass"),
         ({"time": -0.5}, "-0.5 s is before episode 1 began"),
         ({"sequence": 0}, "event 0 is before episode 1 began"),
         ({"sequence": -3}, "event -3 is before episode 1 began"),
         ({"time": at(0)}, r"2023-11-14 22:13:20\+00:00 is before episode 1 began"),
-        ({"time": float("nan")}, "a time is seconds since the episode's start, or a datetime, not nan"),
-        ({"time": float("inf")}, "a time is seconds since the episode's start, or a datetime, not inf"),
-        ({"time": "1"}, "a time is seconds since the episode's start, or a datetime, not '1'"),
-        ({"time": True}, "a time is seconds since the episode's start, or a datetime, not True"),
-        ({"time": datetime(2023, 1, 1)}, r"datetime.datetime\(2023, 1, 1, 0, 0\) has no time zone: say which"),  # noqa: DTZ001
-        ({"sequence": 1.0}, "the sequence of an event is a whole number, not 1.0"),
-        ({"sequence": True}, "the sequence of an event is a whole number, not True"),
+        ({"time": float("nan")}, "time must be seconds since the episode's start or a datetime, got nan"),
+        ({"time": float("inf")}, "time must be seconds since the episode's start or a datetime, got inf"),
+        ({"time": "1"}, "time must be seconds since the episode's start or a datetime, got '1'"),
+        ({"time": True}, "time must be seconds since the episode's start or a datetime, got True"),
+        ({"time": datetime(2023, 1, 1)}, r"datetime.datetime\(2023, 1, 1, 0, 0\) has no time zone: add one"),  # noqa: DTZ001
+        ({"sequence": 1.0}, "sequence must be an integer, got 1.0"),
+        ({"sequence": True}, "sequence must be an integer, got True"),
     ],
 )
 async def test_what_is_no_moment_is_refused(reading: Reading, when: dict[str, Any], message: str) -> None:
@@ -396,8 +396,14 @@ async def test_what_is_no_moment_is_refused(reading: Reading, when: dict[str, An
         ("EpisodeStarted", None, 1, LogDamaged, "event 16: the episode starts a second time"),
         ("ObjectRemoved", b'{"object":{"object":5,"row":5}}', 1, LogDamaged, "event 16: object 5 was never added"),
         ("NodeStarted", b'{"kind":"action","parent":2,"designator":"0f"}', 1, LogDamaged, "type 0f was never declared"),
-        ("NodeEnded", b"{}", 2, DatabaseForeign, "event 16: NodeEnded has version 2, this version knows 1: a newer"),
-        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event this version knows: a newer"),
+        (
+            "NodeEnded",
+            b"{}",
+            2,
+            DatabaseForeign,
+            "event 16: NodeEnded has version 2, this version knows 1: use a newer",
+        ),
+        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event this version knows: use a newer"),
     ],
 )
 async def test_what_came_before_an_event_that_cannot_be_understood_is_told(
@@ -422,5 +428,5 @@ async def test_an_episode_that_does_not_begin_with_its_start_is_damaged(log: Eve
     script.put(NodeStarted("root"))
     await stored_and_folded(log, script.records)
     async with Reading.open_address(log.address) as reading:
-        with pytest.raises(LogDamaged, match="event 1: the episode has not started, and begins with NodeStarted"):
+        with pytest.raises(LogDamaged, match="event 1: the episode begins with NodeStarted instead of EpisodeStarted"):
             await reading.as_of(1, sequence=1)

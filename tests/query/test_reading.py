@@ -147,7 +147,7 @@ async def test_a_memory_that_is_not_there_or_has_no_tables_is_unavailable(log: E
     with pytest.raises(DatabaseUnavailable):
         async with Reading.open(f"sqlite:///{tmp_path}/nothing.db"):
             pass
-    with pytest.raises(DatabaseUnavailable, match="has a log and no tables yet: `pycrorm writer --once` makes them"):
+    with pytest.raises(DatabaseUnavailable, match="has a log but no tables yet: run `pycrorm writer --once`"):
         async with Reading.open_address(log.address):
             pass
 
