@@ -34,6 +34,18 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str
     running.drop(url)  # some hundred files, which would be written to the disk and deleted at the end of all
 
 
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def module_database_url(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A new database of each kind for all tests of a module, which fill it once and only read it."""
+    if request.param == "sqlite":
+        yield f"sqlite:///{tmp_path_factory.mktemp('memory') / 'memory.db'}"
+        return
+    running: Server = request.getfixturevalue("server")
+    url = running.new_database()
+    yield url
+    running.drop(url)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--soak-turn",

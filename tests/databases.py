@@ -11,7 +11,7 @@ import sqlite3
 import threading
 import time
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Coroutine, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 import asyncpg
 
-__all__ = ["Server", "server_in", "ask", "ask_to_change", "await_events"]
+__all__ = ["Server", "server_in", "ask", "ask_to_change", "await_events", "in_a_loop_of_its_own"]
 
 
 class Server:
@@ -43,13 +43,13 @@ class Server:
     def new_database(self) -> str:
         """The URL of an empty database that nobody used before."""
         name = f"memory_{next(self._numbers)}"
-        _in_a_loop_of_its_own(_run(self.url(), f"CREATE DATABASE {name}", ()))
+        in_a_loop_of_its_own(_run(self.url(), f"CREATE DATABASE {name}", ()))
         return self.url(name)
 
     def drop(self, url: str) -> None:
         """The database of that URL, whoever is connected to it."""
         name = urlsplit(url).path.removeprefix("/")
-        _in_a_loop_of_its_own(_run(self.url(), f"DROP DATABASE IF EXISTS {name} WITH (FORCE)", ()))
+        in_a_loop_of_its_own(_run(self.url(), f"DROP DATABASE IF EXISTS {name} WITH (FORCE)", ()))
 
     def stop(self) -> None:
         """At once, as if it had crashed: connections are cut, nothing is written that was not."""
@@ -91,8 +91,8 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
     running = Server(folder, server)
     if not syncs:
         for change in ("SET fsync = off", "SET full_page_writes = off"):
-            _in_a_loop_of_its_own(_run(running.url(), f"ALTER SYSTEM {change}", ()))
-        _in_a_loop_of_its_own(_run(running.url(), "SELECT pg_reload_conf()", ()))
+            in_a_loop_of_its_own(_run(running.url(), f"ALTER SYSTEM {change}", ()))
+        in_a_loop_of_its_own(_run(running.url(), "SELECT pg_reload_conf()", ()))
     try:
         yield running
     finally:
@@ -111,7 +111,7 @@ def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> li
             return connection.execute(statement, tuple(parameters)).fetchall()
         finally:
             connection.close()
-    return [tuple(row) for row in _in_a_loop_of_its_own(_run(url, statement, tuple(parameters)))]
+    return [tuple(row) for row in in_a_loop_of_its_own(_run(url, statement, tuple(parameters)))]
 
 
 def await_events(file: Path, count: int) -> None:
@@ -146,14 +146,15 @@ async def _run(url: str, statement: str, parameters: tuple[Any, ...]) -> list[An
         await connection.close()
 
 
-def _in_a_loop_of_its_own(call: Any) -> list[Any]:
-    """Its answer, also while a loop runs in this thread."""
+def in_a_loop_of_its_own(call: Coroutine[Any, Any, list[Any] | None]) -> list[Any]:
+    """Its rows, if it has any, also while a loop runs in this thread."""
     answer: list[Any] = []
     fault: list[BaseException] = []
 
     def run() -> None:
         try:
-            answer.extend(asyncio.run(call))
+            rows: list[Any] | None = asyncio.run(call)
+            answer.extend(rows or [])
         except BaseException as error:  # noqa: BLE001  raised again in the thread that asked
             fault.append(error)
 

@@ -12,6 +12,8 @@ ROOT = Path(__file__).parents[2]
 BUT = {"busy", "faults", "hook", "__main__", "rebuild_beside"}
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
 """Those that have no test of their own, and are run by themselves."""
+HEAVY = {"growth", "questions", "rebuild", "visible"}
+"""Those that start servers and daemons; a quick version takes more than ten seconds, and runs in turns."""
 
 
 def measured(script: str, *options: str) -> dict[str, Any]:
@@ -25,6 +27,7 @@ def measured(script: str, *options: str) -> dict[str, Any]:
     return dict(result)
 
 
+@pytest.mark.soak
 def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> None:
     result = measured("hook")
     states = [f"{writer}, {state}" for writer in ("thread", "daemon") for state in ("up", "slow", "down")]
@@ -34,13 +37,15 @@ def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> N
         assert 0 < spread["median"] <= spread["p99"] <= spread["p99.9"] <= spread["max"]
 
 
-@pytest.mark.parametrize("options", [(), ("--postgresql",)])
+@pytest.mark.parametrize("options", [(), pytest.param(("--postgresql",), marks=pytest.mark.soak)])
 def test_the_backlog_beside_a_busy_plan_is_measured(options: tuple[str, ...]) -> None:
     result = measured("busy", *options)
     assert result["events"] > 0
     assert max(result["backlog_at_the_end"], *result["backlog"]) <= result["backlog_max"] <= result["events"] + 10
 
 
-@pytest.mark.parametrize("script", OTHERS)
+@pytest.mark.parametrize(
+    "script", [pytest.param(each, marks=pytest.mark.soak) if each in HEAVY else each for each in OTHERS]
+)
 def test_every_other_script_measures_something(script: str) -> None:
     assert len(measured(script)) >= 2

@@ -54,7 +54,7 @@ def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> No
     assert "400 rollouts of this experiment are recorded already" in line
     assert "--resume" in line
     assert refused.returncode == 2
-    done = pycrorm(*SMALL, "--resume", "--figure", "two.svg", "--study", "5", cwd=folder)
+    done = pycrorm(*SMALL, "--resume", "--figure", "two.svg", "--study", "2", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "The same policies in other scenes" in done.stdout
     assert done.stdout.count("remembered") > 3
@@ -65,14 +65,14 @@ def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> No
 
 
 def test_a_study_asks_what_else_the_policy_is_worth(document: Any, folder: Path) -> None:
-    studied = answer(*SMALL, "--resume", "--study", "20", cwd=folder)["study"]
+    studied = answer(*SMALL, "--resume", "--study", "4", cwd=folder)["study"]
     assert len(studied["elsewhere"]) > 8
-    assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {20}
+    assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {4}
     assert document["study"] is None
 
 
 def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path) -> None:
-    longer = ("--rollouts", "2500")
+    longer = ("--rollouts", "1500")
     command = [*COMMAND, *SMALL, *longer, "--workers", "2"]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
     await_events(tmp_path / "pycrorm.db", 500)
@@ -83,8 +83,8 @@ def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path
     assert told == "pycrorm: interrupted; all events recorded so far are kept"
     assert note in ([], ["recorded events are being stored; Ctrl-C again exits at once without losing any"])
     document = answer(*SMALL, *longer, "--resume", cwd=tmp_path)
-    assert [each["rollouts"] for each in document["phases"]] == [2_500, 150, 150]
-    assert 0 < document["phases"][0]["done_now"] < 2_500
+    assert [each["rollouts"] for each in document["phases"]] == [1_500, 150, 150]
+    assert 0 < document["phases"][0]["done_now"] < 1_500
 
 
 def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: Path) -> None:

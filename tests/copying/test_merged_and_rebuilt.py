@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from itertools import pairwise
 
+import pytest
+
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from tests.copying.memories import assert_merged, everything, lost, random_plans
@@ -48,6 +50,7 @@ async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_h
     assert traces(target) == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_it_makes_no_difference_which_of_them_was_rebuilt_before(new_url: New, new_file: New) -> None:
     one, other, target = await merged(new_file, new_url, lambda url: random_plans(url, range(6)))
     before = tables_of(target)

@@ -77,6 +77,18 @@ SLOW = [
     if each.startswith(("killed fold", "stopped fold", "deleted database", "foreign", "failover", "restored"))
 ]
 """A round of these starts servers or many processes."""
+CHEAP = [
+    "torn write at every byte",
+    "flipped bit",
+    "failed sync",
+    "clock jumps",
+    "fork",
+    "second opener",
+    "crafted frames",
+    "lost COMMIT reply",
+    "cancelled append",
+]
+"""Rounds of these need no process and no server of their own; together they take a few seconds."""
 COST = ("lost", "duplicated", "misordered", "changed", "broke")
 
 
@@ -94,7 +106,8 @@ def test_the_list_of_faults_is_whole() -> None:
 @pytest.mark.parametrize(
     "names",
     [
-        pytest.param([each for each in FAULTS if each not in SLOW], id="quick rows"),
+        pytest.param([each for each in FAULTS if each in CHEAP], id="cheap rows"),
+        pytest.param([each for each in FAULTS if each not in SLOW + CHEAP], id="quick rows", marks=pytest.mark.soak),
         pytest.param(SLOW, id="slow rows", marks=pytest.mark.soak),
     ],
 )
@@ -108,6 +121,7 @@ def test_the_quick_version_makes_every_fault_and_costs_nothing(names: list[str])
     assert all(each["told"] > 0 for each in outcomes if each["fault"] == "flipped bit")
 
 
+@pytest.mark.soak
 def test_a_run_goes_on_from_its_report_and_a_loss_in_it_is_a_problem(tmp_path: Path) -> None:
     arguments = ("--only", "clock", "--seed", "7", "--report", tmp_path / "faults.md")
     code, [first], _ = faults(*arguments)

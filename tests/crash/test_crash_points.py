@@ -120,6 +120,10 @@ def stored(url: str, number: int) -> list[tuple[int, str, str]]:
     return ask(url, STORED, (episode_text(episode(number)),))
 
 
+AFTER = [False, pytest.param(True, marks=pytest.mark.soak)]
+"""Killed before each step; killed after it differs only by what a process does between two steps."""
+
+
 # --- recovery ---------------------------------------------------------------------------------------------------
 
 
@@ -163,7 +167,7 @@ def pairs() -> Iterator[tuple[int, int]]:
             yield first, second
 
 
-@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("after", AFTER)
 def test_a_recovery_killed_at_any_step_and_the_next_one_too_stores_every_event_once(
     left: tuple[str, Path], after: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -217,7 +221,7 @@ def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
     queue.release()
 
 
-@pytest.mark.parametrize("after", [False, True])
+@pytest.mark.parametrize("after", AFTER)
 def test_a_recorder_and_its_writer_killed_at_any_step_lose_nothing_that_was_put(tmp_path: Path, after: bool) -> None:
     done = False
     step = 0

@@ -120,7 +120,7 @@ async def beside_others(url: str, folder: Path, *, episodes: int, rebuilds: int,
 
 
 async def test_processes_that_record_and_read_meanwhile_see_nothing_of_it(database_url: str, tmp_path: Path) -> None:
-    await beside_others(database_url, tmp_path, episodes=300, rebuilds=2, readers=2)
+    await beside_others(database_url, tmp_path, episodes=100, rebuilds=2, readers=2)
 
 
 @pytest.mark.soak

@@ -29,7 +29,7 @@ from pycrorm_async.orm import MoveAndPickUpAction
 from tests.databases import ask, await_events
 
 SMALL = Experiment(rollouts=700, evaluate=200, held_out=200, workers=2)
-LONGER = Experiment(rollouts=3_000, evaluate=50, held_out=50, workers=2)
+LONGER = Experiment(rollouts=1_500, evaluate=50, held_out=50, workers=2)
 """At its first news most of it is still to be done, also when the machine is busy and news are looked at late."""
 
 
@@ -55,6 +55,7 @@ def after(rollouts: int, act: Callable[[], None]) -> Callable[[str, int, int, Ta
     return watch
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_often(place: MemoryLocation) -> None:
     told: dict[str, tuple[int, int]] = {}
     learned = await run(SMALL, place, lambda name, done, total, _: told.update({name: (done, total)}))
@@ -126,10 +127,10 @@ async def test_a_worker_that_is_killed_is_told_and_resumed_nothing_is_lost_or_co
         await run(LONGER, place, after(1, kill_one))
     assert not workers_running()
     async with Reading.open(place.url) as reading:
-        before = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 3_000)
-    assert 0 < len(before) < 3_000
+        before = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 1_500)
+    assert 0 < len(before) < 1_500
     learned = await finished(LONGER, place)
-    assert learned.default.done_now == 3_000 - len(before)
+    assert learned.default.done_now == 1_500 - len(before)
 
 
 async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it_can_be_resumed(tmp_path: Path) -> None:
@@ -145,7 +146,7 @@ async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it
     assert not workers_running()
     assert ask(place.url, "SELECT status FROM process_metadata WHERE status <> 'SUCCEEDED'") == []
     learned = await finished(LONGER, place)
-    assert 0 < learned.default.done_now < 3_000
+    assert 0 < learned.default.done_now < 1_500
 
 
 async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is_lost(tmp_path: Path) -> None:

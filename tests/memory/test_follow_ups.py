@@ -7,6 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Reading, Settings
@@ -49,6 +50,7 @@ async def recorded(url: str, spool: Path) -> list[str]:
         return list(memory.recent_episodes)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_every_perform_is_there_once_with_its_outcome_and_the_parts_name_each_other(
     database_url: str, tmp_path: Path
 ) -> None:

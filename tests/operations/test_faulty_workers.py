@@ -112,6 +112,7 @@ async def lab_at(url: str, folder: Path, settings: Settings, monkeypatch: pytest
 DEATHS = {"SIGKILL": "exited with signal 9", "SIGSEGV": "exited with signal 11", "exit": "exited with exit code 3"}
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_worker_that_dies_in_its_transaction_is_started_again_after_longer_and_longer_pauses(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,6 +130,7 @@ async def test_a_worker_that_dies_in_its_transaction_is_started_again_after_long
         assert [line for line in lab.said if "restarting" in line] == expected
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_what_a_worker_raises_is_said_and_it_goes_on_folding(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,6 +163,7 @@ async def test_a_worker_that_is_stopped_in_its_transaction_is_named_and_then_rep
         await lab.worker_is("running", restarts=1)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_worker_that_continues_in_time_is_not_replaced(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,26 +38,27 @@ DRAWERS = [
 ]
 TRAVEL = dict.fromkeys(DRAWERS, 0.35) | {"fridge_door": 1.9}
 """How far each of them goes, as the kitchen's own description says: m, rad."""
-ABOUT = 12
-"""So many of the places are tried, from all over the order."""
+ABOUT = pytest.mark.parametrize("about", [4, pytest.param(12, marks=pytest.mark.soak)])
+"""About so many of the places are tried, from all over the order."""
 
 
-def some(places: list[Location]) -> list[Location]:
-    return places[:: max(1, len(places) // ABOUT)]
+def some(places: list[Location], about: int) -> list[Location]:
+    return places[:: max(1, len(places) // about)]
 
 
+@ABOUT
 @pytest.mark.parametrize(
     ("name", "torso"), [*((name, 0.3 if "lower" in name else 0.0) for name in TRAVEL), ("fridge_door", 0.3)]
 )
 async def test_from_every_place_that_is_offered_it_can_be_opened_and_closed(
-    scene: Scene, name: str, torso: float
+    scene: Scene, name: str, torso: float, about: int
 ) -> None:
     await MoveTorsoActionPerformable(torso).perform()
     handle, joint = ObjectPart(f"{name}_handle", scene.kitchen), f"{name}_joint"
     before = scene.world.save_state()
     places = list(AccessingLocation(handle, scene.robot))
     assert len(places) >= 90
-    for place in some(places):
+    for place in some(places, about):
         for arm in place.reachable_arms:
             await NavigateActionPerformable(place.pose).perform()
             await OpenActionPerformable(handle, arm).perform()
@@ -70,14 +71,15 @@ async def test_from_every_place_that_is_offered_it_can_be_opened_and_closed(
             scene.world.restore_state(before)
 
 
+@ABOUT
 @pytest.mark.parametrize(("name", "now"), [("sink_area_drawer", 0.13), ("fridge_door", 0.77)])
 async def test_what_stands_half_open_can_be_opened_or_closed_from_every_place_that_is_offered(
-    scene: Scene, name: str, now: float
+    scene: Scene, name: str, now: float, about: int
 ) -> None:
     handle, joint = ObjectPart(f"{name}_handle", scene.kitchen), f"{name}_joint"
     scene.kitchen.set_joint_position(joint, now)
     before = scene.world.save_state()
-    for place in some(list(AccessingLocation(handle, scene.robot))):
+    for place in some(list(AccessingLocation(handle, scene.robot)), about):
         arm = place.reachable_arms[0]
         for action, there in ((OpenActionPerformable, TRAVEL[name] - 0.05), (CloseActionPerformable, 0.0)):
             await NavigateActionPerformable(place.pose).perform()

@@ -85,6 +85,7 @@ async def test_tables_made_anew_hold_row_for_row_what_was_kept_up_to_date(databa
     assert traces(database_url) == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_view_of_ours_that_was_noted_as_a_users_one_is_made_anew_too(database_url: str) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
     asked = 'SELECT id, arm, status FROM "PickUpWithContextView" ORDER BY id'
@@ -143,10 +144,11 @@ async def test_tables_that_nobody_ever_made_are_made(database_url: str) -> None:
     assert traces(database_url) == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_what_is_folded_beside_rebuilds_is_in_the_tables_and_no_reader_misses_anything(
     database_url: str, tmp_path: Path
 ) -> None:
-    await beside(database_url, tmp_path, rebuilds=4)
+    await beside(database_url, tmp_path, rebuilds=2)
 
 
 @pytest.mark.soak
@@ -263,6 +265,7 @@ async def test_interrupted_it_is_taken_up_where_it_was(database_url: str, monkey
     assert traces(database_url) == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_however_small_its_batches_are_it_makes_the_same(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,6 +278,7 @@ async def test_however_small_its_batches_are_it_makes_the_same(
     assert (list(done.parked), traces(database_url)) == ([str_of(10)], [])
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of an episode that is longer than a batch the next one begins where that ends which is being written."""
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 10)
@@ -290,6 +294,7 @@ async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.M
     await log.close()
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_cancelled_at_any_moment_it_is_taken_up_where_it_was(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ from tests.promises.random_plans import AT_ONCE, Entry, Generator, Journal, Thin
 
 PLANS = 1_000
 PARTS = 4
+"""A part holds plans of every kind, so one of them runs by default and the others in turns."""
 
 Row = tuple[str, int | None, str, str | None, str | None]
 """dtype, which row is the parent, status, class and message of the failure."""
@@ -70,7 +71,7 @@ def told(journal: Journal) -> list[Row]:
     return [(each.dtype, each.parent, each.status, each.reason, each.message) for each in journal.entries]
 
 
-@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.soak) for part in range(1, PARTS))])
 async def test_what_is_remembered_of_a_random_plan_is_what_its_parts_say(tmp_path: Path, part: int) -> None:
     journals: dict[int, Journal] = {}
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
@@ -153,9 +154,10 @@ def tree_of(entries: list[Entry], root: int = 0) -> Tree:
     return entry.thing.path, entry.status == "SUCCEEDED", inside
 
 
-async def test_an_ordinary_random_plan_does_what_the_language_means() -> None:
+@pytest.mark.parametrize("plans", [PLANS // PARTS, pytest.param(PLANS, marks=pytest.mark.soak)])
+async def test_an_ordinary_random_plan_does_what_the_language_means(plans: int) -> None:
     async with Memory.open("sqlite://") as memory:
-        for seed in range(0, PLANS, 5):
+        for seed in range(0, plans, 5):
             for each in (seed, seed + 1):
                 journal = await play(each, memory)
                 assert tree_of(journal.entries) == Meaning().of(plan_of(each)), f"seed {each}: {plan_of(each)}"

@@ -40,8 +40,10 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import AttachmentThen, Moment, NodeThen, RobotThen
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.pose import Pose
+from tests.databases import in_a_loop_of_its_own
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, T0_NS, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
@@ -174,11 +176,25 @@ def story(number: int = 1) -> Script:
     return script
 
 
-@pytest.fixture
-async def reading(log: EventLog) -> AsyncIterator[Reading]:
+@pytest.fixture(scope="module")
+def recorded(module_database_url: str) -> DatabaseAddress:
     """Episode 1 is the story."""
-    await stored_and_folded(log, [*declarations(*TYPES), *story().records])
-    async with Reading.open_address(log.address) as opened:
+    address = DatabaseAddress.parse(module_database_url)
+
+    async def record() -> None:
+        log = await EventLog.open(address, create=True)
+        try:
+            await stored_and_folded(log, [*declarations(*TYPES), *story().records])
+        finally:
+            await log.close()
+
+    in_a_loop_of_its_own(record())
+    return address
+
+
+@pytest.fixture
+async def reading(recorded: DatabaseAddress) -> AsyncIterator[Reading]:
+    async with Reading.open_address(recorded) as opened:
         yield opened
 
 

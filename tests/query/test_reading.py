@@ -28,8 +28,10 @@ from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, Pick
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms
+from tests.databases import in_a_loop_of_its_own
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
@@ -58,12 +60,26 @@ def episode(number: int) -> Script:
     return script
 
 
-@pytest.fixture
-async def reading(log: EventLog) -> AsyncIterator[Reading]:
+@pytest.fixture(scope="module")
+def recorded(module_database_url: str) -> DatabaseAddress:
     """Episode 1 still runs, episode 2 is over."""
-    types = declarations(NAVIGATE, PICK_UP, SAYING)
-    await stored_and_folded(log, [*types, *episode(1).records, *episode(2).records])
-    async with Reading.open_address(log.address) as opened:
+    address = DatabaseAddress.parse(module_database_url)
+
+    async def record() -> None:
+        log = await EventLog.open(address, create=True)
+        try:
+            types = declarations(NAVIGATE, PICK_UP, SAYING)
+            await stored_and_folded(log, [*types, *episode(1).records, *episode(2).records])
+        finally:
+            await log.close()
+
+    in_a_loop_of_its_own(record())
+    return address
+
+
+@pytest.fixture
+async def reading(recorded: DatabaseAddress) -> AsyncIterator[Reading]:
+    async with Reading.open_address(recorded) as opened:
         yield opened
 
 

@@ -158,7 +158,8 @@ def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
     assert waits
 
 
-def test_of_many_who_ring_at_once_each_waiter_is_woken_once() -> None:
+@pytest.mark.parametrize("rounds", [50, pytest.param(500, marks=pytest.mark.soak)])
+def test_of_many_who_ring_at_once_each_waiter_is_woken_once(rounds: int) -> None:
     bell = Notifier()
     over = threading.Event()
     failures: list[BaseException] = []
@@ -173,7 +174,7 @@ def test_of_many_who_ring_at_once_each_waiter_is_woken_once() -> None:
     ringing = [threading.Thread(target=notify_all) for _ in range(3)]
     for thread in ringing:
         thread.start()
-    for _ in range(500):
+    for _ in range(rounds):
         asked = iter([False, True])
         assert bell.block_until(lambda asked=asked: next(asked), remaining_s=lambda: PATIENCE_S)  # type: ignore[misc]
     over.set()
