@@ -1,4 +1,4 @@
-"""Loads the plan of `PLAN.py[:function]`, or says in one line why it cannot."""
+"""This module loads the plan function that `PLAN.py[:function]` names."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ __all__ = ["PlanNotLoadable", "LoadedPlan", "load_plan"]
 
 
 class PlanNotLoadable(CallerError):
-    """The plan file or its function cannot be used."""
+    """The plan file or its function cannot be used; the message is one line."""
 
 
 class LoadedPlan(NamedTuple):
-    """An async function to run; it takes the memory, or nothing."""
+    """A plan: an async function that takes the memory or no argument."""
 
     name: str
     function: Callable[..., Awaitable[Any]]
@@ -28,23 +28,23 @@ class LoadedPlan(NamedTuple):
 
     @property
     def description(self) -> str:
-        """The first line of the function's docstring, or the plan's name."""
+        """Return the first line of the function's docstring, or the plan's name."""
         documentation = inspect.getdoc(self.function)
         return documentation.splitlines()[0] if documentation else self.name
 
 
 def load_plan(reference: str) -> LoadedPlan:
-    """The plan of `path.py` or `path.py:function`; without a function, `plan`. Raises `PlanNotLoadable`."""
+    """Import `path.py` and return its function; without `:function`, the function `plan`. Raises `PlanNotLoadable`."""
     path_text, _, function_name = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
     function_name = function_name or "plan"
     path = Path(path_text)
     if not path.is_file():
-        raise PlanNotLoadable(f"no plan file {path_text!r}")
-    module = _imported(path)
+        raise PlanNotLoadable(f"the plan file {path_text!r} does not exist")
+    module = _import_file(path)
     function = getattr(module, function_name, None)
     if function is None:
-        offered = [name for name, each in vars(module).items() if inspect.iscoroutinefunction(each)]
-        hint = f"; it has {', '.join(offered)}" if offered else "; it has no async function"
+        functions = [name for name, each in vars(module).items() if inspect.iscoroutinefunction(each)]
+        hint = f"; its async functions: {', '.join(functions)}" if functions else "; it has no async function"
         raise PlanNotLoadable(f"{path} has no function {function_name!r}{hint}")
     if not inspect.iscoroutinefunction(function):
         raise PlanNotLoadable(f"{path}:{function_name} is not an async function: write `async def {function_name}()`")
@@ -55,17 +55,17 @@ def load_plan(reference: str) -> LoadedPlan:
     ]
     if len(required) > 1:
         names = ", ".join(each.name for each in required)
-        raise PlanNotLoadable(f"{path}:{function_name} takes {names}: a plan takes the memory, or nothing")
+        raise PlanNotLoadable(f"{path}:{function_name} takes {names}: a plan takes the memory or no argument")
     return LoadedPlan(f"{path.name}:{function_name}", function, bool(required))
 
 
-def _imported(path: Path) -> Any:
+def _import_file(path: Path) -> Any:
     name = path.stem
     if name in sys.modules or name in sys.stdlib_module_names:
-        raise PlanNotLoadable(f"{path} has the name of a module of Python's own or one in use: rename the file")
+        raise PlanNotLoadable(f"{path} has the name of a standard or already loaded module: rename the file")
     specification = importlib.util.spec_from_file_location(name, path.resolve())
     if specification is None or specification.loader is None:
-        raise PlanNotLoadable(f"{path} is no Python file")
+        raise PlanNotLoadable(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(specification)
     sys.modules[name] = module
     sys.path.insert(0, str(path.resolve().parent))
@@ -73,7 +73,7 @@ def _imported(path: Path) -> Any:
         specification.loader.exec_module(module)
     except SystemExit as error:
         del sys.modules[name]
-        raise PlanNotLoadable(f"{path} leaves the program when it is imported (exit {error.code})") from error
+        raise PlanNotLoadable(f"{path} exits the program when it is imported (exit code {error.code})") from error
     except Exception as error:
         del sys.modules[name]
         frames = traceback.extract_tb(error.__traceback__)
@@ -81,5 +81,5 @@ def _imported(path: Path) -> Any:
             (frame.lineno for frame in reversed(frames) if frame.filename == str(path.resolve())), None
         )
         where = f"{path}:{line}" if line else str(path)
-        raise PlanNotLoadable(f"{where} does not import: {type(error).__name__}: {error}") from error
+        raise PlanNotLoadable(f"{where} cannot be imported: {type(error).__name__}: {error}") from error
     return module

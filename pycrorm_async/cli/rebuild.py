@@ -1,4 +1,4 @@
-"""`pycrorm rebuild`: makes the tables anew from the log."""
+"""`pycrorm rebuild` rebuilds the tables from the log."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ _TABLES = "tables"
 
 def rebuild(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="`tables`, or a projection; default: all.")
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="`tables`, or the name of a projection; default: all."),
     ] = None,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
@@ -35,67 +36,68 @@ def rebuild(
             "--workers",
             min=1,
             max=64,
-            help="Processes that fold the tables at once. Default: two for more than half a million events where two"
-            " cores have nothing to do.",
+            help="Processes that fold in parallel. Default: 2 for more than half a million events if two cores are"
+            " idle, else 1.",
             show_default=False,
         ),
     ] = None,
     projection: ProjectionOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Make all tables and views anew from the log, or those of the named projections, while all goes on.
+    """Rebuild all tables and views from the log, or those of the named projections, while recording continues.
 
-    The new tables are made beside those that people see and take their place in one moment, when they show at least as
-    much. A rebuild that was interrupted is taken up by the next one. It needs no code of a plan, only that of the
-    projections: one whose code is not here is left as it is.
+    The new tables are built as a new generation beside the current one and replace it in one transaction, once they
+    contain at least as many events. Run it again to continue an interrupted rebuild. It needs no code of a plan, only
+    that of the projections; a projection whose code is not available is skipped.
     """
-    named_here = named(projection or ())
-    known = {each.name: each for each in (*named_here, *installed_besides(named_here))}
+    given_projections = named(projection or ())
+    projections = {each.name: each for each in (*given_projections, *installed_besides(given_projections))}
     collect_seldom()
-    chosen = asyncio.run(_chosen(url, names or [], known))
-    done = {name: asyncio.run(_rebuild(url, workers, known.get(name))) for name in chosen}
+    chosen = asyncio.run(_choose(url, names or [], projections))
+    summaries = {name: asyncio.run(_rebuild(url, workers, projections.get(name))) for name in chosen}
     if as_json:
-        tables = done["tables"]._asdict() if "tables" in done else {}
-        others = {name: each._asdict() for name, each in done.items() if name in known}
+        tables = summaries["tables"]._asdict() if "tables" in summaries else {}
+        others = {name: each._asdict() for name, each in summaries.items() if name in projections}
         print_json({**tables, "projections": others} if others else tables)
-    for name, each in done.items():
+    for name, each in summaries.items():
         if not as_json:
             rate = each.events / max(each.seconds, 1e-9)
             stdout.print(
-                f"{f'{name}, ' if name in known else ''}generation {each.generation}: {each.events} events of"
+                f"{f'{name}, ' if name in projections else ''}generation {each.generation}: {each.events} events of"
                 f" {each.episodes} episodes in {duration(int(each.seconds * 1e9))}, {rate:,.0f} events/s"
             )
         if each.left:
             note(
-                f"{len(each.left)} tables that are not shown any more are used still, by a long transaction or a view:"
+                f"{len(each.left)} tables of a former generation are still used by a long transaction or a view:"
                 f" {each.left[0]}, … (the next rebuild drops them)"
             )
         for episode, reason in each.parked.items():
-            note(f"episode {episode} is parked{f' in {name}' if name in known else ''}: {reason}")
+            note(f"episode {episode} is parked{f' in {name}' if name in projections else ''}: {reason}")
     note_pending_events(url, spool)
-    return 1 if any(each.parked for each in done.values()) else 0
+    return 1 if any(each.parked for each in summaries.values()) else 0
 
 
-async def _chosen(url: str, names: list[str], known: Mapping[str, Projection]) -> list[str]:
-    """What to rebuild, the tables first. Raises `CallerError`."""
-    there = await projections_of(url)
+async def _choose(url: str, names: list[str], projections: Mapping[str, Projection]) -> list[str]:
+    """Return the names of what to rebuild, the tables first. Raises `CallerError` for an unknown name."""
+    stored_names = await projections_of(url)
     for name in names:
-        if name in there and name not in known:
-            raise CallerError(f"the code of the projection {name} is not here: give it with --projection module:Class")
-        if name != _TABLES and name not in known:
-            raise CallerError(f"there is no projection {name!r}: there are {', '.join([_TABLES, *sorted(known)])}")
-    for name in there:
-        if not names and name not in known:
-            note(f"the code of the projection {name} is not here: it is left as it is")
-    return [each for each in (_TABLES, *known) if not names or each in names]
+        if name in stored_names and name not in projections:
+            raise CallerError(f"the code of the projection {name} is not available: add --projection module:Class")
+        if name != _TABLES and name not in projections:
+            choices = ", ".join([_TABLES, *sorted(projections)])
+            raise CallerError(f"unknown projection {name!r}; known: {choices}")
+    for name in stored_names:
+        if not names and name not in projections:
+            note(f"the projection {name} is not rebuilt, because its code is not available")
+    return [each for each in (_TABLES, *projections) if not names or each in names]
 
 
 async def _rebuild(url: str, workers: int | None, projection: Projection | None) -> RebuildSummary:
-    with watched("rebuilding") as watch:
+    with watched("rebuilding") as advance:
 
-        def tell(what: str, done: int, total: int) -> None:
-            watch(done, total, what)
+        def report_progress(phase: str, done: int, total: int) -> None:
+            advance(done, total, phase)
 
         if projection is not None:
-            return await rebuild_projection(url, projection, report_progress=tell)
-        return await rebuild_memory(url, workers=workers, report_progress=tell)
+            return await rebuild_projection(url, projection, report_progress=report_progress)
+        return await rebuild_memory(url, workers=workers, report_progress=report_progress)

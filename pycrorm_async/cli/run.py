@@ -1,4 +1,4 @@
-"""`pycrorm run PLAN.py[:function]`: any plan, remembered."""
+"""`pycrorm run PLAN.py[:function]` runs a plan and records it."""
 
 from __future__ import annotations
 
@@ -35,29 +35,37 @@ from pycrorm_async.settings import Settings
 
 __all__ = ["run"]
 
-_FOUND_AFTER_S = 2
+_DRAIN_WAIT_S = 2
+"""Bounds the wait until a daemon drains the new recorder; a running daemon scans the spool more often than that."""
 
 
 def run(
     plan: Annotated[
-        str, typer.Argument(metavar="PLAN.py[:function]", help="An async function; without a name, `plan`.")
+        str,
+        typer.Argument(
+            metavar="PLAN.py[:function]", help="File and async function of the plan; default function: `plan`."
+        ),
     ],
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     description: Annotated[
-        str | None, typer.Option(help="Why; default: the function's docstring, or its name.")
+        str | None, typer.Option(help="Description of the episode; default: the function's docstring, or its name.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Recorded with the episode; the plan itself must use it.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed to record with the episode; the plan must use it itself.")
+    ] = None,
     writer: WriterOption = "thread",
     projection: ProjectionOption = None,
     file_access: FileAccessOption = "owner",
-    show_traceback: Annotated[bool, typer.Option("--traceback", help="Of a plan that raises, on stderr.")] = False,
+    show_traceback: Annotated[
+        bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> int:
-    """Run a plan and remember it.
+    """Run a plan and record it.
 
-    The function takes nothing, and is one episode; or it takes the memory, and opens its own.
-    Exit code 1 if the plan failed: everything up to there is remembered.
+    A function without an argument is recorded as one episode; a function that takes the memory opens its own episodes.
+    Exit code 1 if the plan failed; everything it did before is recorded.
     """
     loaded = load_plan(plan)
     settings = Settings(writer=writer, file_access=file_access)
@@ -65,11 +73,11 @@ def run(
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         try:
-            asyncio.run(_remembered(loaded, memory, description or loaded.description, seed, outcome))
-        except asyncio.CancelledError as cancelled:  # the plan's own doing: Ctrl-C is a KeyboardInterrupt here
+            asyncio.run(_run_and_record(loaded, memory, description or loaded.description, seed, outcome))
+        except asyncio.CancelledError as cancelled:  # the plan cancelled itself; Ctrl-C is a KeyboardInterrupt here
             outcome.failure = cancelled
-        except SystemExit as leaving:  # in a task of the plan's: it ends the loop
-            outcome.leave(leaving)
+        except SystemExit as system_exit:  # raised in a task of the plan, where it ends the event loop
+            outcome.note_exit(system_exit)
     failure, episodes = outcome.failure, outcome.episodes
     if as_json:
         print_json(
@@ -89,7 +97,7 @@ def run(
         )
     if outcome.left is not None:
         where = _place(outcome.left)
-        note(f"the plan {loaded.name} ended itself by sys.exit(0){where}; all that was recorded up to there is kept")
+        note(f"the plan {loaded.name} called sys.exit(0){where}; all events recorded before are kept")
     for each in outcome.unawaited:
         problem(each)
     if failure is None:
@@ -102,11 +110,14 @@ def run(
 
 @dataclass
 class _Outcome:
-    """How the plan ended, and its episodes, once they are in the database.
+    """The outcome of a plan.
 
     Attributes:
-        left: the `sys.exit()` by which it ended itself, as if all was well.
-        unawaited: its performs that were never awaited.
+        failure: the exception that left the plan; None if it succeeded.
+        left: the `SystemExit` of a plan that called `sys.exit()` with code 0.
+        unawaited: a sentence for each type of perform that was never awaited.
+        episodes: the plan's episodes, read from the database after the last flush.
+        is_written: whether a writer drained the recorder, so that `episodes` could be read.
     """
 
     failure: BaseException | None = None
@@ -115,15 +126,15 @@ class _Outcome:
     episodes: list[EpisodeSummary] = field(default_factory=list)
     is_written: bool = True
 
-    def leave(self, leaving: SystemExit) -> None:
-        """The plan ended itself."""
-        if leaving.code in (None, 0):
-            self.left = leaving
+    def note_exit(self, system_exit: SystemExit) -> None:
+        """Record that the plan called `sys.exit()`: with a code other than 0 it failed."""
+        if system_exit.code in (None, 0):
+            self.left = system_exit
         else:
-            self.failure = leaving
+            self.failure = system_exit
 
 
-async def _remembered(
+async def _run_and_record(
     loaded: LoadedPlan, opened: Memory, description: str, seed: int | None, outcome: _Outcome
 ) -> None:
     interruption = Interruption()
@@ -137,9 +148,9 @@ async def _remembered(
                         await loaded.function()
             except (KeyboardInterrupt, asyncio.CancelledError):
                 raise
-            except SystemExit as leaving:
-                outcome.leave(leaving)
-            except BaseException as error:  # noqa: BLE001  a plan may raise anything; it is told in one line
+            except SystemExit as system_exit:
+                outcome.note_exit(system_exit)
+            except BaseException as error:  # noqa: BLE001  a plan may raise anything; `run` prints it as one line
                 outcome.failure = error
             finally:
                 interruption.plan_ended()
@@ -150,10 +161,10 @@ async def _remembered(
 async def _summarise(memory: Memory, outcome: _Outcome) -> None:
     if not memory.is_open:  # the plan closed it
         return
-    gc.collect()  # a perform that was never awaited is noticed when its coroutine is collected
+    gc.collect()  # a perform that was never awaited is reported when its coroutine is collected
     outcome.unawaited = memory.status.unawaited
-    if not await _is_written(memory):
-        outcome.is_written = False  # closing says so
+    if not await _wait_for_writer(memory):
+        outcome.is_written = False  # closing the memory reports it
         return
     try:
         await memory.flush()
@@ -161,13 +172,13 @@ async def _summarise(memory: Memory, outcome: _Outcome) -> None:
         note(str(parked))
     recent = memory.recent_episodes
     if memory.opened_count > len(recent):
-        note(f"the last {len(recent)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")
+        note(f"showing the last {len(recent)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")
     outcome.episodes = [each for each in await memory.reading.episodes() if each.id in recent]
 
 
-async def _is_written(memory: Memory) -> bool:
-    """Whether there is somebody to wait for: a daemon may take a moment to find a recorder that is new."""
-    for _ in range(_FOUND_AFTER_S * 10):
+async def _wait_for_writer(memory: Memory) -> bool:
+    """Wait until a writer drains this recorder, and return False if none does within `_DRAIN_WAIT_S`."""
+    for _ in range(_DRAIN_WAIT_S * 10):
         if memory.status.drained:
             return True
         await asyncio.sleep(0.1)
@@ -182,7 +193,7 @@ def _one_line(failure: BaseException | None) -> str | None:
 
 
 def _place(failure: BaseException) -> str:
-    """The last line of the plan's own that it passed."""
+    """Return file and line of the innermost traceback frame in the user's code, in parentheses."""
     frames = traceback.extract_tb(failure.__traceback__)
     library = sysconfig.get_path("stdlib")
     own = [

@@ -1,4 +1,4 @@
-"""`pycrorm spool`: `inspect` its files, `repair` damaged ones, `rebind` it to another database."""
+"""`pycrorm spool` inspects a spool's files, repairs damaged ones, and rebinds the spool to another database."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The spool: 
 
 
 def inspect(folder: FolderArgument, as_json: JsonOption = False) -> int:
-    """Say what is in a spool, from its files alone. Changes nothing.
+    """List the contents of a spool, reading only its files. Changes nothing.
 
-    Exit code 4 if something in it is damaged, 3 if something cannot be read, 1 if something in it is not ours.
+    Exit code 4 if a file is damaged, 3 if a folder cannot be read, 1 if the spool contains files of other programs.
     """
     report = inspect_spool(folder)
     if as_json:
@@ -49,12 +49,12 @@ def inspect(folder: FolderArgument, as_json: JsonOption = False) -> int:
         _print(report)
     for each in report.recorders:
         if each.damage is not None:
-            what = "stop its process first" if each.alive else f"mend it with: pycrorm spool repair {folder}"
-            problem(f"{_told(each.damage)}; {what}")
+            remedy = "stop its process first" if each.alive else f"repair it with: pycrorm spool repair {folder}"
+            problem(f"{_damage_text(each.damage)}; {remedy}")
         if each.refused is not None:
             problem(each.refused)
     for name in report.strangers:
-        problem(f"{folder / name} is not ours; it is left alone")
+        problem(f"{folder / name} does not belong to a spool and is ignored")
     if any(each.damage for each in report.recorders):
         return 4
     if any(each.refused for each in report.recorders):
@@ -63,40 +63,40 @@ def inspect(folder: FolderArgument, as_json: JsonOption = False) -> int:
 
 
 def repair(folder: FolderArgument, as_json: JsonOption = False) -> int:
-    """Mend damaged folders of dead recorders, so that all that is whole in them can be stored.
+    """Repair damaged folders of dead recorders, so that their readable records can be stored.
 
-    A damaged folder is put aside as it is, and told. Exit code 1 if records were given up, 3 if a damaged folder
-    cannot be mended.
+    The original of a repaired folder is kept beside it under the name that is printed. Exit code 1 if records could
+    not be kept, 3 if a damaged folder cannot be repaired.
     """
     inspect_spool(folder)
     finished = finish_repairs(folder)
-    mended: list[RepairReport] = []
+    repaired: list[RepairReport] = []
     refused: dict[str, PycrormError] = {}
     for each in inspect_spool(folder).recorders:
         if each.damage is None and each.refused is None:
             continue
         try:
             report = repair_folder(Path(each.path))
-        except Exception as fault:  # noqa: BLE001 - reported of this folder; the next may be repaired
+        except Exception as fault:  # noqa: BLE001 - reported for this folder; the others can still be repaired
             refused[each.name] = folder_error(Path(each.path), fault)
         else:
-            mended += [report] if report is not None else []
+            repaired += [report] if report is not None else []
     if as_json:
-        print_json(_repaired(finished, mended, refused))
+        print_json(_repair_document(finished, repaired, refused))
     else:
         for path in finished:
-            _line(f"{path.name}: a repair that was interrupted is finished")
-        for report in mended:
+            _line(f"{path.name}: completed an interrupted repair")
+        for report in repaired:
             _print_repair(report)
-        if not (finished or mended or refused):
+        if not (finished or repaired or refused):
             _line("nothing is damaged")
     for error in refused.values():
         problem(str(error))
-    if mended and not as_json:
-        note(f"Store what was kept with: pycrorm writer --once --url DATABASE --spool {folder}")
+    if repaired and not as_json:
+        note(f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {folder}")
     if refused:
         return 3
-    return 0 if all(each.complete for each in mended) else 1
+    return 0 if all(each.complete for each in repaired) else 1
 
 
 def rebind(
@@ -106,39 +106,39 @@ def rebind(
     file_access: FileAccessOption = "owner",
     as_json: JsonOption = False,
 ) -> int:
-    """Store what a spool holds in the database that is at the URL now, when its own was deleted or replaced.
+    """Bind a spool to the database at the URL, after its own was deleted or replaced, and store the spool's events.
 
-    A database that does not exist is made. Nothing is deleted before it is stored. An episode whose beginning was in
-    the deleted database alone cannot be stored: its events stay in the spool as dead letters, and the exit code is 1.
-    Refused with exit code 3 while a process records into the spool or drains it. Other exit codes as of `pycrorm writer
+    Creates the database if it does not exist. Deletes no event before it is stored. An episode whose first events were
+    only in the deleted database cannot be stored: its events stay in the spool as dead letters, and the exit code is 1.
+    Exit code 3 while a process records into the spool or drains it. Other exit codes are those of `pycrorm writer
     --once`.
     """
     projections, settings = named(projection or ()), Settings(file_access=file_access)
-    done = asyncio.run(recovery.rebind(url, spool=spool, settings=settings, say=_say_rebinding))
-    beside = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
-    return store_once(url, spool, projections, settings, as_json=as_json, beside=beside)
+    done = asyncio.run(recovery.rebind(url, spool=spool, settings=settings, say=_print_rebinding))
+    extra = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
+    return store_once(url, spool, projections, settings, as_json=as_json, extra=extra)
 
 
-def _say_rebinding(planned: Rebinding) -> None:
-    before = f"log {planned.before}" if planned.before else "no log yet"
-    holds = f"{planned.events} events of {planned.recorders} recorder{'' if planned.recorders == 1 else 's'}"
-    note(f"{planned.spool} belongs to {before}; from now on to log {planned.after}, which gets its {holds}.")
+def _print_rebinding(planned: Rebinding) -> None:
+    before = f"log {planned.before}" if planned.before else "no log"
+    events = f"{planned.events} events of {planned.recorders} recorder{'' if planned.recorders == 1 else 's'}"
+    note(f"binding {planned.spool} to log {planned.after} (before: {before}) and storing its {events} there")
 
 
 def _print(report: SpoolReport) -> None:
     print_facts(
         f"Spool {report.path}",
         {
-            "log": report.log_id or "none yet: nothing was ever drained from it",
+            "log": report.log_id or "none: no writer has drained the spool yet",
             "recorders": str(len(report.recorders)),
-            "aside": ", ".join(report.set_aside),
-            "half made or removed": ", ".join(report.unfinished),
+            "originals of repaired folders": ", ".join(report.set_aside),
+            "incomplete": ", ".join(report.unfinished),
         },
     )
     if report.recorders:
         print_table(
             "Recorders",
-            ("recorder", "state", "files", "first", "last", "safe to", "records", "episodes", "open", "torn bytes"),
+            ("recorder", "state", "files", "first", "last", "synced", "records", "episodes", "open", "torn bytes"),
             [
                 (
                     each.name,
@@ -165,63 +165,63 @@ def _print_recorder(each: RecorderReport) -> None:
         {
             "types": ", ".join(f"{name} {count}" for name, count in each.types.items()),
             "files": ", ".join(f"{one.file} from {one.base}" for one in each.segments if one.base is not None),
-            "cut off": ", ".join(each.cut_off),
+            "copies of torn tails": ", ".join(each.cut_off),
             "foreign": ", ".join(each.foreign),
         },
     )
     for one in each.open:
-        _line(f"  open: episode {one.id}, {one.sequence} events, the last {_time(one.wall_ns)}")
+        _line(f"  open: episode {one.id}, {one.sequence} events, the last at {_time(one.wall_ns)}")
 
 
 def _print_repair(report: RepairReport) -> None:
     _line(
-        f"{report.name}: mended; {report.kept} records before the damage are kept,"
-        f" {report.saved} from behind it are saved"
+        f"{report.name}: repaired; {report.kept} records before the damage are kept,"
+        f" {report.saved} behind it are salvaged"
     )
-    _line(f"  as it was: {report.set_aside}")
-    _line(f"  damage: {_told(report.damage)}")
+    _line(f"  original folder: {report.set_aside}")
+    _line(f"  damage: {_damage_text(report.damage)}")
     if report.unreadable:
-        _line(f"  given up: {_spans('position', report.unreadable)}, which cannot be read any more")
+        _line(f"  not kept: {_spans('position', report.unreadable)}, because the bytes cannot be read")
     for each in report.given_up:
         kept = f"kept up to event {each.kept_to}" if each.kept_to else "not kept at all"
         _line(
-            f"  given up: {_spans('event', each.sequences)} of episode {each.episode}, which is {kept}: what comes"
-            f" between is missing ({_spans('position', each.positions)} in the folder put aside)"
+            f"  not kept: {_spans('event', each.sequences)} of episode {each.episode}, because the events before them"
+            f" are missing ({_spans('position', each.positions)} in the original folder); the episode is {kept}"
         )
     if report.headless:
-        _line("  given up: the end of episodes that were open in the oldest file and wrote nothing after it")
+        _line("  not kept: the ends of episodes that were open in the oldest file and have no later record")
 
 
 def _state(each: RecorderReport) -> str:
     state = "refused" if each.name.endswith(REFUSED) else "alive" if each.alive else "dead"
-    return f"{state}, drained now" if each.being_drained else state
+    return f"{state}, being drained" if each.being_drained else state
 
 
-def _told(damage: Damage) -> str:
+def _damage_text(damage: Damage) -> str:
     return f"{damage.file} is damaged at byte {damage.offset}: {damage.reason}"
 
 
 def _time(wall_ns: int) -> str:
     try:
         return f"{moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))} UTC"
-    except (ValueError, OverflowError, OSError):  # a clock that was never set
+    except (ValueError, OverflowError, OSError):  # the recording machine's clock was not set
         return f"{wall_ns} ns"
 
 
 def _line(text: str) -> None:
-    """A whole line, however long: paths and ids are copied from it."""
+    """Print a line without wrapping, so that users can copy its paths and ids."""
     stdout.print(text, markup=False, soft_wrap=True)
 
 
-def _spans(noun: str, found: Sequence[Range]) -> str:
-    """Numbers in words.
+def _spans(noun: str, ranges: Sequence[Range]) -> str:
+    """Format ranges of numbers behind their noun.
 
     >>> _spans("event", [(5, 5)]), _spans("event", [(5, 7), (9, 9)])
     ('event 5', 'events 5 to 7, 9')
     """
-    texts = [str(first) if first == last else f"{first} to {last}" for first, last in found]
-    many = len(found) > 1 or found[0][0] != found[0][1]
-    return f"{noun}{'s' * many} {', '.join(texts)}"
+    texts = [str(first) if first == last else f"{first} to {last}" for first, last in ranges]
+    is_plural = len(ranges) > 1 or ranges[0][0] != ranges[0][1]
+    return f"{noun}{'s' * is_plural} {', '.join(texts)}"
 
 
 def _document(report: SpoolReport) -> dict[str, object]:
@@ -229,11 +229,11 @@ def _document(report: SpoolReport) -> dict[str, object]:
     return asdict(report) | {"recorders": recorders}
 
 
-def _repaired(
-    finished: Sequence[Path], mended: Sequence[RepairReport], refused: dict[str, PycrormError]
+def _repair_document(
+    finished: Sequence[Path], repaired: Sequence[RepairReport], refused: dict[str, PycrormError]
 ) -> dict[str, object]:
     return {
-        "mended": [asdict(each) | {"complete": each.complete} for each in mended],
+        "mended": [asdict(each) | {"complete": each.complete} for each in repaired],
         "finished": [path.name for path in finished],
         "refused": {name: str(error) for name, error in refused.items()},
     }

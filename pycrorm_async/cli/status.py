@@ -1,4 +1,4 @@
-"""`pycrorm status`: who records, who drains, how far the database and its tables are behind, and what is stopped."""
+"""`pycrorm status` reports recorders and writers, the lag of database and tables, and everything that is stopped."""
 
 from __future__ import annotations
 
@@ -32,20 +32,24 @@ from pycrorm_async.store.log import EventLog
 __all__ = ["status", "RecorderState", "EpisodeState", "RefusedState"]
 
 
+_DRAINED_BY = {"itself": "itself", "another": "another process", "nobody": "no process"}
+"""The table's words for the values of `RecorderState.drained`, which are part of the `--json` document."""
+
+
 @dataclass(frozen=True)
 class RecorderState:
-    """One recorder of the spool, as its folder shows it.
+    """The state of one recorder, read from its folder in the spool.
 
     Attributes:
-        name: of its folder, a UUID that sorts by time.
-        alive: whether its process lives.
-        drained: by `itself`, by `another` process, or by `nobody`.
-        synced, stored, folded: positions; None where its own process drains it, or it is dead.
-        bytes_spooled: what its files take; a living one's are allocated ahead.
-        away: why the database takes nothing now, as whoever drains it says.
-        given_up: why nothing more of it is stored.
-        stopped: by id, its episodes that are refused or parked, and why.
-        fault: why its folder cannot be read; the other fields say nothing then.
+        name: the folder's name, a UUID that sorts by time.
+        alive: whether the recorder's process is running.
+        drained: the process that drains it: `itself`, `another`, or `nobody`.
+        synced, stored, folded: positions; None for a dead recorder and for one that its own process drains.
+        bytes_spooled: size of its files; a living recorder allocates them in advance.
+        away: reason why the database is unavailable, as the draining process reports it.
+        given_up: reason why no further records of it are stored.
+        stopped: reasons of its refused and parked episodes, by episode id.
+        fault: reason why its folder cannot be read; the other fields are then meaningless.
     """
 
     name: str
@@ -63,7 +67,10 @@ class RecorderState:
 
 @dataclass(frozen=True)
 class EpisodeState:
-    """An episode the tables do not show all of, or that is stopped; `lag_s` is the age of what they show next."""
+    """An episode that is not completely folded, or that is stopped.
+
+    `lag_s` is the age in seconds of the first event that is not folded yet.
+    """
 
     number: int
     id: str
@@ -77,7 +84,7 @@ class EpisodeState:
 
 @dataclass(frozen=True)
 class RefusedState:
-    """Events of one episode that the database refused: kept in this folder, and offered to it again by every start."""
+    """The folder of dead letters of one episode; each start of a writer offers them to the database again."""
 
     episode: str
     folder: Path
@@ -85,10 +92,10 @@ class RefusedState:
 
 
 def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
-    """Say who records, who drains, and how far database and tables are behind. Reads only.
+    """Report recorders, writers, and the lag of database and tables. Changes nothing.
 
     Exit code 1 if an episode or a recorder is stopped or a designator type has no tables, 3 if the database or the
-    spool is not available.
+    spool is unavailable.
     """
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
@@ -101,10 +108,10 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     projections: list[ProjectionState] = []
     limits_near: list[str] = []
     unmade: dict[str, str] = {}
-    kept, known = summarise_kept_segments(place.path), None
+    kept, log_durability = summarise_kept_segments(place.path), None
     fault: str | None = None
     try:
-        episodes, projections, limits_near, unmade, known = asyncio.run(_episodes(address))
+        episodes, projections, limits_near, unmade, log_durability = asyncio.run(_query(address))
     except DatabaseError as error:
         fault = str(error)
     if as_json:
@@ -122,17 +129,17 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
                 "warnings": limits_near,
                 "unmade": unmade,
                 "kept": kept,
-                "stored_on": None if known is None else known.stored_on._asdict(),
-                "went_back": [] if known is None else [each._asdict() for each in known.went_back],
+                "stored_on": None if log_durability is None else log_durability.stored_on._asdict(),
+                "went_back": [] if log_durability is None else [each._asdict() for each in log_durability.went_back],
             }
         )
     else:
-        _print(place, recorders, episodes, has_daemon=has_daemon, known=fault is None)
+        _print(place, recorders, episodes, has_daemon=has_daemon, database_answered=fault is None)
         _print_workers(workers)
-        print_durability(kept, known)
+        print_durability(kept, log_durability)
         for projection in projections:
-            late = f"is {projection.behind} events behind" if projection.behind else "shows all that is stored"
-            stdout.print(f"The projection {projection.name}, version {projection.version}, {late}.", markup=False)
+            lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
+            stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
         _warn(limits_near)
     if fault is not None:
         problem(fault)
@@ -141,21 +148,21 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     for episode in stopped:
         problem(f"episode {episode.number} ({episode.id}) is stopped: {episode.refused or episode.parked}")
     for dtype, reason in unmade.items():
-        problem(f"{dtype[:80]!r} has no tables: {reason}")
-    halted = _halted(projections)
+        problem(f"designator type {dtype[:80]!r} has no tables: {reason}")
+    halted = _report_halted(projections)
     unreadable = [each for each in recorders if each.fault]
     for recorder in unreadable:
         problem(f"recorder {recorder.name}: {recorder.fault}")
     given_up = [each for each in recorders if each.given_up]
     for recorder in given_up:
-        problem(f"nothing more of recorder {recorder.name} is stored: {recorder.given_up}")
+        problem(f"further records of recorder {recorder.name} are not stored: {recorder.given_up}")
     for each in refused:
-        problem(f"what the database refused of episode {each.episode} is kept in {each.folder}")
+        problem(f"the database refused events of episode {each.episode}; they are kept in {each.folder}")
     return 1 if stopped or unmade or halted or given_up or refused or unreadable else 0
 
 
-def _halted(projections: Sequence[ProjectionState]) -> bool:
-    """Whether any of them is not kept up to date, after a line for each reason."""
+def _report_halted(projections: Sequence[ProjectionState]) -> bool:
+    """Print a line for each fault or parked episode of the projections; return whether there is any."""
     for projection in projections:
         if projection.fault is not None:
             problem(projection.fault)
@@ -170,7 +177,7 @@ def _warn(warnings: Iterable[str]) -> None:
 
 
 def _workers(note: bytes | None) -> Sequence[FoldWorkerState]:
-    """The fold workers of the daemon that wrote this; none if a daemon of another version did."""
+    """Decode the fold workers from the daemon's note; return none if another version wrote the note."""
     try:
         return () if note is None else msgspec.json.decode(note, type=DaemonNote).fold_workers
     except msgspec.DecodeError:
@@ -183,7 +190,7 @@ def _print_workers(workers: Sequence[FoldWorkerState]) -> None:
     now_ns = SYSTEM_CLOCK.wall_ns()
     print_table(
         "Fold workers of the daemon",
-        ("worker", "state", "for s", "pid", "restarts", "last death", "batches folded"),
+        ("worker", "state", "since s", "pid", "restarts", "last exit", "batches folded"),
         [
             (
                 each.number,
@@ -202,7 +209,7 @@ def _print_workers(workers: Sequence[FoldWorkerState]) -> None:
 def _recorder(folder: RecorderFolder) -> RecorderState:
     try:
         return _state(folder)
-    except Exception as error:  # noqa: BLE001 - shown with this recorder; the others are looked at
+    except Exception as error:  # noqa: BLE001 - shown for this recorder; the others are still read
         fault = str(folder_error(folder.path, error))
         return RecorderState(folder.name, folder.alive, "nobody", None, None, None, 0, None, None, {}, fault)
 
@@ -216,17 +223,17 @@ def _state(folder: RecorderFolder) -> RecorderState:
             drained = "nobody" if not locked else "itself" if folder.alive else "another"
             return RecorderState(folder.name, folder.alive, drained, None, None, None, spooled, None, None, {})
         try:
-            recorded, said = progress.recorded(), progress.drained()
+            recorded, drain_status = progress.recorded(), progress.drained()
         finally:
             progress.close()
-    drained, note = ("another" if locked else "nobody"), said.note
+    drained, note = ("another" if locked else "nobody"), drain_status.note
     return RecorderState(
         folder.name,
         folder.alive,
         drained,
         recorded.synced,
-        said.stored,
-        said.folded,
+        drain_status.stored,
+        drain_status.folded,
         spooled,
         note.away if locked else None,
         note.given_up if locked else None,
@@ -235,7 +242,7 @@ def _state(folder: RecorderFolder) -> RecorderState:
 
 
 def _bytes(folder: Path) -> int:
-    with suppress(OSError):  # all of it was stored and deleted since it was listed, or `_state` says why not
+    with suppress(OSError):  # the folder may have been stored and deleted meanwhile; `_state` reports other errors
         return sum(_size(segment_path(folder, number)) for number in segment_numbers(folder))
     return 0
 
@@ -247,29 +254,34 @@ def _size(path: Path) -> int:
         return 0
 
 
-async def _episodes(
+async def _query(
     address: DatabaseAddress,
 ) -> tuple[list[EpisodeState], list[ProjectionState], list[str], dict[str, str], Durability]:
     log = await EventLog.open(address, create=False)
     try:
-        found = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
+        rows = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
         now_ns = SYSTEM_CLOCK.wall_ns()
-        found_states = []
-        for row in (found[number] for number in sorted(found)):
+        episode_states = []
+        for row in (rows[number] for number in sorted(rows)):
             following = await log.events(row.number, after=row.folded, limit=1)
             lag_s = (now_ns - following[0].wall_ns) / 1e9 if following else None
             lag_events = row.head - row.folded
-            found_states.append(
+            episode_states.append(
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
             )
         projections = await states(log, installed_besides(()))
-        return found_states, projections, await log.limits_near(), await unmade_types(log), await durability(log)
+        return episode_states, projections, await log.limits_near(), await unmade_types(log), await durability(log)
     finally:
         await log.close()
 
 
 def _print(
-    place: Spool, recorders: list[RecorderState], episodes: list[EpisodeState], *, has_daemon: bool, known: bool
+    place: Spool,
+    recorders: list[RecorderState],
+    episodes: list[EpisodeState],
+    *,
+    has_daemon: bool,
+    database_answered: bool,
 ) -> None:
     if recorders:
         print_table(
@@ -279,24 +291,24 @@ def _print(
                 (
                     each.name,
                     "alive" if each.alive else "dead",
-                    each.drained,
+                    _DRAINED_BY[each.drained],
                     each.synced,
                     each.stored,
                     each.folded,
                     each.bytes_spooled,
-                    f"away: {each.away}" if each.away else "",
+                    f"unavailable: {each.away}" if each.away else "",
                 )
                 for each in recorders
             ],
         )
     else:
-        stdout.print(f"Nobody records below {place.path}", markup=False)
+        stdout.print(f"No recorders below {place.path}", markup=False)
     stdout.print("A daemon drains this spool." if has_daemon else "No daemon drains this spool.")
     if episodes:
         print_table(
-            "Episodes the tables do not show all of",
+            "Episodes that are stopped or not completely folded",
             ("episode", "id", "stored", "folded", "behind", "by s", "stopped"),
             [(e.number, e.id, e.head, e.folded, e.lag_events, e.lag_s, e.refused or e.parked) for e in episodes],
         )
-    elif known:
-        stdout.print("The tables show all that is stored.")
+    elif database_answered:
+        stdout.print("The tables show all stored events.")

@@ -1,4 +1,4 @@
-"""`pycrorm verify`: are log and tables what they should be."""
+"""`pycrorm verify` checks that the log is undamaged and that the tables equal a new fold of it."""
 
 from __future__ import annotations
 
@@ -23,93 +23,96 @@ from pycrorm_async.store.log import EventLog
 
 __all__ = ["verify"]
 
-_SHOWN = 20
+_FINDINGS_MAX = 20
+"""Bounds the printed findings of each kind; the rest is only counted."""
 
 
 def verify(
     episode: Annotated[
-        str | None, typer.Option("--episode", help="Only this one: its number, its id, or `last`.")
+        str | None, typer.Option("--episode", help="Verify only this episode: its number, its id, or `last`.")
     ] = None,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     projection: ProjectionOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Fold the log again and compare with the tables, row by row; look whether the log is whole.
+    """Check the log for damage, fold it again, and compare the result with the tables row by row.
 
-    Reads only, while recording and folding go on. Exit code 0 if all is as it should be, 1 if tables differ from the
-    log or are those of an older version (`pycrorm rebuild` makes them anew), if an episode is parked or refused, or if
-    a designator type has no tables; 4 if the log itself is damaged.
+    Changes nothing; recording and folding may continue. Exit code 0 if no problem is result; 1 if tables differ from
+    the log or are of an older version (`pycrorm rebuild` replaces them), if an episode is parked or refused, or if a
+    designator type has no tables; 4 if the log is damaged.
     """
-    projections = named(projection or ())
-    known = [*projections, *installed_besides(projections)]
+    given_projections = named(projection or ())
+    projections = [*given_projections, *installed_besides(given_projections)]
     collect_seldom()
-    found, ids = asyncio.run(_verify(url, episode, known))
+    result, ids = asyncio.run(_verify(url, episode, projections))
     note_pending_events(url, spool)
-    for name, reason in found.not_compared.items():
-        note(f"the projection {name} was not looked at: {reason}")
+    for name, reason in result.not_compared.items():
+        note(f"the projection {name} was not verified: {reason}")
     if as_json:
-        print_json(_document(found, ids))
+        print_json(_document(result, ids))
     else:
-        _print(found)
-    if found.damage:
+        _print(result)
+    if result.damage:
         return 4
-    return 1 if found.drift or found.stopped or found.unmade or found.outdated else 0
+    return 1 if result.drift or result.stopped or result.unmade or result.outdated else 0
 
 
-async def _verify(url: str, episode: str | None, known: Sequence[Projection]) -> tuple[Verified, dict[int, str]]:
+async def _verify(url: str, episode: str | None, projections: Sequence[Projection]) -> tuple[Verified, dict[int, str]]:
     log = await EventLog.open(shared_address(url), create=False)
     try:
         only = None if episode is None else await episode_named(log, episode)
-        with watched("verifying") as tell:
-            found = await verify_log(log, episode=only, projections=known, report_progress=tell)
-        return found, {each.number: each.id for each in await log.episodes()}
+        with watched("verifying") as report_progress:
+            result = await verify_log(log, episode=only, projections=projections, report_progress=report_progress)
+        return result, {each.number: each.id for each in await log.episodes()}
     finally:
         await log.close()
 
 
-def _print(found: Verified) -> None:
-    for damage in found.damages[:_SHOWN]:
+def _print(result: Verified) -> None:
+    for damage in result.damages[:_FINDINGS_MAX]:
         stdout.print(f"damage: {damage}", markup=False)
-    for each in found.differences[:_SHOWN]:
+    for each in result.differences[:_FINDINGS_MAX]:
         stdout.print(f"drift: episode {each.number}, event {each.sequence}: {each}", markup=False)
-    for stopped in found.stopped[:_SHOWN]:
+    for stopped in result.stopped[:_FINDINGS_MAX]:
         stdout.print(f"{stopped.how}: episode {stopped.number}: {stopped.reason}", markup=False)
-    for dtype, reason in [*found.unmade.items()][:_SHOWN]:
+    for dtype, reason in [*result.unmade.items()][:_FINDINGS_MAX]:
         stdout.print(f"no tables: {dtype[:80]!r}: {reason}", markup=False)
-    if found.outdated is not None:
-        stdout.print(f"outdated: {found.outdated}", markup=False)
-    findings = (found.damages, found.differences, found.stopped, found.unmade)
-    count = found.damage + found.drift + len(found.stopped) + len(found.unmade)
-    shown = sum(min(len(each), _SHOWN) for each in findings)
+    if result.outdated is not None:
+        stdout.print(f"outdated: {result.outdated}", markup=False)
+    findings = (result.damages, result.differences, result.stopped, result.unmade)
+    count = result.damage + result.drift + len(result.stopped) + len(result.unmade)
+    shown = sum(min(len(each), _FINDINGS_MAX) for each in findings)
     if count > shown:
         stdout.print(f"and {count - shown} more")
-    if found.behind:
-        stdout.print(f"{found.behind} events are not in the tables yet")
-    said = f"{found.events} events of {found.episodes} episodes and {found.rows} rows: "
-    if found.damage:
-        stdout.print(f"{said}the log is damaged; what is whole can be copied to another with `pycrorm copy`")
-    elif found.drift:
-        stdout.print(f"{said}the log is whole, the tables differ from it: `pycrorm rebuild` makes them anew")
-    elif found.outdated is not None:
-        stdout.print(f"{said}the tables are outdated: `pycrorm rebuild` makes them anew")
-    elif found.stopped or found.unmade:
+    if result.behind:
+        stdout.print(f"{result.behind} events are not in the tables yet")
+    checked = f"{result.events} events of {result.episodes} episodes and {result.rows} rows: "
+    if result.damage:
+        stdout.print(f"{checked}the log is damaged; copy its intact events to another memory with `pycrorm copy`")
+    elif result.drift:
+        stdout.print(f"{checked}the log is intact, but the tables differ from it; run `pycrorm rebuild`")
+    elif result.outdated is not None:
+        stdout.print(f"{checked}the tables are outdated; run `pycrorm rebuild`")
+    elif result.stopped or result.unmade:
         stdout.print(
-            f"{said}{len(found.stopped)} episodes are stopped, {len(found.unmade)} types have no tables,"
-            " and the rest is as it should be",
+            f"{checked}{len(result.stopped)} episodes are stopped, {len(result.unmade)} types have no tables,"
+            " no other problem",
             soft_wrap=True,
         )
     else:
-        stdout.print(f"{said}all as it should be")
+        stdout.print(f"{checked}no problem")
 
 
-def _document(found: Verified, ids: dict[int, str]) -> dict[str, Any]:
-    def named(number: int | None) -> str | None:
+def _document(result: Verified, ids: dict[int, str]) -> dict[str, Any]:
+    def id_of(number: int | None) -> str | None:
         return None if number is None else ids.get(number)
 
     return {
-        **{name: value for name, value in found._asdict().items() if name not in ("damages", "differences", "stopped")},
-        "damages": [{"episode": named(each.number), **each._asdict()} for each in found.damages],
-        "stopped": [{"episode": named(each.number), **each._asdict()} for each in found.stopped],
-        "differences": [{"episode": named(each.number), **each._asdict()} for each in found.differences],
+        **{
+            name: value for name, value in result._asdict().items() if name not in ("damages", "differences", "stopped")
+        },
+        "damages": [{"episode": id_of(each.number), **each._asdict()} for each in result.damages],
+        "stopped": [{"episode": id_of(each.number), **each._asdict()} for each in result.stopped],
+        "differences": [{"episode": id_of(each.number), **each._asdict()} for each in result.differences],
     }

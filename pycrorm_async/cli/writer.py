@@ -1,4 +1,4 @@
-"""`pycrorm writer`: the daemon that brings a spool into its database; with `--once` it does that once."""
+"""`pycrorm writer` runs the daemon that drains a spool into its database; with `--once` it drains it once."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from pycrorm_async.writer.daemon import LEAVE_S, DaemonSummary
 
 __all__ = ["writer", "store_once"]
 
-_HANGING_S = 5.0
-"""How much longer than `LEAVE_S` a database that does not answer at all may keep the process."""
+_WATCHDOG_MARGIN_S = 5.0
+"""Seconds after `LEAVE_S` until the watchdog ends a process whose database does not answer at all."""
 
 
 def writer(
     once: Annotated[
-        bool, typer.Option("--once", help="Recover, append and fold all there is at this moment, then exit.")
+        bool, typer.Option("--once", help="Recover, append and fold all events present now, then exit.")
     ] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
@@ -50,30 +50,30 @@ def writer(
     file_access: FileAccessOption = "owner",
     as_json: JsonOption = False,
 ) -> int:
-    """Bring what is recorded below a spool into the database and its tables, as it comes.
+    """Drain a spool continuously: append its events to the database and fold them into the tables.
 
-    Drains plans that run with `writer="daemon"` and what dead processes left, until SIGTERM or Ctrl-C: then stores what
-    is synced and exits 0 within 15 seconds. A database that goes away is waited for; one that cannot be opened at the
-    start, or a spool that another `pycrorm writer` drains, is exit code 3.
+    Drains the recorders of plans that run with `writer="daemon"` and of dead processes. After SIGTERM or Ctrl-C it
+    stores the synced events and exits with code 0 within 15 seconds. It waits for a database that becomes unavailable.
+    Exit code 3 if the database cannot be opened at the start, or if another `pycrorm writer` drains the spool.
 
-    With --once: exit code 0 also when an episode was lost with its process; 1 if the database refused events of an
+    With --once: exit code 0, also if an episode was LOST with its process; 1 if the database refused events of an
     episode, now or earlier, or they do not fit the tables; 3 if a recorder's folder cannot be read or written; 4 if
-    files are damaged. What is refused is kept in the spool, and the line names the folder.
+    files are damaged. Refused events are kept in the spool, in the folder that the message names.
     """
     projections, settings = named(projection or ()), Settings(file_access=file_access)
     collect_seldom()
     if once:
         return store_once(url, spool, projections, settings, as_json=as_json)
     with forked(WORKERS) as processes:
-        moved = asyncio.run(_until_told_to_leave(url, spool, projections, settings, processes))
+        summary = asyncio.run(_serve_until_signal(url, spool, projections, settings, processes))
     if as_json:
-        print_json(moved._asdict())
+        print_json(summary._asdict())
     else:
-        note(f"left after {moved.records} events of {moved.recorders} recorders")
+        note(f"stopped after {summary.records} events of {summary.recorders} recorders")
     return 0
 
 
-async def _until_told_to_leave(
+async def _serve_until_signal(
     url: str,
     spool: Path | None,
     projections: Sequence[Projection],
@@ -82,16 +82,16 @@ async def _until_told_to_leave(
 ) -> DaemonSummary:
     leave = asyncio.Event()
 
-    def told() -> None:
+    def handle_signal() -> None:
         if leave.is_set():
-            os._exit(130)  # asked twice; what is not stored is safe in the spool
+            os._exit(130)  # the second signal; events not stored are safe in the spool
         leave.set()
-        watchdog = threading.Timer(LEAVE_S + _HANGING_S, os._exit, (0,))
+        watchdog = threading.Timer(LEAVE_S + _WATCHDOG_MARGIN_S, os._exit, (0,))
         watchdog.daemon = True
         watchdog.start()
 
     for each in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(each, told)
+        asyncio.get_running_loop().add_signal_handler(each, handle_signal)
     return await serve(
         url,
         spool=spool,
@@ -111,27 +111,30 @@ def store_once(
     settings: Settings,
     *,
     as_json: bool,
-    beside: Mapping[str, object] = MappingProxyType({}),
+    extra: Mapping[str, object] = MappingProxyType({}),
 ) -> int:
-    """Append and fold all there is, and print the report (`beside` goes into the same JSON document); the exit code."""
-    logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)  # the report tells all of it, once
-    logging.getLogger("pycrorm_async.projections").setLevel(logging.WARNING)  # but of these nothing
-    with stderr.status("recovering what dead processes left …"):
+    """Append and fold all events of a spool, print the report and return the exit code.
+
+    The JSON document also contains the entries of `extra`.
+    """
+    logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)  # the report contains all of these errors
+    logging.getLogger("pycrorm_async.projections").setLevel(logging.WARNING)  # the report omits those of projections
+    with stderr.status("recovering the events of dead processes …"):
         report = asyncio.run(recover(url, spool=spool, settings=settings, projections=projections))
     if as_json:
-        print_json({**beside, **_document(report)})
+        print_json({**extra, **_document(report)})
     else:
         _print(report)
     for name, error in report.failed.items():
-        mend = ""
+        remedy = ""
         if isinstance(error, SpoolDamaged):
-            mend = f"; mend it with: pycrorm spool repair {error.path.parent.parent}"
-        problem(f"{name}: {error}{mend}")
+            remedy = f"; repair it with: pycrorm spool repair {error.path.parent.parent}"
+        problem(f"{name}: {error}{remedy}")
     for episode, reason in report.drained.stopped.items():
-        problem(f"episode {episode} is stopped: {reason}{_kept_in(report.dead_letters.get(episode))}")
+        problem(f"episode {episode} is stopped: {reason}{_dead_letters_text(report.dead_letters.get(episode))}")
     for episode, folder in report.dead_letters.items():
         if episode not in report.drained.stopped:
-            problem(f"episode {episode} was refused{_kept_in(folder)}")
+            problem(f"episode {episode} was refused{_dead_letters_text(folder)}")
     if any(isinstance(error, DamageError) for error in report.failed.values()):
         return 4
     if report.failed:
@@ -139,7 +142,7 @@ def store_once(
     return 1 if report.drained.stopped or report.dead_letters else 0
 
 
-def _kept_in(folder: Path | None) -> str:
+def _dead_letters_text(folder: Path | None) -> str:
     return "" if folder is None else f"; its events are kept in {folder}"
 
 

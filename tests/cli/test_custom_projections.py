@@ -159,14 +159,14 @@ def test_one_whose_code_is_not_here_is_left_as_it_is_and_told(lab: Path) -> None
     pycrorm("run", "weighing.py", "--projection", "lab:Weighed", cwd=lab)
     told = pycrorm("rebuild", cwd=lab)
     assert told.returncode == 0
-    assert one_line_of(told) == "the code of the projection weighed is not here: it is left as it is"
+    assert one_line_of(told) == "the projection weighed is not rebuilt, because its code is not available"
     assert weighed(lab) == WEIGHED
     told = pycrorm("rebuild", "weighed", cwd=lab)
     assert told.returncode == 2
-    assert "the code of the projection weighed is not here: give it with --projection module:Class" in one_line_of(told)
+    assert "the code of the projection weighed is not available: add --projection module:Class" in one_line_of(told)
     told = pycrorm("verify", cwd=lab)
     assert told.returncode == 0
-    assert one_line_of(told) == "the projection weighed was not looked at: its code is not installed here"
+    assert one_line_of(told) == "the projection weighed was not verified: its code is not installed here"
 
 
 def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_folded(lab: Path) -> None:
@@ -195,7 +195,7 @@ def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_fol
         (["rebuild", "--projection", "lab:Strange"], "lab:Strange is no projection"),
         (["rebuild", "--projection", "lab:NoTables"], "it has no tables"),
         (["rebuild", "--projection", "lab:Weighed", "--projection", "lab:Picky"], "two projections have the name"),
-        (["rebuild", "scales"], "there is no projection 'scales': there are tables"),
+        (["rebuild", "scales"], "unknown projection 'scales'; known: tables"),
         (["run", "weighing.py", "--writer", "daemon", "--projection", "lab:Weighed"], "knows no projections"),
     ],
 )

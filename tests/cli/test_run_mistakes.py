@@ -61,7 +61,7 @@ def test_a_plan_that_ends_itself_is_said_to_have_done_so(tmp_path: Path) -> None
     for name, line in (("leaving", 16), ("leaving_in_a_task", 20)):
         ran = pycrorm("run", f"plan.py:{name}", cwd=tmp_path)
         assert (ran.returncode, "Traceback" in ran.stderr) == (0, False), ran.stderr
-        assert f"the plan plan.py:{name} ended itself by sys.exit(0) (plan.py:{line})" in ran.stderr
+        assert f"the plan plan.py:{name} called sys.exit(0) (plan.py:{line})" in ran.stderr
     ran = pycrorm("run", "plan.py:leaving_badly", cwd=tmp_path)
     assert ran.returncode == 1
     assert "failed: SystemExit: 3 (plan.py:25)" in ran.stderr

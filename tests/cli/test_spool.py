@@ -81,12 +81,12 @@ def test_a_damaged_spool_is_mended_and_what_is_whole_is_stored(left: Path) -> No
     assert said.returncode == 4
     line = one_line_of(said)
     assert f"{path} is damaged at byte" in line
-    assert f"mend it with: pycrorm spool repair {left}" in line
+    assert f"repair it with: pycrorm spool repair {left}" in line
     refused = pycrorm("writer", "--once", cwd=left.parent)
     assert refused.returncode == 4
     line = one_line_of(refused)
     assert f"{path} is damaged at byte" in line
-    assert line.endswith(f"; mend it with: pycrorm spool repair {left}")
+    assert line.endswith(f"; repair it with: pycrorm spool repair {left}")
 
     document = answer("spool", "repair", left, cwd=left.parent, code=1)
     [mended] = document["mended"]
@@ -110,11 +110,11 @@ def test_a_mended_spool_says_what_to_do_next(left: Path) -> None:
     overwrite(segment(left), 20_000, bytes(8))
     done = pycrorm("spool", "repair", left, cwd=left.parent)
     assert done.returncode == 1
-    assert done.stderr == f"Store what was kept with: pycrorm writer --once --url DATABASE --spool {left}\n"
+    assert done.stderr == f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {left}\n"
     lines = done.stdout.splitlines()
-    assert lines[0].endswith("from behind it are saved")
-    assert lines[1] == f"  as it was: {segment(left).parent}.damaged"
-    assert any(line.startswith("  given up: position ") for line in lines)
+    assert lines[0].endswith("behind it are salvaged")
+    assert lines[1] == f"  original folder: {segment(left).parent}.damaged"
+    assert any(line.startswith("  not kept: position ") for line in lines)
 
 
 def test_a_living_plans_spool_is_told_and_not_mended(tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_what_the_database_refused_is_told_with_its_place_by_status_and_inspect(
     told = pycrorm("status", cwd=folder)
     assert (told.returncode, one_line_of(told)) == (
         1,
-        f"pycrorm: what the database refused of episode {identity} is kept in {place}",
+        f"pycrorm: the database refused events of episode {identity}; they are kept in {place}",
     )
     [inspected] = answer("spool", "inspect", spool, cwd=folder)["recorders"]
     assert (inspected["name"], inspected["types"]) == (place.name, {"NodeStarted": 1})

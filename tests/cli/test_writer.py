@@ -73,7 +73,7 @@ def test_a_plan_beside_a_daemon_is_in_the_database_when_it_is_over(
     name = appeared.split()[1]
     assert appeared == f"recorder {name} appeared"
     assert ended == f"recorder {name} has ended; 11 events stored"
-    assert goodbye == "left after 11 events of 1 recorders"
+    assert goodbye == "stopped after 11 events of 1 recorders"
     assert [path for path in (folder / "pycrorm.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
 
 
@@ -141,14 +141,14 @@ def test_a_writing_plan_of_its_own_is_left_alone(folder: Path, daemon: subproces
     assert (recorder["alive"], recorder["drained"], recorder["synced"]) == (True, "itself", None)
     plan.send_signal(signal.SIGINT)
     plan.communicate(timeout=60)
-    assert left(daemon, signal.SIGTERM) == ["left after 0 events of 0 recorders"]
+    assert left(daemon, signal.SIGTERM) == ["stopped after 0 events of 0 recorders"]
 
 
 def test_status_says_what_is_stopped_and_how_far_the_tables_are_behind(folder: Path) -> None:
     assert pycrorm("run", "notes.py", cwd=folder).returncode == 0
     document = answer("status", cwd=folder)
     assert (document["recorders"], document["episodes"], document["database"]) == ([], [], "ok")
-    assert "The tables show all that is stored." in pycrorm("status", cwd=folder).stdout
+    assert "The tables show all stored events." in pycrorm("status", cwd=folder).stdout
     ask_to_change(f"sqlite:///{folder}/pycrorm.db", "UPDATE episode SET folded = 4")
     [behind] = answer("status", cwd=folder)["episodes"]
     assert (behind["head"], behind["folded"], behind["lag_events"]) == (10, 4, 6)

@@ -189,7 +189,7 @@ def test_when_both_workers_are_killed_on_a_long_way_the_daemon_goes_on(folder: P
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=15)
     assert process.returncode == 0
-    lines = [line for line in said.splitlines() if not line.startswith(("recorder ", "left after"))]
+    lines = [line for line in said.splitlines() if not line.startswith(("recorder ", "stopped after"))]
     assert sorted(lines) == [
         f"fold worker {number} (pid {pid}) exited with signal 9; restarting it in 1 s"
         for number, pid in enumerate(pids, start=1)
