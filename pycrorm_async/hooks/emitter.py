@@ -26,6 +26,8 @@ _THREAD_NAME_PREFIX = "pycrorm "
 """The names of all threads of the memory begin with this."""
 _REASON_MAX = 2_000
 """Bounds the characters of the last fault's message in `status`."""
+_HEADINGS_MAX = 1_000
+"""Bounds the headings kept for reuse: an episode has one for each event type. When it is reached all are dropped."""
 UNAWAITED_MAX = 100
 """Bounds the designator types listed with a perform that was never awaited; the latest are kept."""
 
@@ -58,6 +60,7 @@ class Emitter:
         self.feed = EventFeed()
         self.missing = MissingValues()
         self.unawaited: tuple[str, ...] = ()
+        self._headings: dict[tuple[EpisodeId, type[Happening]], Heading] = {}
         self._fault_count = 0
         self._last_fault: str | None = None
 
@@ -67,9 +70,8 @@ class Emitter:
 
     def put(self, episode: EpisodeId, event: Happening) -> int:
         """Append an event and return its sequence. Raises `NotEncodable` before anything is written."""
-        kind = type(event)
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        sequence = self.put_payload(Heading(episode, kind.__name__, kind.version), payload)
+        sequence = self.put_payload(self._heading(episode, type(event)), payload)
         if self.feed.observers:
             self.feed.publish(episode, sequence, event)
         return sequence
@@ -88,12 +90,21 @@ class Emitter:
 
     def offer(self, episode: EpisodeId, event: Happening) -> int:
         """Append an event without using the reserve and without waiting; raise `SpoolFull` if there is no room."""
-        kind = type(event)
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        sequence = self.sink.put_nowait(Heading(episode, kind.__name__, kind.version), payload)
+        sequence = self.sink.put_nowait(self._heading(episode, type(event)), payload)
         if self.feed.observers:
             self.feed.publish(episode, sequence, event)
         return sequence
+
+    def _heading(self, episode: EpisodeId, kind: type[Happening]) -> Heading:
+        """Return the heading of an event; kept for the next one, because making it takes three times as long."""
+        key = (episode, kind)
+        heading = self._headings.get(key)
+        if heading is None:
+            if len(self._headings) >= _HEADINGS_MAX:
+                self._headings.clear()
+            heading = self._headings[key] = Heading(episode, kind.__name__, kind.version)
+        return heading
 
     def note_unawaited(self, dtype: str) -> None:
         """Count a perform that was called and never awaited as a fault, and log a warning for the first of a type."""
