@@ -1,6 +1,7 @@
-"""How it travels: the background writer moves records from a queue into a log, knowing both only as `ports`.
+"""Move records from a queue into a log in the background; the writer knows both only as `ports`.
 
-`drain` is the loop read, append, acknowledge; `live` adds when to fold and whom to adopt; `thread` runs that beside a
-plan; `once` does all there is and returns. A lost reply, a kill or a second writer make a batch arrive twice, never not
-at all: the log stores it once.
+`drain` is the loop read, append, acknowledge. `background_writer` decides when to fold and drains dead recorders;
+`writer_thread` runs it beside a plan. `daemon` drains all recorders of a spool in its own process, `drain_once` drains
+and folds once. After a lost reply, a kill or with a second writer a batch may arrive twice, but never not at all: the
+log stores it once.
 """

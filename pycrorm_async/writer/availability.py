@@ -1,4 +1,4 @@
-"""A destination that says when it is away and when it is back, and does everything else as the one behind it."""
+"""Report when a database becomes unavailable and available again, for a destination that forwards every call."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ __all__ = ["AvailabilityMonitor", "is_notable"]
 
 _T = TypeVar("_T")
 _NOTABLE_S = 1.0
+"""A database that has not answered for less than this is not reported: a deadlock or a quick restart."""
 
 
 def is_notable(unanswered_s: float) -> bool:
-    """Whether a database that has not answered for so long is away: a deadlock or a restart of its own is not.
+    """Return whether a database that has not answered for this long counts as unavailable.
 
     >>> is_notable(0.3), is_notable(2.0)
     (False, True)
@@ -26,7 +27,7 @@ def is_notable(unanswered_s: float) -> bool:
 
 
 class AvailabilityMonitor(Tables):
-    """`on_away` is called with the reason once it is notable, `on_back` with the seconds at the next answer."""
+    """Calls `on_away` with the reason when the database is unavailable, `on_back` with the seconds when it is back."""
 
     def __init__(
         self,
@@ -41,48 +42,48 @@ class AvailabilityMonitor(Tables):
         self._on_away = on_away
         self._on_back = on_back
         self._unanswered_since_s: float | None = None
-        self._said = False
+        self._reported = False
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self._answered(self._destination.append(records))
+        return await self._observe(self._destination.append(records))
 
     async def confirm(self) -> None:
-        await self._answered(self._destination.confirm())
+        await self._observe(self._destination.confirm())
 
     async def fold(self) -> int:
-        return await self._answered(self._destination.fold())
+        return await self._observe(self._destination.fold())
 
     async def fold_next_batch(self) -> bool:
-        return await self._answered(self._destination.fold_next_batch())
+        return await self._observe(self._destination.fold_next_batch())
 
     async def behind(self) -> Mapping[str, int]:
-        return await self._answered(self._destination.behind())
+        return await self._observe(self._destination.behind())
 
     async def stopped(self) -> Mapping[str, str]:
-        return await self._answered(self._destination.stopped())
+        return await self._observe(self._destination.stopped())
 
-    async def _answered(self, answer: Awaitable[_T]) -> _T:
-        asked_s = self._now_s()
+    async def _observe(self, call: Awaitable[_T]) -> _T:
+        called_s = self._now_s()
         try:
-            found = await answer
+            result = await call
         except DatabaseUnavailable as error:
-            self._note_away(asked_s, str(error))
+            self._note_away(called_s, str(error))
             raise
-        self._note_answer(asked_s)
-        return found
+        self._note_success(called_s)
+        return result
 
-    def _note_away(self, asked_s: float, reason: str) -> None:
+    def _note_away(self, called_s: float, reason: str) -> None:
         if self._unanswered_since_s is None:
-            self._unanswered_since_s = asked_s
-        if not self._said and is_notable(self._now_s() - self._unanswered_since_s):
-            self._said = True
+            self._unanswered_since_s = called_s
+        if not self._reported and is_notable(self._now_s() - self._unanswered_since_s):
+            self._reported = True
             self._on_away(reason)
 
-    def _note_answer(self, asked_s: float) -> None:
+    def _note_success(self, called_s: float) -> None:
         since_s = self._unanswered_since_s
-        if since_s is None or asked_s < since_s:  # asked before it went away
+        if since_s is None or called_s < since_s:  # the call began before the database became unavailable
             return
         self._unanswered_since_s = None
-        if self._said:
-            self._said = False
+        if self._reported:
+            self._reported = False
             self._on_back(self._now_s() - since_s)

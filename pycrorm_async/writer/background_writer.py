@@ -1,6 +1,7 @@
-"""The writer of one memory: drains its queue as it fills, folds when asked or idle, adopts what the dead left.
+"""Drain one memory's queue as it fills, fold when a flush asks for it or the plan is idle, and drain dead recorders.
 
-Appending goes on beside the plan; folding costs interpreter time, so it waits until the plan is idle, flushes or ends.
+Appending runs beside the plan. Folding takes interpreter time from it, so it waits for an idle plan, a flush or the
+end.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ _T = TypeVar("_T")
 
 
 class WriterState(NamedTuple):
-    """What the writer does, for status.
+    """The writer's state, for status.
 
     Attributes:
         queue: the drain of this memory's own queue.
-        adopted: the drains of what dead recorders left.
-        failure: why appending stopped for good; None while it goes on. The queue keeps its events on disk.
-        fold_error: why the tables could not be brought up to date the last time; None if they could.
-        adoption_errors: folders that could not be adopted, and why.
+        adopted: the drains of dead recorders.
+        failure: why appending has stopped for good; None while it continues. The queue keeps its events on disk.
+        fold_error: why the last attempt to update the tables failed; None if it succeeded.
+        adoption_errors: the dead recorders' folders that could not be drained, with the reasons.
     """
 
     queue: DrainState
@@ -43,7 +44,7 @@ class WriterState(NamedTuple):
 
 
 class LiveWriter:
-    """Runs in one loop, which should not be the plan's: a plan may never suspend."""
+    """The writer of one memory. Runs in one loop, not in the plan's, because a plan may never suspend."""
 
     def __init__(
         self,
@@ -58,8 +59,8 @@ class LiveWriter:
         self._adopt = adopt
         self._settings = settings
         self._randomness = randomness
-        self._news = asyncio.Event()
-        self._drain = Drain(source, destination, settings=settings, on_append=self._news.set)
+        self._appended_events = asyncio.Event()
+        self._drain = Drain(source, destination, settings=settings, on_append=self._appended_events.set)
         self._adopted: list[Drain] = []
         self._adoption_errors: list[str] = []
         self._not_adopted: list[str] = []
@@ -69,36 +70,36 @@ class LiveWriter:
         self._stopped_before: Mapping[str, str] = {}
 
     async def run(self) -> None:
-        """Until the queue is closed and drained and everything is folded.
+        """Run until the queue is closed and drained and all events are folded.
 
-        Raises what stopped the appending, or `EpisodeParked` for episodes that stopped since this began.
+        Raises the error that stopped appending, or `EpisodeParked` for episodes that stopped during the run.
         """
         try:
-            self._stopped_before = await self._patiently(self._destination.stopped)
+            self._stopped_before = await self._retry(self._destination.stopped)
         except Exception as error:
-            self._stop(error)
+            self._note_failure(error)
             await self._drain.abandon(error)
             raise
         async with asyncio.TaskGroup() as tasks:
-            others = (
+            background_tasks = (
                 tasks.create_task(self._fold_when_idle(), name="pycrorm fold when idle"),
                 tasks.create_task(self._adopt_all(), name="pycrorm adopt"),
             )
             try:
                 await self._drain.run()
-            except Exception as error:  # noqa: BLE001 - kept, and raised below and at every flush
-                self._stop(error)
+            except Exception as error:  # noqa: BLE001 - noted, and raised below and by every flush
+                self._note_failure(error)
             finally:
-                for each in others:
+                for each in background_tasks:
                     each.cancel()
         self._raise_failure()
         await self._fold()
         await self._raise_stopped()
 
     async def flush(self, position: int) -> None:
-        """Returns when everything up to this position is stored and the tables show all that is stored.
+        """Wait until the records up to this position are stored and all stored events are visible in the tables.
 
-        Raises what stopped the appending, `EpisodeParked` for episodes that stopped since `run` began, and
+        Raises the error that stopped appending, `EpisodeParked` for episodes that stopped since `run` began, and
         `FlushTimeout` after `flush_timeout_s` without progress.
         """
         timeout_s = self._settings.flush_timeout_s
@@ -122,7 +123,7 @@ class LiveWriter:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Grows while the database takes what it is given; from any thread."""
+        """A value that changes while the database accepts records; readable from any thread."""
         return self._drain.appended, self._destination.writes
 
     @property
@@ -136,86 +137,88 @@ class LiveWriter:
         )
 
     def _not_in_time(self, timeout_s: float) -> str:
-        reason = self._drain.state.away or self._fold_error or "there was too much to store and fold"
+        reason = (
+            self._drain.state.away or self._fold_error or "more events than could be stored and folded in that time"
+        )
         return f"not finished after {timeout_s:g} s ({reason}); everything recorded is safe in the spool"
 
-    def _stop(self, error: Exception) -> None:
-        """For good. Said at once: the next flush may be far away."""
+    def _note_failure(self, error: Exception) -> None:
+        """Note that appending has stopped for good; log it now, because the next flush may be far away."""
         self._failure = error
-        _log.error("the writer stopped, and what is recorded is kept in the spool: %s", error)
+        _log.error("the writer stopped; recorded events are kept in the spool: %s", error)
 
     def _raise_failure(self) -> None:
         if self._failure is not None:
             raise self._failure
 
     async def _raise_stopped(self) -> None:
-        stopped = {**self._drain.state.refused, **await self._patiently(self._destination.stopped)}
-        news = {episode: reason for episode, reason in stopped.items() if episode not in self._stopped_before}
-        if news:
-            raise EpisodeParked(news)
+        stopped = {**self._drain.state.refused, **await self._retry(self._destination.stopped)}
+        new_reasons = {episode: reason for episode, reason in stopped.items() if episode not in self._stopped_before}
+        if new_reasons:
+            raise EpisodeParked(new_reasons)
 
     async def _fold(self) -> None:
         async with self._folding:
-            await self._patiently(self._destination.confirm)
-            await self._patiently(self._destination.fold)
+            await self._retry(self._destination.confirm)
+            await self._retry(self._destination.fold)
 
-    async def _patiently(self, ask: Callable[[], Awaitable[_T]]) -> _T:
-        """Asks again while the database is away; the caller bounds the time."""
-        answer = await retry(ask, backoff=PATIENT, on_away=self._note_away, randomness=self._randomness)
+    async def _retry(self, operation: Callable[[], Awaitable[_T]]) -> _T:
+        """Retry while the database is unavailable; the caller bounds the time."""
+        result = await retry(operation, backoff=PATIENT, on_away=self._note_away, randomness=self._randomness)
         self._fold_error = None
-        return answer
+        return result
 
     def _note_away(self, error: DatabaseUnavailable) -> None:
         self._fold_error = str(error)
 
     async def _fold_when_idle(self) -> None:
-        self._news.set()  # something may have been left behind before
+        self._appended_events.set()  # an earlier process may have left events unfolded
         while True:
-            await self._news.wait()
-            self._news.clear()
+            await self._appended_events.wait()
+            self._appended_events.clear()
             try:
                 async with asyncio.timeout(self._settings.idle_ms / 1000):
-                    await self._news.wait()
+                    await self._appended_events.wait()
             except TimeoutError:
                 await self._fold_once()
 
     async def _fold_once(self) -> None:
         try:
             await self._fold()
-        except Exception as error:  # noqa: BLE001 - shown in the state; the next flush meets and raises it
+        except Exception as error:  # noqa: BLE001 - in the state; the next flush raises it
             self._fold_error = str(error)
 
     async def _adopt_all(self) -> None:
-        # Finding and recovering folders reads files: in a thread, so that our own queue does not wait for it.
+        # Recovering folders reads files; in a thread, so that it does not delay our own queue.
         sources: Iterator[Source] = iter(())
         try:
             sources = await run_to_completion(asyncio.to_thread(lambda: iter(self._adopt())))
             while (source := await run_to_completion(asyncio.to_thread(next, sources, None))) is not None:
                 await self._drain_adopted(source)
-        except Exception as error:  # noqa: BLE001 - shown in the state; another's folder does not stop our own queue
+        except Exception as error:  # noqa: BLE001 - in the state; must not stop our own queue
             self._adoption_errors.append(str(error))
         finally:
             if isinstance(sources, Generator):
-                sources.close()  # so that it lets go of the folder it is at
-            self._tell_not_adopted()
+                sources.close()  # releases the folder that the generator holds
+            self._report_not_adopted()
 
     async def _drain_adopted(self, source: Source) -> None:
         drain = Drain(
             source,
             self._destination,
             settings=self._settings,
-            on_append=self._news.set,
+            on_append=self._appended_events.set,
             say=self._not_adopted.append,
         )
         self._adopted.append(drain)
         try:
             await drain.run()
-        except Exception as error:  # noqa: BLE001 - shown in the state; the next folder may be in order
+        except Exception as error:  # noqa: BLE001 - in the state; must not stop the next folder
             self._adoption_errors.append(f"{source.name}: {error}")
             self._not_adopted.append(f"recorder {source.name}: {error}")
 
-    def _tell_not_adopted(self) -> None:
-        """In one line: what was refused once is offered, and refused, at every start."""
+    def _report_not_adopted(self) -> None:
+        """Log one line for all failures, because the same records are refused at every start."""
         if self._not_adopted:
             more = len(self._not_adopted) - 1
             _log.error("%s%s", self._not_adopted[0], f" (and {more} more: see `pycrorm status`)" if more else "")

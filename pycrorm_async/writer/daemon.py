@@ -1,7 +1,22 @@
-"""The writer as a process of its own: drains all recorders of a spool, of living and of dead processes, and folds.
+"""Drain all recorders of a spool, living and dead, in a process of its own, and fold.
 
-Three kinds of tasks: one looks round for recorders, one for each recorder moves its records into the log, one folds.
-None waits for another's database: what is away is asked again with pauses, and the recorders keep their events on disk.
+**Theory of operation.** All tasks run in one loop and one task group. The scan loop in `run` claims every folder that
+can be drained and starts a drain task for it (`_serve`). The fold task folds whenever a drain has appended, and
+publishes to each recorder how far its events are visible. The confirm task asks the database every few seconds whether
+it still holds the last stored events, so that a log that went back is refilled even while no recorder appends.
+
+A recorder's name is in `_serving` from its claim to the release of its folder, and in `_rests` while a failed folder
+waits for its next attempt. The scan excludes both, so each folder has at most one drain task. Processes exclude each
+other by the folders' `drain` locks.
+
+No task waits for another one's database call. `AvailabilityMonitor` observes every call; while the database is
+unavailable each task retries with pauses, and the recorders keep their events on disk. An error in one recorder's
+folder ends only its drain task; an error in a fold is reported and retried while appending continues.
+
+On `leave` the daemon claims no more folders and drains the records synced at that moment. After `LEAVE_S` it cancels
+the remaining drain tasks. Draining may stop at any point: unacknowledged records stay in their folders for the next
+daemon, and the log stores repeated records once. A release always runs to its end, also in a cancelled task, because
+the next daemon, possibly in this process, needs the folder's lock.
 """
 
 from __future__ import annotations
@@ -24,28 +39,29 @@ from pycrorm_async.writer.visibility import VisibilityTracker
 __all__ = ["Daemon", "DaemonSummary", "LEAVE_S"]
 
 LEAVE_S: Final = 10.0
-"""How long leaving may take. What is not stored by then stays in its folder, and the next daemon finds it."""
-_LOOK_S: Final = 0.2
+"""Bounds the time of leaving. Records not stored by then stay in their folders for the next daemon."""
+_SCAN_INTERVAL_S: Final = 0.2
+"""Interval between two scans for folders, and so the delay until a new recorder is drained."""
 _CONFIRM_S: Final = 5.0
-"""How often the database is asked whether it still holds what was stored last: one row, in a tenth of a millisecond."""
+"""Interval at which the database confirms the last stored events: one row, in a tenth of a millisecond."""
 _REST = Backoff(first_s=1.0, longest_s=60.0)
-"""Before a folder is tried again that could not be drained to its end: it is damaged, or nothing can be set aside."""
+"""Pauses before the next attempt at a folder that could not be drained: a damaged one, or one without dead letters."""
 
 
 class DaemonSummary(NamedTuple):
-    """What a daemon did: recorders it let go of, and records it gave to the log."""
+    """Numbers of recorders drained and released, and of records appended."""
 
     recorders: int
     records: int
 
 
 class Daemon:
-    """Belongs to the loop that runs it. `say` gets one line for each notable thing."""
+    """The daemon. Belongs to the loop that runs it. `say` gets one line per notable event."""
 
     def __init__(
         self,
         destination: Tables,
-        look: SourceScanner,
+        scan: SourceScanner,
         *,
         settings: Settings,
         say: Callable[[str], None],
@@ -54,124 +70,124 @@ class Daemon:
         self._destination = AvailabilityMonitor(
             destination, now_s=self._now_s, on_away=self._note_away, on_back=self._note_back
         )
-        self._look = look
+        self._scan = scan
         self._settings = settings
         self._say = say
         self._randomness = randomness
         self._serving: dict[str, VisibilityTracker] = {}
-        self._rests: dict[str, tuple[int, float]] = {}  # by name: how often it was tried, when it may be again
-        self._news = asyncio.Event()
+        self._rests: dict[str, tuple[int, float]] = {}  # by name: number of attempts, time of the next one
+        self._appended_events = asyncio.Event()
         self._away: str | None = None
-        self._said: dict[str, str] = {}  # by what it is about, the last line
+        self._last_lines: dict[str, str] = {}  # by subject, the last line
         self._recorders = self._records = 0
 
     async def run(self, leave: asyncio.Event) -> DaemonSummary:
-        """Until `leave` is set. Then takes hold of nothing new, drains what is synced at that moment, folds, returns.
+        """Run until `leave` is set; then drain the records synced at that moment, fold, and return.
 
-        Returns after `LEAVE_S` in any case, when the database lets it; nothing is lost by that. Raises `SpoolForeign`
-        when the spool has become another database's, and `DatabaseForeign` when the database has become another.
+        Returns at most `LEAVE_S` later unless a database call blocks; no record is lost by that. Raises `SpoolForeign`
+        if the spool was bound to another database, and `DatabaseForeign` if the database was replaced by another.
         """
         foreign: SpoolForeign | DatabaseForeign | None = None
         async with asyncio.TaskGroup() as tasks:
-            folding = tasks.create_task(self._fold_as_it_comes(), name="pycrorm fold")
-            confirming = tasks.create_task(self._confirm_now_and_then(), name="pycrorm confirm")
-            served: set[asyncio.Task[None]] = set()
+            folding = tasks.create_task(self._fold_repeatedly(), name="pycrorm fold")
+            confirming = tasks.create_task(self._confirm_repeatedly(), name="pycrorm confirm")
+            drains: set[asyncio.Task[None]] = set()
             while not leave.is_set() and foreign is None:
                 try:
-                    for held in await self._look_round():
-                        task = tasks.create_task(self._serve(held), name=f"pycrorm drain {held.name}")
-                        served.add(task)
-                        task.add_done_callback(served.discard)
+                    for source in await self._claim_sources():
+                        task = tasks.create_task(self._serve(source), name=f"pycrorm drain {source.name}")
+                        drains.add(task)
+                        task.add_done_callback(drains.discard)
                 except (SpoolForeign, DatabaseForeign) as error:
                     foreign = error
-                await _wait(leave, _LOOK_S)
+                await _wait(leave, _SCAN_INTERVAL_S)
             for each in self._serving.values():
-                each.held.finish()
-            if served:
+                each.source.finish()
+            if drains:
                 patience_s = 0.0 if isinstance(foreign, DatabaseForeign) else LEAVE_S
-                _, late = await asyncio.wait(served, timeout=patience_s)
+                _, late = await asyncio.wait(drains, timeout=patience_s)
                 for task in late:
                     task.cancel()
                 if late and foreign is None:
-                    self._say(f"not finished after {LEAVE_S:g} s: what is left is safe in the spool")
+                    self._say(f"not finished after {LEAVE_S:g} s: the remaining events are safe in the spool")
             folding.cancel()
             confirming.cancel()
         if foreign is not None:
             raise foreign
         return DaemonSummary(self._recorders, self._records)
 
-    # --- looking round ----------------------------------------------------------------------------------------
+    # --- claiming ----------------------------------------------------------------------------------------
 
-    async def _look_round(self) -> list[ClaimedSource]:
+    async def _claim_sources(self) -> list[ClaimedSource]:
         now_s = self._now_s()
         resting = {name for name, (_, until_s) in self._rests.items() if until_s > now_s}
-        but = self._serving.keys() | resting
-        found = ScanResult([], {})
+        excluded = self._serving.keys() | resting
+        result = ScanResult([], {})
 
-        def look() -> None:
-            nonlocal found
-            found = self._look(but)
+        def scan() -> None:
+            nonlocal result
+            result = self._scan(excluded)
 
         try:
-            await run_to_completion(asyncio.to_thread(look))
+            await run_to_completion(asyncio.to_thread(scan))
         except asyncio.CancelledError:
-            for held in found.held:  # the next daemon, which may be in this process, is to find them free
+            for source in result.held:  # free for the next daemon, possibly in this process
                 with suppress(PycrormError):
-                    held.release_folder()
+                    source.release_folder()
             raise
         except SpoolForeign:
             raise
         except FilesError as error:
-            self._say_news(f"cannot look for recorders: {error}", "look")
+            self._say_if_new(f"cannot scan for recorders: {error}", "scan")
             return []
-        self._said.pop("look", None)
-        for name, fault in found.failed.items():
+        self._last_lines.pop("scan", None)
+        for name, fault in result.failed.items():
             self._rest(name, str(fault))
-        return list(found.held)
+        return list(result.held)
 
-    def _rest(self, name: str, reason: str, *, again: bool = True) -> None:
+    def _rest(self, name: str, reason: str, *, retried: bool = True) -> None:
         attempt = self._rests.get(name, (0, 0.0))[0] + 1
-        pause_s = _REST.pause_s(attempt, self._randomness()) if again else math.inf
-        assert pause_s is not None, "it is tried for ever"
+        pause_s = _REST.pause_s(attempt, self._randomness()) if retried else math.inf
+        assert pause_s is not None, "retries never end"
         self._rests[name] = attempt, self._now_s() + pause_s
-        when = "now and then" if again else "by the next writer"
-        self._say_news(f"recorder {name}: {reason}; tried again {when}", f"{name} rests")
+        then = "retrying with pauses" if retried else "the next writer retries"
+        self._say_if_new(f"recorder {name}: {reason}; {then}", f"{name} rests")
 
     # --- one recorder -----------------------------------------------------------------------------------------
 
-    async def _serve(self, held: ClaimedSource) -> None:
-        name = held.name
-        serving = VisibilityTracker(
-            held,
+    async def _serve(self, source: ClaimedSource) -> None:
+        name = source.name
+        tracker = VisibilityTracker(
+            source,
             self._destination,
             settings=self._settings,
-            on_append=self._news.set,
-            say=lambda line: self._say_news(line, name),
+            on_append=self._appended_events.set,
+            say=lambda line: self._say_if_new(line, name),
         )
-        self._serving[name] = serving
+        self._serving[name] = tracker
         if name not in self._rests:
-            self._say(f"recorder {name} " + ("appeared" if held.is_alive else "is dead: recovering what it left"))
+            self._say(f"recorder {name} " + ("appeared" if source.is_alive else "is dead: recovering its folder"))
         fault: str | None = None
         try:
             if self._away is not None:
-                held.mark_unavailable(self._away)
-            await serving.run()
-        except Exception as error:  # noqa: BLE001 - told, and tried again; the other recorders go on
-            fault = _in_a_line(error)
+                source.mark_unavailable(self._away)
+            await tracker.run()
+        except Exception as error:  # noqa: BLE001 - reported and retried; must not stop the other recorders
+            fault = _one_line(error)
         finally:
-            await run_to_completion(self._let_go(serving, fault))
+            await run_to_completion(self._release(tracker, fault))
 
-    async def _let_go(self, serving: VisibilityTracker, fault: str | None) -> None:
-        name, state, again = serving.name, serving.state, True
+    async def _release(self, tracker: VisibilityTracker, fault: str | None) -> None:
+        name, state, retried = tracker.name, tracker.state, True
         try:
-            left = await asyncio.to_thread(serving.held.release_folder)
-            again = left.again
-            if fault is None and not left.whole:
+            outcome = await asyncio.to_thread(tracker.source.release_folder)
+            retried = outcome.again
+            if fault is None and not outcome.whole:
                 fault = next(
-                    (f"episode {episode} {why}" for episode, why in state.refused.items()), "not all is stored"
+                    (f"episode {episode} {why}" for episode, why in state.refused.items()), "not all events are stored"
                 )
             if fault is None:
-                self._say(f"recorder {name} {left.what}; {state.records} events stored")
+                self._say(f"recorder {name} {outcome.what}; {state.records} events stored")
         except PycrormError as error:
             fault = fault or str(error)
         del self._serving[name]
@@ -179,76 +195,76 @@ class Daemon:
         self._records += state.records
         if fault is None:
             self._rests.pop(name, None)
-            self._said.pop(name, None)
-            self._said.pop(f"{name} rests", None)
+            self._last_lines.pop(name, None)
+            self._last_lines.pop(f"{name} rests", None)
         else:
-            self._rest(name, fault, again=again)
+            self._rest(name, fault, retried=retried)
 
     # --- the tables -------------------------------------------------------------------------------------------
 
-    async def _fold_as_it_comes(self) -> None:
-        self._news.set()  # something may have been left behind before
+    async def _fold_repeatedly(self) -> None:
+        self._appended_events.set()  # an earlier process may have left events unfolded
         attempt = 0
         while True:
-            await self._news.wait()
-            self._news.clear()
+            await self._appended_events.wait()
+            self._appended_events.clear()
             try:
                 while await self._destination.fold_next_batch():
-                    await self._tell_what_shows()
-                await self._tell_what_shows()
-            except Exception as error:  # noqa: BLE001 - told, and tried again; appending goes on
+                    await self._publish_visibility()
+                await self._publish_visibility()
+            except Exception as error:  # noqa: BLE001 - reported and retried; appending continues
                 attempt += 1
                 if not isinstance(error, DatabaseUnavailable):
-                    self._say_news(f"the tables cannot be brought up to date: {_in_a_line(error)}", "fold")
-                self._news.set()
+                    self._say_if_new(f"the tables cannot be brought up to date: {_one_line(error)}", "fold")
+                self._appended_events.set()
                 await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0.0)
             else:
                 attempt = 0
-                self._said.pop("fold", None)
+                self._last_lines.pop("fold", None)
 
-    async def _confirm_now_and_then(self) -> None:
-        """A log that went back is healed also while no recorder appends."""
+    async def _confirm_repeatedly(self) -> None:
+        """Detect and refill a log that went back, also while no recorder appends."""
         while True:
             try:
                 await self._destination.confirm()
-                self._said.pop("confirm", None)
-            except Exception as error:  # noqa: BLE001 - told, and tried again
+                self._last_lines.pop("confirm", None)
+            except Exception as error:  # noqa: BLE001 - reported and retried
                 if not isinstance(error, DatabaseUnavailable):
-                    self._say_news(f"what was stored cannot be confirmed: {_in_a_line(error)}", "confirm")
+                    self._say_if_new(f"stored events cannot be confirmed: {_one_line(error)}", "confirm")
             await asyncio.sleep(_CONFIRM_S)
 
-    async def _tell_what_shows(self) -> None:
+    async def _publish_visibility(self) -> None:
         before = [(each, each.appended) for each in self._serving.values()]
         behind, stopped = await self._destination.behind(), await self._destination.stopped()
-        for serving, appended in before:
+        for tracker, appended in before:
             try:
-                serving.note(appended, behind, stopped)
-            except FilesError as error:  # whoever waits there waits on; the drain meets the same disk
-                self._say(f"recorder {serving.name}: {error}")
+                tracker.note(appended, behind, stopped)
+            except FilesError as error:  # the drain meets the same disk error and reports it
+                self._say(f"recorder {tracker.name}: {error}")
 
-    # --- what is notable --------------------------------------------------------------------------------------
+    # --- reports --------------------------------------------------------------------------------------
 
     def _note_away(self, reason: str) -> None:
         self._away = reason
-        self._say(f"the database is away: {reason}; trying again")
-        self._tell_away()
+        self._say(f"the database is unavailable: {reason}; retrying")
+        self._publish_availability()
 
     def _note_back(self, after_s: float) -> None:
         self._away = None
-        self._say(f"the database is back after {after_s:.1f} s")
-        self._tell_away()
+        self._say(f"the database is available again after {after_s:.1f} s")
+        self._publish_availability()
 
-    def _tell_away(self) -> None:
-        for serving in self._serving.values():
+    def _publish_availability(self) -> None:
+        for tracker in self._serving.values():
             try:
-                serving.held.mark_unavailable(self._away)
+                tracker.source.mark_unavailable(self._away)
             except FilesError as error:
-                self._say(f"recorder {serving.name}: {error}")
+                self._say(f"recorder {tracker.name}: {error}")
 
-    def _say_news(self, line: str, about: str) -> None:
-        """Says it unless it was the last thing said about that."""
-        if self._said.get(about) != line:
-            self._said[about] = line
+    def _say_if_new(self, line: str, about: str) -> None:
+        """Say a line unless it was the last one about this subject."""
+        if self._last_lines.get(about) != line:
+            self._last_lines[about] = line
             self._say(line)
 
     def _now_s(self) -> float:
@@ -263,6 +279,6 @@ async def _wait(event: asyncio.Event, seconds: float) -> None:
         return
 
 
-def _in_a_line(error: Exception) -> str:
+def _one_line(error: Exception) -> str:
     text = " ".join(str(error).split())
     return text if isinstance(error, PycrormError) else f"{type(error).__name__}: {text}"

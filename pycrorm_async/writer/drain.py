@@ -1,10 +1,12 @@
-"""Moves records from one source into the log: read, append, acknowledge, in that order only.
+"""Move records from one source into the log: read, append, acknowledge, in this order only.
 
-Killed or cancelled anywhere in between, the worst that follows is that a batch is appended a second time, which
-stores it once. While the database is away the drain waits and the source keeps its records. What is refused is set
-aside by the source before it is acknowledged, and is offered again by the next process. If that cannot be done, nothing
-from the first such record on is ever acknowledged: a source forgets by position only, so this is how they are kept. The
-source is told at once, for it can only fill up from then on; so it is when the drain ends with an error.
+After a kill or a cancellation at any point, the worst case is that a batch is appended a second time; the log stores it
+once. While the database is unavailable the drain retries and the source keeps its records.
+
+The source keeps refused records as dead letters before the drain acknowledges them; the next process offers them again.
+If the source cannot keep them, the drain acknowledges no position from the first such record on, because a source
+deletes by position. From then on the source can only fill up, so the drain calls `fail`, which makes waiting producers
+raise; it does the same when it ends with an error.
 """
 
 from __future__ import annotations
@@ -30,18 +32,18 @@ _T = TypeVar("_T")
 
 
 class DrainState(NamedTuple):
-    """How far a drain is, for status.
+    """The state of a drain, for status.
 
     Attributes:
         source: the recorder's name.
-        records: appended so far, those that were there already included, refused ones not.
-        batches: appended so far.
-        retries: how often the database was away.
-        away: why it is away at this moment; None if it is not.
+        records: number of appended records, with those stored before, without refused ones.
+        batches: number of appended batches.
+        retries: number of attempts at which the database was unavailable.
+        away: why the database is unavailable at the moment; None if it is available.
         last_error: the latest of these reasons.
-        appended: position of the last record the log was given.
-        acknowledged: position up to which the source may forget.
-        refused: by episode id, why records of it were refused.
+        appended: position of the last appended record.
+        acknowledged: position up to which the source may delete records.
+        refused: by episode id, why the log refused records of it.
     """
 
     source: str
@@ -56,7 +58,7 @@ class DrainState(NamedTuple):
 
 
 class Drain:
-    """One source on its way into one log. Belongs to the loop that runs it; `state` may be read from any thread."""
+    """A drain of one source into one log. Belongs to the loop that runs it; `state` is readable from any thread."""
 
     def __init__(
         self,
@@ -82,18 +84,18 @@ class Drain:
         self._away: str | None = None
         self._last_error: str | None = None
         self._appended = self._acknowledged = 0
-        self._ceiling: int | None = None  # no position above it is acknowledged any more
+        self._acknowledge_max: int | None = None  # no position above it is acknowledged
         self._refused: dict[str, str] = {}
         self.stuck: FilesError | DamageError | None = None
-        """Why refused records could not be set aside, so that nothing from them on is acknowledged any more."""
-        self._moved = asyncio.Condition()
-        self._over = False
+        """Why the source could not keep refused records; no position from them on is acknowledged."""
+        self._changed = asyncio.Condition()
+        self._finished = False
 
     async def run(self) -> None:
-        """Drains until the source is closed and empty.
+        """Drain until the source is closed and empty.
 
-        Raises what makes going on useless: `LogDamaged`, a damaged source, a database away after the last attempt.
-        The source is told; the user is told by whoever this is raised to.
+        Raises `LogDamaged`, the error of a damaged source, and `DatabaseUnavailable` after the last attempt. Calls the
+        source's `fail` first; reporting the error to the user is up to the caller.
         """
         settings = self._settings
         try:
@@ -107,29 +109,29 @@ class Drain:
                 self._batches += 1
                 self._appended = batch[-1].position
                 self._on_append()
-                await self._tell()
+                await self._notify()
         except Exception as error:
-            self._source.fail(_stopped(error))
+            self._source.fail(_failure_reason(error))
             raise
         finally:
-            self._over = True
-            await self._tell()
+            self._finished = True
+            await self._notify()
 
     async def abandon(self, error: Exception) -> None:
-        """Instead of `run`, when it cannot be: who waits is told."""
-        self._source.fail(_stopped(error))
-        self._over = True
-        await self._tell()
+        """End the drain without running it: fail the source and wake the waiters."""
+        self._source.fail(_failure_reason(error))
+        self._finished = True
+        await self._notify()
 
     async def reached(self, position: int) -> bool:
-        """Waits until the log was given everything up to this position; False if the drain ended before."""
-        async with self._moved:
-            await self._moved.wait_for(lambda: self._over or self._appended >= position)
+        """Wait until the records up to this position are appended; False if the drain ended before."""
+        async with self._changed:
+            await self._changed.wait_for(lambda: self._finished or self._appended >= position)
         return self._appended >= position
 
     @property
     def appended(self) -> int:
-        """Position of the last record the log was given."""
+        """Position of the last appended record."""
         return self._appended
 
     @property
@@ -143,7 +145,7 @@ class Drain:
             last_error=self._last_error,
             appended=self._appended,
             acknowledged=self._acknowledged,
-            refused=dict(self._refused),  # one step of the interpreter, so whole from any thread
+            refused=dict(self._refused),  # one step of the interpreter, so consistent from any thread
         )
 
     async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
@@ -162,47 +164,47 @@ class Drain:
         self._away = self._last_error = str(error)
 
     async def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
-        """How far the source may forget now."""
+        """Keep the refused records of a batch; return the position that may be acknowledged."""
         self._records += sum(1 for record in batch if record.episode not in refusals) if refusals else len(batch)
         refused = {episode_text(episode): reason for episode, reason in refusals.items()}
-        if refused and self._ceiling is None:
-            await self._set_aside([each for each in batch if each.episode in refusals], refused)
+        if refused and self._acknowledge_max is None:
+            await self._keep_refused([each for each in batch if each.episode in refusals], refused)
         self._refused = {**refused, **self._refused}
-        return batch[-1].position if self._ceiling is None else self._ceiling
+        return batch[-1].position if self._acknowledge_max is None else self._acknowledge_max
 
-    async def _set_aside(self, records: Sequence[Record], refused: Mapping[str, str]) -> None:
+    async def _keep_refused(self, records: Sequence[Record], refused: Mapping[str, str]) -> None:
         try:
-            aside = await run_to_completion(asyncio.to_thread(self._source.dead_letter, records))
+            kept_elsewhere = await run_to_completion(asyncio.to_thread(self._source.dead_letter, records))
         except (FilesError, DamageError) as error:
-            self._ceiling, self.stuck = records[0].position - 1, error
+            self._acknowledge_max, self.stuck = records[0].position - 1, error
             episode, reason = next(iter(refused.items()))
-            refusal = f"episode {episode} was refused: {reason}; its events cannot be set aside: {error}"
-            self._say(f"nothing more is acknowledged to recorder {self._source.name}: {refusal}")
+            refusal = f"episode {episode} was refused: {reason}; its events cannot be kept as dead letters: {error}"
+            self._say(f"recorder {self._source.name} gets no further acknowledgements: {refusal}")
             self._source.fail(refusal)
             return
-        if not aside:
-            self._ceiling = records[0].position - 1
+        if not kept_elsewhere:
+            self._acknowledge_max = records[0].position - 1
         for episode, reason in refused.items():
             if episode not in self._refused:
-                kept = f"episode {episode} was refused: {reason}; its events are kept in the spool"
-                self._say(f"recorder {self._source.name}: {kept}")
+                detail = f"episode {episode} was refused: {reason}; its events are kept in the spool"
+                self._say(f"recorder {self._source.name}: {detail}")
 
     async def _acknowledge(self, position: int) -> None:
         if position > self._acknowledged:
             await self._source.acknowledge(position)
             self._acknowledged = position
 
-    async def _tell(self) -> None:
-        async with self._moved:
-            self._moved.notify_all()
+    async def _notify(self) -> None:
+        async with self._changed:
+            self._changed.notify_all()
 
 
-def _stopped(error: Exception) -> str:
+def _failure_reason(error: Exception) -> str:
     return f"the writer stopped: {error}"
 
 
 async def run_to_completion(work: Coroutine[Any, Any, _T]) -> _T:
-    """Awaits work that is not to be left half done: a cancellation, or several, is passed on when it is finished."""
+    """Await work that must not be interrupted; raise a cancellation only after the work has finished."""
     task = asyncio.create_task(work)
     try:
         return await asyncio.shield(task)
@@ -211,5 +213,5 @@ async def run_to_completion(work: Coroutine[Any, Any, _T]) -> _T:
             with suppress(asyncio.CancelledError):
                 await asyncio.wait([task])
         if not task.cancelled():
-            task.exception()  # seen; the cancellation counts for more
+            task.exception()  # retrieved, so that asyncio does not log it; the cancellation wins
         raise

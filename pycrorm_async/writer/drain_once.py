@@ -1,4 +1,4 @@
-"""`pycrorm writer --once`: append and fold all there is, then say what it was."""
+"""Drain every source to its end, then fold once, for `pycrorm writer --once`."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ __all__ = ["DrainSummary", "drain_once"]
 
 @dataclass(frozen=True, kw_only=True)
 class DrainSummary:
-    """What one round moved.
+    """The result of `drain_once`.
 
     Attributes:
-        drained: one state for each source, in the order they were drained.
-        failed: by the source's name, why it could not be drained to its end or its refused records not be set aside.
-        folded: events folded.
-        stopped: by episode id, why it is refused or parked; also one that was refused whole and has no row.
+        drained: one state per source, in the order of draining.
+        failed: by source name, why it could not be drained to its end, or its refused records not be kept.
+        folded: number of folded events.
+        stopped: by episode id, why it is refused or parked; includes episodes refused whole, which have no row.
     """
 
     drained: tuple[DrainState, ...]
@@ -32,9 +32,9 @@ class DrainSummary:
 
 
 async def drain_once(sources: Iterable[Source], destination: Destination, *, settings: Settings) -> DrainSummary:
-    """Drains each source to its end, then folds. One that is damaged does not keep the others from being drained.
+    """Drain each source to its end, then fold. A damaged source does not prevent draining the others.
 
-    Raises `DatabaseUnavailable` if the database stays away for some attempts at any of this; what was stored stays.
+    Raises `DatabaseUnavailable` if the database stays unavailable for five attempts; stored events stay stored.
     """
     drained: list[DrainState] = []
     failed: dict[str, PycrormError] = {}
@@ -46,7 +46,7 @@ async def drain_once(sources: Iterable[Source], destination: Destination, *, set
             raise
         except PycrormError as error:
             failed[source.name] = error
-        except Exception as error:  # noqa: BLE001 - reported of this source; the next may be in order
+        except Exception as error:  # noqa: BLE001 - reported for this source; must not stop the next
             failed[source.name] = InternalError(f"recorder {source.name} cannot be drained: {error!r}")
         if drain.stuck is not None:
             failed[source.name] = drain.stuck

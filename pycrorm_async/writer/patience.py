@@ -1,4 +1,4 @@
-"""Wait for work as long as it gets on: a bound on standing still, not on the work.
+"""Wait for work as long as it makes progress: bound the time without progress, not the work.
 
 >>> patience = Patience(15.0, progress=lambda: writer.progress)
 >>> if not await patience.wait(closing):
@@ -13,26 +13,26 @@ from typing import Final
 
 __all__ = ["Patience"]
 
-_LOOK_S: Final = 0.25
-"""How often the progress is looked at; the bound is exact to this."""
+_CHECK_S: Final = 0.25
+"""Interval at which the progress is read, and the precision of the bound."""
 
 
 class Patience:
-    """Ends a wait when `progress` has given the same for `limit_s`."""
+    """Ends a wait when `progress` has returned the same value for `limit_s`."""
 
     def __init__(self, limit_s: float, *, progress: Callable[[], object]) -> None:
         self._limit_s = limit_s
         self._progress = progress
 
     async def wait(self, work: asyncio.Future[None]) -> bool:
-        """Whether the work is done, well or not; False when it has stood still for too long. Cancels nothing."""
+        """Wait for the work; True when it is done, False after `limit_s` without progress. Cancels nothing."""
         loop = asyncio.get_running_loop()
-        seen, since_s = self._progress(), loop.time()
+        last, since_s = self._progress(), loop.time()
         while not work.done():
             left_s = since_s + self._limit_s - loop.time()
             if left_s <= 0:
                 return False
-            await asyncio.wait([work], timeout=min(left_s, _LOOK_S))
-            if (now := self._progress()) != seen:
-                seen, since_s = now, loop.time()
+            await asyncio.wait([work], timeout=min(left_s, _CHECK_S))
+            if (current := self._progress()) != last:
+                last, since_s = current, loop.time()
         return True

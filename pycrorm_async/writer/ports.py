@@ -1,6 +1,6 @@
-"""What the writer needs of its two ends: a source of synced records, and a log that takes and folds them.
+"""Define the writer's two ends: a source of synced records, and a log that stores and folds them.
 
-`Source` and `Destination` are what a writer beside a plan needs; `ClaimedSource` and `Tables` what a daemon needs more.
+A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource` and `Tables`.
 """
 
 from __future__ import annotations
@@ -35,28 +35,27 @@ class Source(Protocol):
         ...
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
-        """The next synced records in order, at least one, at most the limits (a single larger record comes alone).
+        """Return the next synced records in order, at least one, within the limits (a larger record comes alone).
 
-        Waits until one is there, then at most `age_s_max` for more. Empty once the queue is closed and drained.
-        What was given is not given again by this source; what was not acknowledged is given again by the next.
+        Waits for the first record, then at most `age_s_max` for more. Returns an empty sequence once the queue is
+        closed and drained. A source supplies each record once; the next source supplies unacknowledged records again.
         """
         ...
 
     async def acknowledge(self, position: int) -> None:
-        """Everything up to this position is stored for good: its segments may be deleted."""
+        """Note that records up to this position are durable in the database: their segments may be deleted."""
         ...
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
-        """Keeps records that the log refused elsewhere, so that the source may forget them like stored ones: durable
-        when it returns. What was set aside before is so once. Blocks.
+        """Keep records that the log refused, durable on return, so that they can be acknowledged. Blocks.
 
-        False if they are to stay where they are, because the source is made of such records. Raises `FilesError` or
-        `DamageError` if it cannot be done.
+        Keeps each record once. Returns False if the source itself consists of dead letters, which must stay where they
+        are. Raises `FilesError` or `DamageError` if the records cannot be kept.
         """
         ...
 
     def fail(self, reason: str) -> None:
-        """From now on nothing more will be acknowledged: whoever waits for room is told why. The first reason stays."""
+        """Note that no more records will be acknowledged, so that waiting producers fail. The first reason stays."""
         ...
 
 
@@ -64,64 +63,64 @@ class Destination(Protocol):
     """The log in a database, and the tables behind it."""
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        """Durable when it returns. What is stored already with the same bytes is stored once.
+        """Append records, durable on return. Records stored before with the same bytes are stored once.
 
-        Gives the episodes of which it refused records (a gap, or what no database can hold) and why: these records are
-        not stored and must be kept; the other episodes go on. Raises `DatabaseUnavailable` when the database is away:
-        the same call may be made again. Raises `LogDamaged` when another event is stored under a record's key.
+        Returns the episodes with refused records (behind a gap, or with content no database can hold) and the reasons:
+        the caller must keep these records; other episodes are not affected. Raises `DatabaseUnavailable`; then the same
+        call may be repeated. Raises `LogDamaged` if another event is stored under a record's key.
         """
         ...
 
     async def confirm(self) -> None:
-        """Looks whether the log still holds what it confirmed, and offers it again what it lost. Raises as `append`."""
+        """Check that the log still holds the events it confirmed; append lost ones again. Raises as `append` does."""
         ...
 
     @property
     def writes(self) -> int:
-        """How many transactions that write were committed: while it grows the database gets on."""
+        """Number of committed writing transactions; grows while the database makes progress."""
         return 0
 
     async def fold(self) -> int:
-        """Brings the tables up to date with the log; gives the number of events folded.
+        """Fold all events of the log that are not folded yet; return their number.
 
-        An episode it cannot fold is parked. May be cancelled: what was committed stays, the rest is folded next time.
+        Parks an episode that it cannot fold. May be cancelled: committed folds stay, the next call folds the rest.
         """
         ...
 
     async def stopped(self) -> Mapping[str, str]:
-        """Every episode, by id, that is refused or parked, and why. Stays short however many episodes there are."""
+        """Return the refused and parked episodes by id, with reasons, at a cost independent of the others."""
         ...
 
 
 class ClaimedSource(Source, Protocol):
-    """One recorder's folder, held by a daemon: nobody else drains it meanwhile."""
+    """One recorder's folder, claimed by a daemon: no other process drains it meanwhile."""
 
     @property
     def is_alive(self) -> bool:
-        """Whether the recorder lives in another process and puts more into it."""
+        """Whether the recorder lives in another process and may record more."""
         ...
 
     def finish(self) -> None:
-        """Nothing beyond what is synced now is given any more."""
+        """End this source behind the records that are synced now."""
         ...
 
     def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None:
-        """Everything up to this position shows in the tables, or never will: of the `stopped` episodes, by id."""
+        """Publish that records up to this position are visible, except those of `stopped` episodes, by id."""
         ...
 
     def mark_unavailable(self, reason: str | None) -> None:
-        """Why the database takes nothing now; None when it does again."""
+        """Publish why the database is unavailable; None when it is available again."""
         ...
 
     def release_folder(self) -> ReleaseOutcome:
-        """Leaves it to whoever comes next; what a dead recorder left is deleted if all of it is stored. Blocks."""
+        """Release the folder; delete a dead recorder's folder if all its records are stored. Blocks."""
         ...
 
 
 class ReleaseOutcome(NamedTuple):
-    """What became of a folder, in words; `whole` unless something is left in it that could not be stored.
+    """The outcome of releasing a folder: a description, and whether all its records could be stored (`whole`).
 
-    `again`: whether that is to be tried again in this process.
+    `again`: whether this process should retry the rest.
     """
 
     what: str
@@ -130,46 +129,46 @@ class ReleaseOutcome(NamedTuple):
 
 
 class ScanResult(NamedTuple):
-    """What looking round brought: folders to drain, and by name those that cannot be, and why."""
+    """The result of a scan: claimed folders to drain (`held`), and by name the errors of folders that cannot be."""
 
     held: Sequence[ClaimedSource]
     failed: Mapping[str, Exception]
 
 
 class SourceScanner(Protocol):
-    """Takes hold of every recorder's folder that can be drained, but for those of these names. Reads files: blocks."""
+    """Claim every recorder's folder that can be drained, except those of these names. Reads files: blocks."""
 
     def __call__(self, but: Collection[str]) -> ScanResult: ...
 
 
 class Tables(Destination, Protocol):
-    """A destination that says what shows in the tables, and folds in steps, so that appending goes on beside it."""
+    """A destination that folds in steps, so that appending continues meanwhile, and reports what is visible."""
 
     async def fold_next_batch(self) -> bool:
-        """Shows some of what the tables do not show yet; False if there was nothing. Raises as `fold` does."""
+        """Fold one batch of events that are not visible yet; False if there was none. Raises as `fold` does."""
         ...
 
     async def behind(self) -> Mapping[str, int]:
-        """By id, how far the tables show each episode of which they do not show all that they ever will."""
+        """Return the folded sequence, by id, of each episode with events that are not visible yet."""
         ...
 
 
 class DrainRemarks(Protocol):
-    """Reasons that the drainer of a queue gives in words."""
+    """The reasons in the drain status of a queue."""
 
     @property
     def given_up(self) -> str | None:
-        """Why the drainer acknowledges nothing more."""
+        """Why the drainer acknowledges no more records; None while it drains."""
         ...
 
     @property
     def away(self) -> str | None:
-        """Why the database takes nothing at this moment."""
+        """Why the database is unavailable at the moment; None while it is available."""
         ...
 
     @property
     def stopped(self) -> Mapping[str, str]:
-        """By episode id, why it is refused or parked."""
+        """By episode id, why the episode is refused or parked."""
         ...
 
 
@@ -178,17 +177,17 @@ class DrainProgress(Protocol):
 
     @property
     def stored(self) -> int:
-        """Everything up to this position is in the log."""
+        """Records up to this position are in the log."""
         ...
 
     @property
     def folded(self) -> int:
-        """Everything up to this position is visible in the tables."""
+        """Records up to this position are visible in the tables, or never will be."""
         ...
 
     @property
     def note(self) -> DrainRemarks:
-        """What hinders the drainer."""
+        """The drainer's reasons."""
         ...
 
 
@@ -202,19 +201,19 @@ class OfferedQueue(Protocol):
 
     @property
     def written(self) -> int:
-        """The position of the last record."""
+        """Position of the last record put."""
         ...
 
     @property
     def is_drained(self) -> bool:
-        """Whether a process drains the queue at this moment."""
+        """Whether a process drains the queue now."""
         ...
 
     @property
     def external_drain_status(self) -> DrainProgress | None:
-        """How far the other process has got; None for a queue that is drained in this process."""
+        """The drain status from the other process; None for a queue that this process drains."""
         ...
 
     async def synced_to(self) -> None:
-        """Returns when every record is safe on the disk. Raises `SpoolUnavailable`."""
+        """Wait until all records are synced. Raises `SpoolUnavailable`."""
         ...

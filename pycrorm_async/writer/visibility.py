@@ -1,4 +1,4 @@
-"""One recorder on its way through a daemon: drained into the log, and followed until all of it shows in the tables."""
+"""Drain one recorder for a daemon, and track which of its records are visible in the tables."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from pycrorm_async.writer.ports import ClaimedSource, Destination, Source
 
 __all__ = ["VisibilityTracker"]
 
-_UNSHOWN_MAX = 256
-"""Batches that are followed each for itself; further ones are followed together, however long the tables lag."""
+_BATCHES_MAX = 256
+"""Bounds the batches tracked separately, so that memory stays flat while the tables lag; later ones are merged."""
 
 
 class VisibilityTracker(Source):
-    """The source of its own drain: it notes what it passes on, and tells the recorder when that can be seen.
+    """A source that forwards to the claimed one and notes the batches, so that it can publish their visibility.
 
-    How far the tables are is asked of the log, episode by episode, so it does not matter who folded.
+    Visibility comes from the log, per episode, so it does not matter which process folded.
     """
 
     def __init__(
         self,
-        held: ClaimedSource,
+        source: ClaimedSource,
         destination: Destination,
         *,
         settings: Settings,
         on_append: Callable[[], None],
         say: Callable[[str], None],
     ) -> None:
-        self.held = held
+        self.source = source
         self._drain = Drain(self, destination, settings=settings, on_append=on_append, say=say)
-        self._unshown: deque[tuple[int, dict[str, int]]] = (
+        self._invisible: deque[tuple[int, dict[str, int]]] = (
             deque()
         )  # position, and each episode's last sequence up to it
         self._stopped: dict[str, str] = {}
-        self._noted = asyncio.Event()
+        self._updated = asyncio.Event()
 
     async def run(self) -> None:
-        """Until the recorder's folder is drained and shows. Raises as `Drain.run` does."""
+        """Run until the folder is drained and all its records are visible. Raises as `Drain.run` does."""
         await self._drain.run()
-        while self._unshown:
-            self._noted.clear()
-            await self._noted.wait()
+        while self._invisible:
+            self._updated.clear()
+            await self._updated.wait()
 
     @property
     def state(self) -> DrainState:
@@ -54,53 +54,53 @@ class VisibilityTracker(Source):
 
     @property
     def appended(self) -> int:
-        """Position of the last record the log was given."""
+        """Position of the last appended record."""
         return self._drain.appended
 
     def note(self, appended: int, behind: Mapping[str, int], stopped: Mapping[str, str]) -> None:
-        """Tells the recorder what shows.
+        """Publish to the recorder which records are visible.
 
         Args:
-            appended: as it was before the others were asked for.
-            behind: by episode, how far the tables show it, of those that do not show all yet.
-            stopped: by episode, why it is refused or parked.
+            appended: this tracker's `appended` before `behind` and `stopped` were read.
+            behind: by id, the folded sequence of each episode with events that are not visible yet.
+            stopped: by id, why an episode is refused or parked.
         """
-        shown, stopped = 0, {**self.state.refused, **stopped}
-        while self._unshown and self._unshown[0][0] <= appended:
-            position, lasts = self._unshown[0]
+        visible_to, stopped = 0, {**self.state.refused, **stopped}
+        while self._invisible and self._invisible[0][0] <= appended:
+            position, lasts = self._invisible[0]
             if any(behind.get(episode, last) < last for episode, last in lasts.items()):
                 break
             self._stopped |= {episode: stopped[episode] for episode in lasts if episode in stopped}
-            self._unshown.popleft()
-            shown = position
-        if shown:
-            self.held.mark_visible(shown, self._stopped)
-            self._noted.set()
+            self._invisible.popleft()
+            visible_to = position
+        if visible_to:
+            self.source.mark_visible(visible_to, self._stopped)
+            self._updated.set()
 
     # --- as a source ------------------------------------------------------------------------------------------
 
     @property
     def name(self) -> str:
-        return self.held.name
+        return self.source.name
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
-        batch = await self.held.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+        batch = await self.source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
         if batch:
             lasts = {each.episode: each.sequence for each in batch if each.episode is not None}
-            self._follow(batch[-1].position, {episode_text(episode): last for episode, last in lasts.items()})
+            self._track(batch[-1].position, {episode_text(episode): last for episode, last in lasts.items()})
         return batch
 
     async def acknowledge(self, position: int) -> None:
-        await self.held.acknowledge(position)
+        await self.source.acknowledge(position)
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
-        return self.held.dead_letter(records)
+        return self.source.dead_letter(records)
 
     def fail(self, reason: str) -> None:
-        self.held.fail(reason)
+        self.source.fail(reason)
 
-    def _follow(self, position: int, lasts: dict[str, int]) -> None:
-        if len(self._unshown) >= _UNSHOWN_MAX:
-            _, before = self._unshown.pop()
+    def _track(self, position: int, lasts: dict[str, int]) -> None:
+        if len(self._invisible) >= _BATCHES_MAX:
+            _, before = self._invisible.pop()
             lasts = before | lasts
-        self._unshown.append((position, lasts))
+        self._invisible.append((position, lasts))

@@ -1,6 +1,19 @@
-"""The writer inside a plan's process: a thread with a loop of its own, spoken to from the plan's loop.
+"""Run the writer inside a plan's process, in a thread with its own loop, and call it from the plan's loop.
 
-A task in the plan's loop would never run: a plan that moves no real time awaits all the way down without suspending.
+**Theory of operation.** A task in the plan's loop would not run: a plan that waits for no real time awaits all the way
+down without ever suspending. So the thread runs its own loop with one `LiveWriter` and opens the database there,
+because a connection belongs to a loop.
+
+The plan's loop and the thread share two futures. `_opened` gets the writer, or the error of opening; `_ended` gets the
+outcome of the thread. Cancelling `start`, `flush` or `close` cancels the wait, not the work.
+
+A flush runs in the thread's loop, which may be ending at that moment. `_accepting` guards `_flushes`: a flush is added
+before the loop stops accepting, and then the loop waits for it, or it finds None there and waits for `_ended` instead.
+A writer that failed keeps its loop until it is asked to leave, so that each later flush raises its error.
+
+`close` asks the thread to leave and waits as long as the writer makes progress. Then it cancels the work and waits
+`_LEAVE_S` for the thread to close its database. The thread is a daemon thread: unstored events are safe in the spool,
+so they must not keep the process from ending.
 """
 
 from __future__ import annotations
@@ -20,19 +33,18 @@ from pycrorm_async.writer.ports import Destination, Source
 __all__ = ["WriterThread"]
 
 _LEAVE_S = 10.0
-"""How long `close` waits, when it is too late already, for the thread to let go of its database."""
+"""Bounds the wait of `close`, after it has timed out, for the thread to close its database."""
 
 
 class WriterThread:
-    """Drains one queue from a thread of its own.
+    """Drains one queue from its own thread.
 
         writer = WriterThread(source=queue, open_destination=open_log, adopt=dead_folders, settings=settings)
         await writer.start()                # raises if the database cannot be opened
         await writer.flush(position)        # stored and folded
-        queue.close(); await writer.close() # drains what is left, folds, closes the database, ends the thread
+        queue.close(); await writer.close() # drains the rest, folds, closes the database, ends the thread
 
-    `open_destination` is entered and left inside the thread's loop, where its connections belong. `start`, `flush` and
-    `close` are called from the plan's loop; cancelling one of them stops the waiting, not the work.
+    `open_destination` is entered and left in the thread's loop. Call `start`, `flush` and `close` from the plan's loop.
     """
 
     def __init__(
@@ -53,40 +65,39 @@ class WriterThread:
         self._work: asyncio.Task[None] | None = None
         self._leave: asyncio.Event | None = None
         self._accepting = threading.Lock()
-        self._flushes: set[Future[None]] | None = set()  # None: the loop takes no more
-        # A daemon: what it has not stored is safe in the spool, so it is no reason to keep a process from ending.
+        self._flushes: set[Future[None]] | None = set()  # None: the loop accepts no more flushes
         self._thread = threading.Thread(target=self._run, name=f"pycrorm writer {source.name}", daemon=True)
 
     async def start(self) -> None:
-        """Starts the thread; returns when the database is open. Raises what opening raised; the thread is gone then."""
+        """Start the thread and wait until the database is open. Raises the error of opening; the thread ends then."""
         self._thread.start()
         try:
             await asyncio.shield(asyncio.wrap_future(self._opened))
         except asyncio.CancelledError:
-            self._opened.add_done_callback(lambda _: self._ask_to_leave(cancel=True))
+            self._opened.add_done_callback(lambda _: self._request_leave(cancel=True))
             raise
         except Exception:
             self._thread.join()
             raise
 
     async def flush(self, position: int) -> None:
-        """Returns when everything up to this position is stored and visible in the tables; see `LiveWriter.flush`.
+        """Wait until the records up to this position are stored and visible in the tables; see `LiveWriter.flush`.
 
-        One that meets `close` ends as that does: raises what it raises, `FlushTimeout` too.
+        During `close` a flush ends with the outcome of `close`.
         """
         flush = self._begin_flush(self._opened.result(timeout=0), position)
         waited_for = asyncio.wrap_future(self._ended if flush is None else flush)
         try:
             if flush is None and not await self._patience.wait(waited_for):
-                raise self._too_late()
+                raise self._timeout_error()
             await asyncio.shield(waited_for)
         except asyncio.CancelledError:
             if not waited_for.cancelled():
                 raise
-            raise self._too_late() from None
+            raise self._timeout_error() from None
 
     def _begin_flush(self, writer: LiveWriter, position: int) -> Future[None] | None:
-        """In the thread's loop, which does not end before it; None if the loop is ending."""
+        """Start a flush in the thread's loop, which waits for it before it ends; None if the loop is ending."""
         with self._accepting:
             if self._flushes is None:
                 return None
@@ -97,31 +108,32 @@ class WriterThread:
         return flush
 
     def _end_flushes(self) -> list[Future[None]]:
-        """No more are begun; gives those that were."""
+        """Accept no more flushes; return the running ones."""
         with self._accepting:
-            begun, self._flushes = list(self._flushes or ()), None
-        return begun
+            flushes, self._flushes = list(self._flushes or ()), None
+        return flushes
 
     async def close(self) -> None:
-        """Waits until the queue, which the caller closed, is drained and folded. The thread is gone afterwards.
+        """Wait until the queue, which the caller closed, is drained and folded and the thread has ended.
 
-        Raises what stopped the appending, `EpisodeParked`, or `FlushTimeout` after `flush_timeout_s` without progress.
+        Raises the error that stopped appending, `EpisodeParked`, or `FlushTimeout` after `flush_timeout_s` without
+        progress.
         """
-        self._ask_to_leave(cancel=False)
+        self._request_leave(cancel=False)
         ended = asyncio.wrap_future(self._ended)
         if not await self._patience.wait(ended):
-            late = self._too_late()
-            self._ask_to_leave(cancel=True)
+            timeout = self._timeout_error()
+            self._request_leave(cancel=True)
             await asyncio.wait([ended], timeout=_LEAVE_S)
             if ended.done():
-                ended.exception()  # the same, or what came of it
-            raise late
+                ended.exception()  # retrieved, so that it is not logged; the timeout is raised instead
+            raise timeout
         self._thread.join()
         ended.result()
 
     @property
     def state(self) -> WriterState:
-        """What the writer does; from any thread, once started."""
+        """The writer's state; from any thread, after `start`."""
         return self._opened.result(timeout=0).state
 
     @property
@@ -129,19 +141,19 @@ class WriterThread:
         writer = self._opened.result(timeout=0)
         return Patience(self._settings.flush_timeout_s, progress=lambda: writer.progress)
 
-    def _too_late(self) -> FlushTimeout:
-        reason = self.state.queue.away or "there was too much to store and fold"
+    def _timeout_error(self) -> FlushTimeout:
+        reason = self.state.queue.away or "more events than could be stored and folded in that time"
         return FlushTimeout(
             f"closed after {self._settings.flush_timeout_s:g} s with work left ({reason});"
             " everything recorded is safe in the spool"
         )
 
-    def _ask_to_leave(self, *, cancel: bool) -> None:
+    def _request_leave(self, *, cancel: bool) -> None:
         if self._ended.done() or self._loop is None or self._leave is None or self._work is None:
             return
         try:
             self._loop.call_soon_threadsafe(self._work.cancel if cancel else self._leave.set)
-        except RuntimeError:  # the loop was closed at this moment: the thread is leaving
+        except RuntimeError:  # the loop has just closed: the thread is ending
             return
 
     # --- in the thread ----------------------------------------------------------------------------------------
@@ -153,7 +165,7 @@ class WriterThread:
             if self._opened.cancel():
                 self._ended.set_result(None)
             else:
-                self._ended.set_exception(self._too_late())
+                self._ended.set_exception(self._timeout_error())
         except BaseException as error:  # noqa: BLE001 - raised by `start`, or by `flush` and `close`
             if not self._opened.done():
                 self._opened.set_exception(error)
@@ -170,13 +182,13 @@ class WriterThread:
             writer = LiveWriter(self._source, destination, adopt=self._adopt, settings=self._settings)
             self._opened.set_result(writer)
             try:
-                # A writer that failed stays until it is told to leave, so that every flush is told why.
+                # A failed writer waits for the request to leave, so that every flush raises its error.
                 [outcome] = await asyncio.gather(writer.run(), return_exceptions=True)
                 await self._leave.wait()
                 await asyncio.gather(*map(asyncio.wrap_future, self._end_flushes()), return_exceptions=True)
             finally:
                 if self._end_flushes():
-                    await asyncio.sleep(0)  # what was begun just now is a task afterwards, and ends with the loop
+                    await asyncio.sleep(0)  # lets a flush started just now become a task, which ends with the loop
             if outcome is not None:
                 raise outcome
 

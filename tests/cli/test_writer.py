@@ -115,7 +115,7 @@ def test_a_plan_killed_beside_a_daemon_is_recovered_by_it(folder: Path, daemon: 
     assert [line.split(" ", 2)[2] for line in lines[:4]] == [
         "appeared",
         f"died; {recorder['stored']} events stored",
-        "is dead: recovering what it left",
+        "is dead: recovering its folder",
         f"is recovered (1 episode LOST); {recorder['stored'] + 1} events stored",
     ]
     assert [each["status"] for each in answer("episodes", cwd=folder)] == ["LOST"]

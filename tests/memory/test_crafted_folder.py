@@ -61,7 +61,7 @@ async def test_the_daemon_drains_the_next_folder(
     database_url: str, spool: Path, crafted: Author, whole: Author
 ) -> None:
     running = Daemon(database_url, spool)
-    await running.says("is not UTF-8; tried again now and then$")
+    await running.says("is not UTF-8; retrying with pauses$")
     await running.says(f"{whole.folder.name} is recovered")
     await running.leaves()
     assert ask(database_url, STORED) == [(2,)]

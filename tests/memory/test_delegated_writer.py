@@ -112,11 +112,11 @@ async def test_without_a_daemon_flush_says_so_and_closing_leaves_the_events_to_w
 ) -> None:
     async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
         await NoteActionPerformable("a").perform()
-        with pytest.raises(FlushTimeout, match="nobody drains this spool: start `pycrorm writer`"):
+        with pytest.raises(FlushTimeout, match="no process drains this spool: start `pycrorm writer`"):
             await memory.flush()
         assert not memory.status.drained
     [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
-    assert line.startswith(f"7 events are safe in {spool} and not in the database yet (nobody drains this spool")
+    assert line.startswith(f"7 events are safe in {spool} and not in the database yet (no process drains this spool")
     report = await recover(database_url, spool=spool)
     assert (report.lost, report.failed) == ((), {})
     async with Reading.open(database_url) as reading:
@@ -136,7 +136,7 @@ async def test_closing_says_so_when_all_is_stored_and_the_tables_are_behind(
         await drainer.acknowledge(batch[-1].position)
     drainer.release()
     [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
-    assert line.startswith("all events are stored, and the last 7 do not show in the tables yet (")
+    assert line.startswith("all events are stored, but the last 7 are not visible in the tables yet (")
 
 
 async def test_one_round_stores_what_a_living_process_has_synced_and_its_flush_returns(
@@ -220,7 +220,7 @@ async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later
             await memory.__aexit__(None, None, None)
             [kept] = Spool(spool).recorders()
             assert kept.refused == str(refused)
-            await started.says(f"recorder {kept.name}: episode {refused} .*; tried again by the next writer")
+            await started.says(f"recorder {kept.name}: episode {refused} .*; the next writer retries")
             segments = {path: path.read_bytes() for path in kept.path.glob("*.segment")}
     assert (len(segments), kept.alive) == (3, False)
     report = await recover(database_url, spool=spool)
@@ -268,9 +268,9 @@ async def test_a_daemon_whose_file_is_replaced_by_another_ends_and_one_whose_fil
         await started.says("appeared")
         file.rename(tmp_path / "away.db")
         await NoteActionPerformable("b").perform()
-        await started.says("the database is away: .*removed or replaced")
+        await started.says("the database is unavailable: .*removed or replaced")
         (tmp_path / "away.db").rename(file)
-        await started.says("the database is back")
+        await started.says("the database is available again")
         shutil.copy(file, tmp_path / "copy.db")
         (tmp_path / "copy.db").replace(file)
         await NoteActionPerformable("c").perform()
@@ -347,7 +347,7 @@ async def test_a_damaged_folder_is_told_and_the_others_are_drained(
     content[content.index(b"damaged")] ^= 1
     segment.write_bytes(content)
     async with daemon() as started:
-        await started.says(f"{first.name}: .*00000001.segment is damaged at byte .*; tried again")
+        await started.says(f"{first.name}: .*00000001.segment is damaged at byte .*; retrying")
         await started.says(f"{second.name} is recovered")
     async with Reading.open(database_url) as reading:
         assert await texts(reading) == ["whole"]
@@ -382,12 +382,12 @@ async def test_a_locked_database_is_away_for_the_daemon_and_closing_does_not_wai
         other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
         other.execute("BEGIN IMMEDIATE")
         await NoteActionPerformable("b").perform()
-        await started.says("the database is away: .*locked; trying again")
+        await started.says("the database is unavailable: .*locked; retrying")
     [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
-    assert "the daemon says that the database is away" in line
+    assert "the daemon reports that the database is unavailable" in line
     other.execute("COMMIT")
     other.close()
-    await started.says("the database is back after")
+    await started.says("the database is available again after")
     await started.says("is recovered")
     started.leave.set()
     await started.task

@@ -209,7 +209,7 @@ async def test_a_source_that_cannot_set_aside_is_told_once_and_at_once_that_it_c
     running = asyncio.create_task(Drain(source, CountingFold(log), settings=TENS).run())
     refused = (
         f"episode {name(1)} was refused: event 5 did not arrive before event 6;"
-        " its events cannot be set aside: spool /spool/1.refused: No space left on device"
+        " its events cannot be kept as dead letters: spool /spool/1.refused: No space left on device"
     )
     async with asyncio.timeout(60):
         while not source.given_up:  # noqa: ASYNC110 - what is waited for is not ours to signal
@@ -220,7 +220,7 @@ async def test_a_source_that_cannot_set_aside_is_told_once_and_at_once_that_it_c
     assert source.kept == list(range(1, 31))
     assert source.given_up == [refused]
     assert [(each.levelname, each.getMessage()) for each in caplog.records] == [
-        ("ERROR", f"nothing more is acknowledged to recorder robot: {refused}")
+        ("ERROR", f"recorder robot gets no further acknowledgements: {refused}")
     ]
 
 

@@ -141,7 +141,8 @@ async def test_a_refused_episode_that_cannot_be_set_aside_ends_the_waiting_for_r
     queue.put_nowait(kind(episode(2), 1), payload(1))
     put = 1
     with pytest.raises(
-        SpoolStuck, match=r"events 2 to 3 did not arrive .* cannot be set aside: .*refused/alive: Not a directory"
+        SpoolStuck,
+        match=r"events 2 to 3 did not arrive .* cannot be kept as dead letters: .*refused/alive: Not a directory",
     ):
         async with asyncio.timeout(60):
             while True:
