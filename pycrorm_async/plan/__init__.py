@@ -1,7 +1,7 @@
-"""What a robot does: designators, the actions and motions that are there, and the tree of what was performed.
+"""Write and perform robot plans: designators, built-in actions and motions, the plan language, the task tree.
 
-Runs without a memory; a memory implements the observer of `pycrorm_async.plan.execution.observer`. Importing this
-loads neither Bullet nor a database. The kinds of `PlanFailure` are in `pycrorm_async.plan.failures`.
+Plans run without a memory; a memory implements the observer of `pycrorm_async.plan.execution.observer`. Importing this
+package loads neither Bullet nor a database. The kinds of `PlanFailure` are in `pycrorm_async.plan.failures`.
 
 >>> with BulletWorld() as world, simulated_robot:
 ...     robot = Object("pr2", ObjectType.ROBOT)

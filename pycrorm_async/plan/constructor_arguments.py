@@ -1,8 +1,7 @@
-"""Keeps the arguments with which a designator was built whose class has an `__init__` of its own.
+"""Keep the constructor arguments of designators whose class defines its own `__init__`, for a memory to record.
 
-A dataclass shows its fields, any other class only what its `__init__` does with the arguments. So those are kept as
-they were given, under `ARGUMENTS` in the instance, for a memory to record. Of `*rest` and `**options` nothing is kept
-where none were given.
+A dataclass exposes its fields; any other class exposes only what its `__init__` stores. Therefore the arguments are
+kept unchanged under `ARGUMENTS` in the instance. Empty `*rest` and `**options` are kept as None.
 """
 
 from __future__ import annotations
@@ -13,27 +12,27 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-__all__ = ["ARGUMENTS", "keeping_arguments"]
+__all__ = ["ARGUMENTS", "record_arguments"]
 
 ARGUMENTS = "_constructed_with"
-"""The attribute of the instance; its attributes are the arguments by name."""
+"""Name of the instance's attribute that holds the arguments, a namespace with one attribute per argument."""
 
 
-def keeping_arguments(initialise: Callable[..., None]) -> Callable[..., None]:
-    """The same `__init__`, which keeps what it was called with; that of a subclass comes after its base's."""
+def record_arguments(initialise: Callable[..., None]) -> Callable[..., None]:
+    """Wrap `__init__` so that it keeps its arguments; a subclass's arguments replace those of its base."""
     signature = inspect.signature(initialise)
     _, *parameters = signature.parameters.values()
     if not parameters:
         return initialise
-    gathered = {each.name for each in parameters if each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
+    variadic = {each.name for each in parameters if each.kind in (each.VAR_POSITIONAL, each.VAR_KEYWORD)}
 
     @functools.wraps(initialise)
-    def initialised(self: Any, *arguments: Any, **options: Any) -> None:
+    def wrapper(self: Any, *arguments: Any, **options: Any) -> None:
         initialise(self, *arguments, **options)
         bound = signature.bind(self, *arguments, **options)
         bound.apply_defaults()
-        kept = self.__dict__.setdefault(ARGUMENTS, SimpleNamespace()).__dict__
+        namespace = self.__dict__.setdefault(ARGUMENTS, SimpleNamespace()).__dict__
         _, *values = bound.arguments.items()
-        kept.update((name, value if value or name not in gathered else None) for name, value in values)
+        namespace.update((name, value if value or name not in variadic else None) for name, value in values)
 
-    return initialised
+    return wrapper

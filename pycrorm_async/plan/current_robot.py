@@ -1,4 +1,4 @@
-"""Which world a plan acts in, and which robot: those of its context. Without one the caller is told what to do."""
+"""Look up the world and the robot of the current context, with an error that names the missing statement."""
 
 from __future__ import annotations
 
@@ -18,59 +18,59 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["RobotHere", "check_in_map", "world_here", "robot_here"]
+__all__ = ["CurrentRobot", "check_in_map", "require_world", "require_robot"]
 
 
-class RobotHere(NamedTuple):
-    """The robot of this context: the object in the world, and what is known of its kind."""
+class CurrentRobot(NamedTuple):
+    """A robot: its object in the world and the description of its kind."""
 
     body: Object
     description: RobotDescription
 
     def one_arm(self, arm: Arms) -> ArmDescription:
-        """The arm's description.
+        """Return the description of a single arm.
 
         Raises:
-            IllPosedGoalFailure: it is `Arms.BOTH`.
+            IllPosedGoalFailure: `arm` is `Arms.BOTH`.
             CapabilityAbsenceFailure: the robot has no such arm.
         """
         if arm is Arms.BOTH:
-            raise IllPosedGoalFailure("this is done with one arm, LEFT or RIGHT, not with BOTH", arm)
-        found = self.description.arms.get(arm)
-        if found is None:
+            raise IllPosedGoalFailure("this designator needs one arm, LEFT or RIGHT, and does not work with BOTH", arm)
+        arm_description = self.description.arms.get(arm)
+        if arm_description is None:
             raise CapabilityAbsenceFailure(f"{self.body.name} has no {arm.name} arm", self.body.name, arm)
-        return found
+        return arm_description
 
     def each_arm(self, arm: Arms) -> dict[Arms, ArmDescription]:
-        """The arm, or for `Arms.BOTH` the two. Raises `CapabilityAbsenceFailure` for one that the robot lacks."""
+        """Return the arm, or both for `Arms.BOTH`. Raises `CapabilityAbsenceFailure` for an arm the robot lacks."""
         return {each: self.one_arm(each) for each in ((Arms.LEFT, Arms.RIGHT) if arm is Arms.BOTH else (arm,))}
 
     def with_load(self) -> frozenset[Object]:
-        """The robot and all that is attached to it, however deep."""
+        """Return the robot and all objects attached to it, directly or indirectly."""
         return frozenset({self.body, *self.body.world.attachments.below(self.body)})
 
 
-def world_here() -> BulletWorld:
-    """The world of the innermost `with BulletWorld()` of this context. Raises `NoWorld`."""
+def require_world() -> BulletWorld:
+    """Return the world of the innermost `with BulletWorld()` of this context. Raises `NoWorld`."""
     world = current_world.get()
     if world is None:
         raise NoWorld("the plan")
     return world
 
 
-def robot_here() -> RobotHere:
-    """The robot in that world. Raises `NoWorld`, `NoRobotHere`."""
-    body = world_here().robot
+def require_robot() -> CurrentRobot:
+    """Return the robot of the current world. Raises `NoWorld`, `NoRobotHere`."""
+    body = require_world().robot
     if body is None:
         raise NoRobotHere('no robot in the world: add one, e.g. Object("pr2", ObjectType.ROBOT)')
     description = body.robot_description
     if description is None:
-        raise NoRobotHere(f"the robot {body.name!r} is not of a kind that is known here")
-    return RobotHere(body, description)
+        raise NoRobotHere(f"no robot description is registered for the robot {body.name!r}; the built-in one is 'pr2'")
+    return CurrentRobot(body, description)
 
 
 def check_in_map(target: Pose) -> None:
-    """Raise `CallerError` if the pose is in another frame than what is in the world, or not finite."""
+    """Raise `CallerError` if the pose is not in the frame "map", or not finite."""
     if target.frame != "map":
         raise CallerError(f"the target is in frame {target.frame!r}, the robot in 'map': transform it first")
     if not math.isfinite(sum(target.position) + sum(target.orientation)):

@@ -1,6 +1,6 @@
-"""What a plan performs: a dataclass whose fields say what, and whose `async def perform(self)` does it.
+"""Designators are the performable parts of a plan: dataclasses with parameters as fields and an async `perform`.
 
-A class of one's own needs nothing else; every call of its `perform` is a node of the task tree:
+A user's own designator needs nothing else; every call of its `perform` creates a node of the task tree:
 
 >>> @dataclass
 ... class SayingActionPerformable(ActionAbstract):
@@ -17,9 +17,9 @@ import inspect
 from abc import ABC, abstractmethod
 from typing import Any, ClassVar
 
-from pycrorm_async.plan.constructor_arguments import keeping_arguments
+from pycrorm_async.plan.constructor_arguments import record_arguments
 from pycrorm_async.plan.errors import PerformNotAsync, ResourcesNotAMethod
-from pycrorm_async.plan.execution.node_execution import as_node, is_node
+from pycrorm_async.plan.execution.node_execution import is_wrapped, wrap_perform
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.resources import NOTHING, Resource
@@ -29,19 +29,19 @@ __all__ = ["Designator", "ActionAbstract", "BaseMotion"]
 
 
 class Designator(Composable, ABC):
-    """The root of everything performable. Descend from `ActionAbstract` or `BaseMotion`.
+    """Base of everything performable; derive from `ActionAbstract` or `BaseMotion`.
 
     Class attributes:
-        kind: what its nodes are.
-        dtype: its name in a memory, by default from the class' name, also for a class that descends from a
-            named one: two types never share a name by accident. Set it to keep a name when a class is renamed.
-        aliases: a tuple of the names it had before; what was recorded under these is asked for with it. Not inherited.
-        concept: the SOMA concept it stands for, if one is known.
-        orm_class: a mapped class of one's own to ask for it with.
+        kind: the kind of its nodes.
+        dtype: its name in a memory, by default derived from the class name, also for a subclass of a class that sets
+            it, so that two types never share a name by accident. Set it to keep the name when the class is renamed.
+        aliases: a tuple of former names; queries for this type include records under them. Not inherited.
+        concept: the SOMA concept it corresponds to, if there is one.
+        orm_class: a mapped class of the user's own for queries.
 
     Raises:
-        PerformNotAsync: at the definition of a class whose `perform` is not a coroutine function.
-        ResourcesNotAMethod: at the definition of a class that has a field of that name.
+        PerformNotAsync: at class definition, if `perform` is not a coroutine function.
+        ResourcesNotAMethod: at class definition, if `resources` is a field or a value.
     """
 
     kind: ClassVar[NodeKind]
@@ -57,14 +57,14 @@ class Designator(Composable, ABC):
         if "resources" in own.get("__annotations__", ()) or not callable(own.get("resources", len)):
             raise ResourcesNotAMethod(cls.__qualname__)
         initialise = own.get("__init__")
-        if inspect.isfunction(initialise) and "__dataclass_fields__" not in own and not _is_ours(cls):
-            cls.__init__ = keeping_arguments(initialise)  # type: ignore[method-assign]  # as `perform` below
+        if inspect.isfunction(initialise) and "__dataclass_fields__" not in own and not _is_built_in(cls):
+            cls.__init__ = record_arguments(initialise)  # type: ignore[method-assign]  # as `perform` below
         perform = own.get("perform")
-        if perform is None or is_node(perform):  # dataclass(slots=True) makes the class anew, hook and all
+        if perform is None or is_wrapped(perform):  # dataclass(slots=True) copies a class whose `perform` is wrapped
             return
         if not inspect.iscoroutinefunction(perform):
             raise PerformNotAsync(cls.__qualname__)
-        cls.perform = as_node(perform)  # type: ignore[assignment]  # the hook takes the place of the method
+        cls.perform = wrap_perform(perform)  # type: ignore[assignment]  # the wrapper replaces the method
 
     @classmethod
     def _name_in_memory(cls) -> str:
@@ -72,34 +72,34 @@ class Designator(Composable, ABC):
 
     @abstractmethod
     async def perform(self) -> Any:
-        """Do it; return when it is done. Raises a `PlanFailure` when it cannot be done."""
+        """Perform the designator and return when it has ended. Raises a `PlanFailure` if it fails."""
 
     def resources(self) -> frozenset[Resource]:
-        """The parts of the robot it needs for itself from its start to its end; those of its parts are their affair."""
+        """Return the parts of the robot it uses exclusively from start to end; nested designators declare their own."""
         return NOTHING
 
 
-def _is_ours(designator: type) -> bool:
+def _is_built_in(designator: type) -> bool:
     return designator.__module__.startswith("pycrorm_async.")
 
 
 class ActionAbstract(Designator):
-    """An action: something a plan wants done, by motions and other actions."""
+    """A goal of a plan, achieved by performing motions and other actions."""
 
     kind: ClassVar[NodeKind] = "action"
 
     @classmethod
     def _name_in_memory(cls) -> str:
-        """`FaceAtPerformable` and `FaceAtActionPerformable` are both `FaceAtAction`."""
+        """Derive the name: both `FaceAtPerformable` and `FaceAtActionPerformable` give `FaceAtAction`."""
         stem = cls.__name__.removesuffix("Performable")
         return stem if stem.endswith("Action") else f"{stem}Action"
 
 
 class BaseMotion(Designator):
-    """A motion: something a robot's controllers do at once. Its fields are checked when it is built.
+    """A single command to a robot's controllers. Its fields are checked when it is built.
 
     Raises:
-        ResolutionError: naming the fields that are missing or of another type than declared.
+        ResolutionError: names the fields that are missing or have another type than declared.
     """
 
     kind: ClassVar[NodeKind] = "motion"

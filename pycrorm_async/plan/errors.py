@@ -1,4 +1,4 @@
-"""What a plan's author did wrong; what goes wrong in a plan is in `pycrorm_async.plan.failures`."""
+"""Errors of a plan's author; failures of a running plan are in `pycrorm_async.plan.failures`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = [
 
 
 class PerformNotAsync(CallerError, TypeError):
-    """A designator class declares another `perform` than `async def perform(self)`."""
+    """A designator class declares a `perform` that is not `async def perform(self)`."""
 
     def __init__(self, designator: str) -> None:
         super().__init__(f"{designator}.perform must be declared as `async def perform(self)`")
@@ -25,7 +25,7 @@ class PerformNotAsync(CallerError, TypeError):
 
 
 class ResourcesNotAMethod(CallerError, TypeError):
-    """A designator class has `resources` that cannot be asked: a field, or a value."""
+    """A designator class declares `resources` as a field or value and not as a method."""
 
     def __init__(self, designator: str) -> None:
         super().__init__(
@@ -35,7 +35,7 @@ class ResourcesNotAMethod(CallerError, TypeError):
 
 
 class NotResolved(CallerError, AttributeError):
-    """A description is used as what it describes: `.resolve()` is missing."""
+    """A description is used where a resolved designator is needed: `.resolve()` is missing."""
 
     def __init__(self, description: str, name: str) -> None:
         super().__init__(
@@ -46,11 +46,11 @@ class NotResolved(CallerError, AttributeError):
 
 
 class ResolutionError(CallerError):
-    """A designator was built from values that cannot be its properties.
+    """The arguments of a designator do not fit its declared properties.
 
     Attributes:
-        designator: the class' name.
-        missing: properties that are None and may not be.
+        designator: the class name.
+        missing: properties that are None and must not be.
         wrong: properties of another type than declared, each as "name: expected …, got …".
     """
 
@@ -67,7 +67,7 @@ class ResolutionError(CallerError):
 
 
 class NoRobotChosen(CallerError):
-    """A motion was performed and nothing says which robot moves."""
+    """A motion was performed in a context without a chosen robot."""
 
     def __init__(self, motion: str) -> None:
         super().__init__(f"{motion} moves a robot: perform it inside `with simulated_robot:`")
@@ -75,4 +75,4 @@ class NoRobotChosen(CallerError):
 
 
 class NoRobotHere(CallerError):
-    """The call needs a robot of a kind that is known here, and finds none."""
+    """The call needs a robot that has a robot description, and there is none."""

@@ -1,7 +1,7 @@
-"""What a location designator asks of a memory: where the robot stood when things went well before.
+"""Port through which location designators query a memory for past successful pick-ups.
 
-`experience` is that of this context: the one of the memory that is open, or None. The plan layer knows nothing
-of where it comes from.
+`experience` is the experience of the current context: that of the open memory, or None. The plan layer does not depend
+on its implementation.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ __all__ = ["Experience", "PastSuccess", "experience"]
 
 @dataclass(frozen=True, slots=True)
 class PastSuccess:
-    """How an object was picked up once, or several times in the same way.
+    """One way in which an object was picked up successfully.
 
     Attributes:
         torso_height: m; None for a robot without a torso.
-        stand: where the robot's base was, in the object's own frame.
-        score: how well that way of doing it went, failures counted: between 0 and 1.
-        times: how often it went well in exactly this way.
+        stand: pose of the robot's base in the object's own frame.
+        score: rating that also counts the failures of this way, between 0 and 1.
+        times: number of successes with exactly these values.
     """
 
     arm: Arms
@@ -37,10 +37,10 @@ class PastSuccess:
 
 
 class Experience(Protocol):
-    """Knows what went well."""
+    """A source of past successes."""
 
     async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
-        """The ways in which objects of that type were picked up, the best first; with this arm, or any."""
+        """Return successful pick-ups of objects of that type, best first; `arm` None means any arm."""
         ...
 
 

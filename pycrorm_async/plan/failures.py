@@ -1,7 +1,8 @@
-"""How plans fail: `PlanFailure` and its kinds, the vocabulary of the CRAM family of robot plans.
+"""Define `PlanFailure` and its kinds, the failure vocabulary of the CRAM family of robot plans.
 
-A plan failure is an outcome, not a fault: it is recorded with its class, message and arguments, and plans
-catch it to try something else. It is therefore no `PycrormError`.
+A plan failure is an outcome and not a fault: it is recorded with its class, message and arguments, and plans catch it
+to try an alternative. Therefore it is not a `PycrormError`. Recorded events contain the module paths of the classes, so
+the classes must stay in this module.
 
 >>> raise ObjectUnreachable("cereal is out of reach", "cereal", 1.7)
 Traceback (most recent call last):
@@ -21,7 +22,7 @@ __all__ = [
     "PlanFailure",
     "PlanFailures",
     "is_plan_failure",
-    "in_words",
+    "describe_error",
     "IKError",
     "ResourceDeadlock",
     "NotALanguageExpression",
@@ -86,8 +87,8 @@ class PlanFailure(Exception):
     """A plan, action or motion did not succeed.
 
     Attributes:
-        message: for people; also `str(failure)`.
-        data: further values, as they were given; recorded with the message.
+        message: human-readable; also `str(failure)`.
+        data: the further arguments, unchanged; recorded with the message.
     """
 
     def __init__(self, message: str = "", *data: object) -> None:
@@ -103,33 +104,33 @@ class PlanFailure(Exception):
 
 
 class PlanFailures(PlanFailure, ExceptionGroup[Exception]):
-    """Several plan failures that happened in one expression: `except PlanFailure` and `except* IKError` both work.
+    """Several plan failures of one expression: `except PlanFailure` and `except* IKError` both catch it.
 
     Args:
-        message: for people; names each.
-        failures: plan failures, or groups of nothing else.
+        message: human-readable; names each failure.
+        failures: plan failures, or groups of plan failures only.
     """
 
     def __new__(cls, message: str, failures: Sequence[Exception]) -> Self:
         return super().__new__(cls, message, failures)
 
     def __init__(self, message: str, failures: Sequence[Exception]) -> None:
-        # Not that of `PlanFailure`: a group has its message already.
+        # `PlanFailure.__init__` would set `message`, which is read-only in a group.
         Exception.__init__(self, message, failures)
 
     @property
     def data(self) -> tuple[object, ...]:
-        """The failures."""
+        """The contained failures."""
         return self.exceptions
 
     def derive(self, failures: Sequence[Exception], /) -> PlanFailures:  # type: ignore[override]  # as documented
         return PlanFailures(self.message, failures)
 
 
-def in_words(error: BaseException) -> str:
-    """Class and message in one short line. Never raises.
+def describe_error(error: BaseException) -> str:
+    """Describe an exception by class and message in one short line. Never raises.
 
-    >>> in_words(ObjectLost("the gripper is empty"))
+    >>> describe_error(ObjectLost("the gripper is empty"))
     'ObjectLost: the gripper is empty'
     """
     name = type(error).__name__
@@ -137,28 +138,29 @@ def in_words(error: BaseException) -> str:
         message = " ".join(str(error).split())
     except Exception:  # noqa: BLE001  a user's __str__ may raise anything
         return name
-    if len(message) > _WORDS_LENGTH_MAX:
-        message = f"{message[: _WORDS_LENGTH_MAX - 1]}…"
+    if len(message) > _DESCRIPTION_LENGTH_MAX:
+        message = f"{message[: _DESCRIPTION_LENGTH_MAX - 1]}…"
     return f"{name}: {message}" if message else name
 
 
-_WORDS_LENGTH_MAX = 200
+_DESCRIPTION_LENGTH_MAX = 200
 
 
 def is_plan_failure(error: BaseException) -> bool:
-    """Whether it says that a plan failed: a plan failure, or a group of nothing else (what a `TaskGroup` raises)."""
+    """Return whether it is a plan failure, or a group of plan failures only (as a `TaskGroup` raises)."""
     if isinstance(error, ExceptionGroup):
         return all(map(is_plan_failure, error.exceptions))
     return isinstance(error, PlanFailure)
 
 
 class IKError(PlanFailure):
-    """The arm cannot bring its tool frame to the pose from where the base stands.
+    """The arm cannot bring its tool frame to the pose from the current pose of the base.
 
     Attributes:
         pose: the goal of the tool frame, in the map.
-        arm: the arm that was asked.
-        tip_frame: the link that should have got there.
+        arm: the arm that should reach it.
+        tip_frame: the link of the tool frame.
+        reason: the cause that inverse kinematics reports.
     """
 
     def __init__(self, pose: Pose, arm: Arms, tip_frame: str, reason: str = "") -> None:
@@ -174,18 +176,18 @@ class IKError(PlanFailure):
 
 
 class ResourceDeadlock(PlanFailure):
-    """A part of the robot can never be had: who holds it waits, in the end, for the one that wants it.
+    """A wait for a part of the robot would never end, because its holder waits for an ancestor of the waiting node.
 
     Attributes:
         resource: the part.
-        held_by, wanted_by: the designators' types.
-        waits_for: the type of the one around `wanted_by` that cannot end before.
+        held_by, wanted_by: the dtypes of the designators that hold it and wait for it.
+        waits_for: the dtype of the ancestor of `wanted_by` for which `held_by` waits.
     """
 
     def __init__(self, resource: Resource, held_by: str, wanted_by: str, waits_for: str) -> None:
         super().__init__(
-            f"{wanted_by} would wait for {resource.name} for ever: {held_by} holds it and waits, in the end, for"
-            f" {waits_for}, which {wanted_by} is part of"
+            f"{wanted_by} would wait forever for {resource.name}: {held_by} holds it and waits, directly or"
+            f" indirectly, for {waits_for}, which contains {wanted_by}"
         )
         self.args = (resource, held_by, wanted_by, waits_for)
         self.resource = resource
@@ -194,11 +196,11 @@ class ResourceDeadlock(PlanFailure):
         self.waits_for = waits_for
 
 
-# --- diagnoses: what the plan can be told went wrong --------------------------------------------------------
+# --- diagnoses ----------------------------------------------------------------------------------------------
 
 
 class NotALanguageExpression(PlanFailure):
-    """An operand of a plan expression is none."""
+    """An operand of a plan expression is not performable."""
 
 
 class FailureDiagnosis(PlanFailure):
@@ -209,7 +211,7 @@ class FailureDiagnosis(PlanFailure):
 
 
 class LowLevelFailure(FailureDiagnosis):
-    """A single motion or perception went wrong."""
+    """A single motion or perception failed."""
 
 
 class ActionlibActionTimeout(LowLevelFailure):
@@ -217,11 +219,11 @@ class ActionlibActionTimeout(LowLevelFailure):
 
 
 class ManipulationLowLevelFailure(LowLevelFailure):
-    """An arm did not do what it was told."""
+    """An arm did not execute its command."""
 
 
 class EnvironmentManipulationGoalNotReached(ManipulationLowLevelFailure):
-    """A door or drawer did not get where it should."""
+    """A door or drawer did not reach its goal."""
 
 
 class ManipulationGoalNotReached(ManipulationLowLevelFailure):
@@ -233,11 +235,11 @@ class ManipulationPoseUnreachable(ManipulationLowLevelFailure):
 
 
 class GripperLowLevelFailure(LowLevelFailure):
-    """A gripper did not do what it was told."""
+    """A gripper did not execute its command."""
 
 
 class GripperClosedCompletely(GripperLowLevelFailure):
-    """The gripper closed on nothing."""
+    """The gripper closed without an object between its fingers."""
 
 
 class GripperGoalNotReached(GripperLowLevelFailure):
@@ -245,7 +247,7 @@ class GripperGoalNotReached(GripperLowLevelFailure):
 
 
 class NavigationLowLevelFailure(LowLevelFailure):
-    """The base did not do what it was told."""
+    """The base did not execute its command."""
 
 
 class NavigationGoalNotReached(NavigationLowLevelFailure):
@@ -257,19 +259,19 @@ class NavigationPoseUnreachable(NavigationLowLevelFailure):
 
 
 class PerceptionLowLevelFailure(LowLevelFailure):
-    """Perception gave nothing that can be used."""
+    """Perception returned no usable result."""
 
 
 class PerceptionObjectNotFound(PerceptionLowLevelFailure):
-    """The object was not seen."""
+    """The object was not perceived."""
 
 
 class PerceptionObjectNotInWorld(PerceptionLowLevelFailure):
-    """The object that is meant is not in the world."""
+    """The designated object is not in the world."""
 
 
 class TorsoLowLevelFailure(LowLevelFailure):
-    """The torso did not do what it was told."""
+    """The torso did not execute its command."""
 
 
 class TorsoGoalNotReached(TorsoLowLevelFailure):
@@ -277,14 +279,14 @@ class TorsoGoalNotReached(TorsoLowLevelFailure):
 
 
 class TorsoGoalUnreachable(TorsoLowLevelFailure):
-    """The torso cannot get to that height."""
+    """The torso cannot reach that height."""
 
 
 # --- high level: a whole action -----------------------------------------------------------------------------
 
 
 class HighLevelFailure(FailureDiagnosis):
-    """An action as a whole went wrong."""
+    """An action as a whole failed."""
 
 
 class DeliveringFailed(HighLevelFailure):
@@ -304,69 +306,69 @@ class FetchingFailed(HighLevelFailure):
 
 
 class LookingHighLevelFailure(HighLevelFailure):
-    """There is no place to see it from."""
+    """No place offers a view of the target."""
 
 
 class ManipulationGoalInCollision(HighLevelFailure):
-    """Something is in the way of the gripper's goal."""
+    """The arm or gripper would be in collision at its goal."""
 
 
 class NavigationHighLevelFailure(HighLevelFailure):
-    """Going there failed."""
+    """The robot could not navigate to the goal."""
 
 
 class NavigationGoalInCollision(NavigationHighLevelFailure):
-    """Something stands where the base should."""
+    """The base would be in collision at its goal."""
 
 
 class ObjectNowhereToBeFound(HighLevelFailure):
-    """The object was looked for everywhere."""
+    """The object was not in any of the searched places."""
 
 
 class ObjectUndeliverable(HighLevelFailure):
-    """There is no way to deliver the object."""
+    """The object cannot be delivered."""
 
 
 class ObjectUnfetchable(HighLevelFailure):
-    """There is no way to fetch the object."""
+    """The object cannot be fetched."""
 
 
 class ObjectUnreachable(HighLevelFailure):
-    """No place to stand lets an arm reach the object."""
+    """No base pose lets an arm reach the object."""
 
 
 class SearchingFailed(HighLevelFailure):
     """The search ended without the object."""
 
 
-# --- what the robot tried to do -----------------------------------------------------------------------------
+# --- tasks --------------------------------------------------------------------------------------------------
 
 
 class Task(PlanFailure):
-    """A task could not be done."""
+    """A task failed."""
 
 
 class Grasping(Task):
-    """Grasping could not be done."""
+    """Grasping failed."""
 
 
 class Looking(Task):
-    """Looking could not be done."""
+    """Looking failed."""
 
 
 # --- capabilities and states --------------------------------------------------------------------------------
 
 
 class ObjectPoseMisestimation(PlanFailure):
-    """The object is not where it was believed to be."""
+    """The object is not at its assumed pose."""
 
 
 class SuccessfulCompletion(PlanFailure):
-    """Raised to leave a plan early, its goal reached."""
+    """The plan ends early because its goal is reached."""
 
 
 class ObjectNotFound(PlanFailure):
-    """No object answers the description."""
+    """No object matches the description."""
 
 
 class LocomotorFailure(PlanFailure):
@@ -386,15 +388,15 @@ class SensorFailure(PlanFailure):
 
 
 class IllPosedGoalFailure(PlanFailure):
-    """What was asked for leaves nothing that could be done."""
+    """The goal is contradictory or incomplete, so no execution could achieve it."""
 
 
 class CapabilityAbsenceFailure(PlanFailure):
-    """This robot cannot do it."""
+    """The robot lacks the capability."""
 
 
 class ReachabilityFailure(PlanFailure):
-    """No place to stand lets an arm reach the pose."""
+    """No base pose lets an arm reach the pose."""
 
 
 class TorsoFailure(PlanFailure):
@@ -406,19 +408,19 @@ class ConfigurationNotReached(PlanFailure):
 
 
 class Timeout(PlanFailure):
-    """It took longer than it may."""
+    """The time limit was exceeded."""
 
 
 class EndEffectorFailure(PlanFailure):
-    """A gripper is out of order."""
+    """A gripper is out of order or occupied."""
 
 
 class ObjectUnavailable(PlanFailure):
-    """The object cannot be used now."""
+    """The object or surface cannot be used at present."""
 
 
 class SustainedFailure(PlanFailure):
-    """It keeps failing."""
+    """The failure persists over repeated tries."""
 
 
 class ReasoningError(PlanFailure):
@@ -426,4 +428,4 @@ class ReasoningError(PlanFailure):
 
 
 class CollisionError(PlanFailure):
-    """Something was touched that should not be."""
+    """The robot collided with an object."""

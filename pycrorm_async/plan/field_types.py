@@ -1,8 +1,7 @@
-"""Are the fields of a designator of the types it declares? Checked when a motion or a built-in action is built.
+"""Check the fields of a designator against their annotations when a motion or a built-in action is built.
 
-What does not fit is refused by name. A field may hold what its annotation names: classes, unions, None where
-it is in the union; of a list or dict also the items. Whole numbers are fine where a float is declared; an
-annotation that cannot be read (a class that is local to a function) is not checked.
+Classes, unions and None in a union are checked, and the items of lists and dicts. An int is accepted where a float is
+declared. An annotation that cannot be evaluated, such as a class local to a function, is not checked.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ Check = Callable[[Any], bool]
 
 
 def check_properties(designator: object) -> None:
-    """Raise `ResolutionError` naming what is missing and what is wrong."""
+    """Raise `ResolutionError` that names the missing fields and the fields of a wrong type."""
     missing: list[str] = []
     wrong: list[str] = []
     kind: Any = type(designator)  # mypy takes a bare type for unhashable
@@ -40,7 +39,7 @@ def check_properties(designator: object) -> None:
 
 @functools.lru_cache(maxsize=1024)
 def _checks(designator: type) -> tuple[tuple[str, str, bool, Check], ...]:
-    """For each field its name, its type in words, whether None will do, and the check."""
+    """Return for each field its name, its type's name, whether None is allowed, and the check."""
     try:
         hints = typing.get_type_hints(designator)
     except NameError:
@@ -49,7 +48,7 @@ def _checks(designator: type) -> tuple[tuple[str, str, bool, Check], ...]:
     for field in fields(designator):
         hint = hints[field.name]
         optional = hint is Any or type(None) in (hint, *typing.get_args(hint))
-        checks.append((field.name, _in_words(hint), optional, _check(hint)))
+        checks.append((field.name, _type_name(hint), optional, _check(hint)))
     return tuple(checks)
 
 
@@ -64,7 +63,7 @@ def _check(hint: Any) -> Check:
     if isinstance(origin, type) and issubclass(origin, Mapping) and arguments:
         key, item = map(_check, arguments)
         return lambda value: isinstance(value, origin) and all(map(key, value)) and all(map(item, value.values()))
-    if getattr(hint, "_is_protocol", False):  # what has its methods fits, and shows it when it is asked
+    if getattr(hint, "_is_protocol", False):  # structural: a missing method shows when it is called
         return lambda _: True
     if hint is float:
         return lambda value: isinstance(value, numbers.Real) and not isinstance(value, bool)
@@ -72,14 +71,14 @@ def _check(hint: Any) -> Check:
     return (lambda value: isinstance(value, kind)) if isinstance(kind, type) else (lambda _: True)
 
 
-def _in_words(hint: Any) -> str:
+def _type_name(hint: Any) -> str:
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return " | ".join("None" if each is type(None) else _in_words(each) for each in typing.get_args(hint))
+        return " | ".join("None" if each is type(None) else _type_name(each) for each in typing.get_args(hint))
     return hint.__name__ if isinstance(hint, type) and not typing.get_args(hint) else str(hint)
 
 
 def _advice(value: Any) -> str:
-    """What to do with a value that stands for another one."""
+    """Return a hint for values that can be converted to the expected one."""
     if hasattr(value, "pose"):
         return " (its pose is `.pose`)"
     return " (call its .resolve() first)" if hasattr(value, "resolve") else ""

@@ -1,11 +1,11 @@
-"""How a plan names objects: a description finds them in the world, a designator stands for one of them.
+"""Designate objects in plans: a description selects objects of the world, a designator refers to one of them.
 
-Wherever a designator is wanted, the world's own `Object` will do as well. Five classes tell apart what is
-meant: `Object` and `ObjectDesignator` one of the world, `ObjectPart` a link of one, `LocatedObject` one whose
-place was told relative to another, `BelieveObject` one that nobody has seen.
+Every function that takes a designator also takes the world's own `Object`. There are five classes: `Object` and
+`ObjectDesignator` refer to an object of the world, `ObjectPart` to a link of one, `LocatedObject` to an object whose
+pose is specified relative to another, `BelieveObject` to an object that has not been perceived.
 
-What is meant is the object of the world that the plan acts in: in a copy of the world (`plan.thinking`) a
-designator stands for the copy of its object, and one that was made there for the real one again outside.
+A designator refers to the object in the plan's current world: in a simulation (`execution.simulation`) to the copy of
+its object, and outside it to the original again, also if the designator was created inside.
 
 >>> ObjectDesignatorDescription(names=["milk"]).resolve().pose
 Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
@@ -19,7 +19,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.plan.current_robot import world_here
+from pycrorm_async.plan.current_robot import require_world
 from pycrorm_async.plan.errors import NotResolved, ResolutionError
 from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWorld
 from pycrorm_async.world.enums import ObjectType
@@ -41,7 +41,7 @@ __all__ = [
     "ObjectLike",
     "designator_of",
     "in_world",
-    "place_of",
+    "pose_of",
 ]
 
 
@@ -50,11 +50,11 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class ObjectDesignator:
-    """An object of the world, as a plan means it.
+    """A reference to an object of the world.
 
     Attributes:
-        world_object: the object itself; None in a copy of how it was.
-        frozen_pose: where it was, in such a copy.
+        world_object: the object itself; None in a frozen copy.
+        frozen_pose: the pose at the moment of the frozen copy.
     """
 
     name: str
@@ -71,19 +71,19 @@ class ObjectDesignator:
 
     @property
     def pose(self) -> Pose:
-        """Where it is now; in a frozen copy, where it was."""
+        """The current pose; in a frozen copy, the pose at that moment."""
         if self.frozen_pose is not None:
             return self.frozen_pose
         assert self.world_object is not None
-        return _meant_here(self.world_object).pose
+        return _in_current_world(self.world_object).pose
 
     def frozen_copy(self) -> ObjectDesignator:
-        """The object as it is now, whatever becomes of it."""
+        """Return a copy that keeps the object's current pose."""
         return ObjectDesignator(self.name, self.object_type, None, self.pose)
 
 
 class BelieveObject(ObjectDesignator):
-    """An object that is believed to be somewhere and is not in the world."""
+    """An object with an assumed pose that is not in the world."""
 
     def __init__(self, name: str, object_type: ObjectType, pose: Pose) -> None:
         super().__init__(name, object_type, None, pose)
@@ -98,7 +98,7 @@ class ObjectPart(ObjectDesignator):
 
     Attributes:
         name: the link's name.
-        part_of: the whole.
+        part_of: the object that has the link.
     """
 
     part_of: ObjectDesignator = field(kw_only=True)
@@ -120,7 +120,7 @@ class ObjectPart(ObjectDesignator):
 
     @property
     def pose(self) -> Pose:
-        """Where the link is now; in a frozen copy, where it was. Raises `UnknownLink`."""
+        """The link's current pose; in a frozen copy, the pose at that moment. Raises `UnknownLink`."""
         if self.frozen_pose is not None:
             return self.frozen_pose
         return in_world(self.part_of).link_pose(self.name)
@@ -131,19 +131,19 @@ class ObjectPart(ObjectDesignator):
 
 @dataclass(frozen=True, init=False)
 class LocatedObject(ObjectDesignator):
-    """An object whose place was told, at a moment, relative to another: "the milk is 20 cm left of the cereal".
+    """An object whose pose was specified, at a moment, relative to another: "the milk is 20 cm left of the cereal".
 
-    Its pose is in the map and goes along with the reference; the pose's time is the moment it was told.
+    Its pose is in the map and follows the reference; the pose's time is the moment of the specification.
 
     >>> cereal = ObjectDesignatorDescription(names=["cereal"]).resolve()
     >>> LocatedObject("milk", ObjectType.MILK, Pose([0, 0.2, 0]), cereal).pose.position
     Vector(x=1.3, y=0.9, z=0.95)
 
     Attributes:
-        relative_pose: where it is as seen from the reference (m), whatever frame the pose names.
+        relative_pose: the pose relative to the reference (m); its frame's name is ignored.
         reference: another object, or a part of one.
-        timestamp: when it was told, with a time zone; now, if left out.
-        world_object: the object itself, if it is in the world; it may be elsewhere than it was told to be.
+        timestamp: the moment of the specification, with a time zone; None means now.
+        world_object: the object itself, if it is in the world; its real pose may differ.
     """
 
     relative_pose: Pose = field(kw_only=True)
@@ -160,7 +160,7 @@ class LocatedObject(ObjectDesignator):
         world_object: Object | None = None,
         frozen_pose: Pose | None = None,
     ) -> None:
-        told = timestamp if timestamp is not None else _moment(SYSTEM_CLOCK.wall_ns())
+        moment = timestamp if timestamp is not None else _moment(SYSTEM_CLOCK.wall_ns())
         put = object.__setattr__
         put(self, "name", name)
         put(self, "object_type", object_type)
@@ -168,18 +168,18 @@ class LocatedObject(ObjectDesignator):
         put(self, "frozen_pose", frozen_pose)
         put(self, "relative_pose", relative_pose)
         put(self, "reference", designator_of(reference))
-        put(self, "timestamp", told)
+        put(self, "timestamp", moment)
         _check(self, name=str, object_type=ObjectType, relative_pose=Pose, timestamp=datetime)
-        if told.tzinfo is None:
+        if moment.tzinfo is None:
             raise ResolutionError(type(self).__name__, wrong=["timestamp: expected a datetime with a time zone"])
 
     @property
     def pose(self) -> Pose:
-        """Where it is if it is where it was told to be; in a frozen copy, where that was."""
+        """The specified pose in the map; in a frozen copy, the pose at that moment."""
         if self.frozen_pose is not None:
             return self.frozen_pose
-        there = self.reference.pose @ self.relative_pose
-        return Pose(there.position, there.orientation, there.frame, _nanoseconds(self.timestamp))
+        pose = self.reference.pose @ self.relative_pose
+        return Pose(pose.position, pose.orientation, pose.frame, _nanoseconds(self.timestamp))
 
     def frozen_copy(self) -> LocatedObject:
         return LocatedObject(
@@ -193,31 +193,31 @@ class LocatedObject(ObjectDesignator):
 
 
 class ObjectDesignatorDescription:
-    """Describes objects by name or type; iterating it gives a designator for each that is in the world now.
+    """Describes objects by name or type; iterating yields a designator for each match that is in the world now.
 
     Args:
-        names: any of these names, or one; the order is one of preference.
-        types: any of these types, or one.
+        names: one name, or several in the order of preference.
+        types: one type, or several.
 
-    With names the order is theirs, without that of the world. Raises `ResolutionError` for names and types that
-    are none.
+    The order is that of the names, without names that of the world. Raises `ResolutionError` for names that are not
+    str and types that are not `ObjectType`.
     """
 
     def __init__(
         self, names: str | Iterable[str] | None = None, types: ObjectType | Iterable[ObjectType] | None = None
     ) -> None:
-        self.names = _all_of("names", str, names)
-        self.types = _all_of("types", ObjectType, types)
+        self.names = _as_tuple("names", str, names)
+        self.types = _as_tuple("types", ObjectType, types)
 
     def __iter__(self) -> Iterator[ObjectDesignator]:
-        there = [each for each in world_here().objects if self.types is None or each.object_type in self.types]
+        matches = [each for each in require_world().objects if self.types is None or each.object_type in self.types]
         if self.names is not None:
-            by_name = {each.name: each for each in there}
-            there = [by_name[name] for name in dict.fromkeys(self.names) if name in by_name]
-        for each in there:
+            by_name = {each.name: each for each in matches}
+            matches = [by_name[name] for name in dict.fromkeys(self.names) if name in by_name]
+        for each in matches:
             yield designator_of(each)
 
-    if not TYPE_CHECKING:  # a type checker finds the fault by itself
+    if not TYPE_CHECKING:  # hidden from type checkers, which report the fault themselves
 
         def __getattr__(self, name: str) -> NoReturn:
             if name in ("name", "object_type", "pose", "world_object"):
@@ -225,11 +225,11 @@ class ObjectDesignatorDescription:
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def resolve(self) -> ObjectDesignator:
-        """The first that fits. Raises `ObjectNotFound`."""
+        """Return the first match. Raises `ObjectNotFound`."""
         for designator in self:
             return designator
-        there = ", ".join(each.name for each in world_here().objects) or "nothing"
-        raise ObjectNotFound(f"no object is {self}; in the world: {there}", self.names, self._type_names())
+        present = ", ".join(each.name for each in require_world().objects) or "nothing"
+        raise ObjectNotFound(f"no object is {self}; in the world: {present}", self.names, self._type_names())
 
     def __str__(self) -> str:
         parts = []
@@ -237,30 +237,31 @@ class ObjectDesignatorDescription:
             parts.append(f"named {' or '.join(self.names)}")
         if self.types is not None:
             parts.append(f"of type {' or '.join(self._type_names() or ())}")
-        return " and ".join(parts) or "there"
+        return " and ".join(parts) or "in the world"
 
     def _type_names(self) -> tuple[str, ...] | None:
         return tuple(each.name for each in self.types) if self.types is not None else None
 
 
-def _all_of(name: str, kind: type[T], given: T | Iterable[T] | None) -> tuple[T, ...] | None:
-    if given is None:
+def _as_tuple(name: str, kind: type[T], values: T | Iterable[T] | None) -> tuple[T, ...] | None:
+    if values is None:
         return None
-    every: tuple[Any, ...] = tuple(given) if isinstance(given, Iterable) and not isinstance(given, kind) else (given,)
-    if wrong := [each for each in every if not isinstance(each, kind)]:
-        listed = f"{name}: expected each {kind.__name__}, got {wrong[0]!r}"
-        raise ResolutionError(ObjectDesignatorDescription.__name__, wrong=[listed])
-    return every
+    items: tuple[Any, ...]
+    items = tuple(values) if isinstance(values, Iterable) and not isinstance(values, kind) else (values,)
+    if wrong := [each for each in items if not isinstance(each, kind)]:
+        fault = f"{name}: expected each {kind.__name__}, got {wrong[0]!r}"
+        raise ResolutionError(ObjectDesignatorDescription.__name__, wrong=[fault])
+    return items
 
 
 class LocatedObjectDescription(ObjectDesignatorDescription):
-    """Describes objects as an `ObjectDesignatorDescription` does, and tells where each is relative to others.
+    """Describes objects as `ObjectDesignatorDescription` does, and locates each relative to reference objects.
 
     Args:
-        references: alternatives for what the place is told relative to.
-        names, types: any of these, or one.
+        references: alternatives for the reference.
+        names, types: one, or several.
 
-    Iterating it gives each object with each reference (never with itself), as they stand at that moment.
+    Iterating yields each object with each reference other than itself, at their current poses.
     """
 
     def __init__(
@@ -273,17 +274,17 @@ class LocatedObjectDescription(ObjectDesignatorDescription):
         self.references = tuple(designator_of(each) for each in references)
 
     def __iter__(self) -> Iterator[LocatedObject]:
-        for found in super().__iter__():
+        for match in super().__iter__():
             for reference in self.references:
                 other = reference.world_object
-                if other is None or _meant_here(other) is not found.world_object:
-                    relative = found.pose.relative_to(reference.pose)
+                if other is None or _in_current_world(other) is not match.world_object:
+                    relative = match.pose.relative_to(reference.pose)
                     yield LocatedObject(
-                        found.name, found.object_type, relative, reference, world_object=found.world_object
+                        match.name, match.object_type, relative, reference, world_object=match.world_object
                     )
 
     def resolve(self) -> LocatedObject:
-        """The first that fits. Raises `ObjectNotFound`."""
+        """Return the first match. Raises `ObjectNotFound`."""
         first = super().resolve()
         assert isinstance(first, LocatedObject)
         return first
@@ -294,59 +295,62 @@ class LocatedObjectDescription(ObjectDesignatorDescription):
 
 
 ObjectLike: TypeAlias = Object | ObjectDesignator
-"""What stands for an object."""
+"""An object of the world, or a designator of one."""
 
 
-def designator_of(meant: ObjectLike) -> ObjectDesignator:
-    """The designator of a world object; a designator is its own. Raises `ResolutionError` for anything else."""
-    if isinstance(meant, ObjectDesignator):
-        return meant
-    if not isinstance(meant, Object):
-        raise ResolutionError("ObjectDesignator", wrong=[f"expected an object or its designator, got {meant!r}"])
-    return ObjectDesignator(meant.name, meant.object_type, meant)
+def designator_of(target: ObjectLike) -> ObjectDesignator:
+    """Return the designator of a world object, or the designator itself. Raises `ResolutionError` for other values."""
+    if isinstance(target, ObjectDesignator):
+        return target
+    if not isinstance(target, Object):
+        raise ResolutionError("ObjectDesignator", wrong=[f"expected an object or its designator, got {target!r}"])
+    return ObjectDesignator(target.name, target.object_type, target)
 
 
-def place_of(meant: ObjectLike) -> Pose:
-    """Where it is, is believed or was told to be.
+def pose_of(target: ObjectLike) -> Pose:
+    """Return the object's current, assumed or specified pose.
 
     Raises:
-        PerceptionObjectNotInWorld: it was in the world and is there no more.
+        PerceptionObjectNotInWorld: the object was removed from the world.
     """
-    designator = designator_of(meant)
+    designator = designator_of(target)
     if designator.world_object is not None:
         in_world(designator)
     return designator.pose
 
 
-def in_world(meant: ObjectLike) -> Object:
-    """The world object that is meant, in the world of this context if that is its own, a copy of it or its original.
+def in_world(target: ObjectLike) -> Object:
+    """Return the world object that `target` refers to, in the current world if the object's world is related to it.
+
+    Two worlds are related if one is a copy of the other, or both are copies of one.
 
     Raises:
-        PerceptionObjectNotInWorld: there is none, it was removed, or it is only in a copy.
+        PerceptionObjectNotInWorld: the designator has no world object, the object was removed, or it exists in a copy
+            only.
     """
-    thing = meant.world_object if isinstance(meant, ObjectDesignator) else meant
-    found = counterpart(thing, _world_of(thing)) if thing is not None else None
-    if found is None:
-        raise PerceptionObjectNotInWorld(f"{meant.name} is not an object of the world", meant.name)
-    return found
+    obj = target.world_object if isinstance(target, ObjectDesignator) else target
+    match = counterpart(obj, _current_world_of(obj)) if obj is not None else None
+    if match is None:
+        raise PerceptionObjectNotInWorld(f"{target.name} is not an object of the world", target.name)
+    return match
 
 
-def _meant_here(thing: Object) -> Object:
-    """As `in_world`; one that is not there itself, whose last pose can still be read."""
-    world = _world_of(thing)
-    return thing if thing.world is world else counterpart(thing, world) or thing
+def _in_current_world(obj: Object) -> Object:
+    """Return the object's counterpart in the current world, or the object itself, whose last pose can be read."""
+    world = _current_world_of(obj)
+    return obj if obj.world is world else counterpart(obj, world) or obj
 
 
-def _world_of(thing: Object) -> BulletWorld:
-    """The one of this context, unless the object's has nothing to do with it."""
-    here = current_world.get()
-    if here is None:
-        return original(thing.world)
-    return here if related(here, thing.world) else thing.world
+def _current_world_of(obj: Object) -> BulletWorld:
+    """Return the world of this context if it is related to the object's, otherwise the object's world."""
+    world = current_world.get()
+    if world is None:
+        return original(obj.world)
+    return world if related(world, obj.world) else obj.world
 
 
 def _check(designator: ObjectDesignator, **expected: type) -> None:
-    """Raise `ResolutionError` naming the fields that are something else."""
+    """Raise `ResolutionError` that names the fields of another type."""
     wrong = [
         f"{name}: expected {kind.__name__}, got {value!r}"
         for name, kind in expected.items()

@@ -1,9 +1,8 @@
-"""A node of the task tree: one `perform`, from its start to its end, with the node it ran inside.
+"""Nodes of the task tree: one node for each `perform`, from its start to its end.
 
-Nodes know their parent and not their children, so a plan of any length keeps only the path it is on in
-memory. The parent of a new node is the current node of the same context: asyncio tasks inherit it,
-concurrent plans never mix. To see a whole tree without a memory, collect it: `with collected_tree() as tree:
-await plan(); print(tree)`.
+A node refers to its parent and not to its children, so that a plan of any length keeps only its current path in memory.
+The parent of a new node is the current node of the same context; asyncio tasks inherit it, so that concurrent plans do
+not mix. To keep a whole tree without a memory, collect it: `with collected_tree() as tree: await plan(); print(tree)`.
 """
 
 from __future__ import annotations
@@ -32,17 +31,17 @@ NodeKind = Literal["root", "action", "motion", "language"]
 
 
 class TaskTreeNode:
-    """One `perform`.
+    """One execution of a `perform`.
 
     Attributes:
-        designator: the performable; None for the root of an episode.
-        kind: root, action, motion, language.
-        parent: the node it runs inside, in the same context; None outside any.
+        designator: the performed designator; None for the root of an episode.
+        kind: root, action, motion or language.
+        parent: the node it runs inside, in the same context; None for a top-level node.
         status: see `TaskStatus`.
         failure: the exception it ended with, if any.
-        result: what `perform` returned.
+        result: the value that `perform` returned.
         started_ns, ended_ns: monotonic time, ns; `ended_ns` is None while it runs.
-        record: belongs to whoever records the plan.
+        record: reserved for the observer that records the plan.
     """
 
     __slots__ = (
@@ -83,7 +82,7 @@ current_node: ContextVar[TaskTreeNode | None] = ContextVar("current_node", defau
 
 
 class CollectedTree:
-    """The nodes that started while it was collecting, in order; `print(tree)` draws them.
+    """The nodes that started while the tree was collecting, in order; `print(tree)` draws them.
 
     Attributes:
         roots: the nodes whose parent is not in the tree.
@@ -94,17 +93,17 @@ class CollectedTree:
         self._children: dict[TaskTreeNode, list[TaskTreeNode]] = {}
 
     def add(self, node: TaskTreeNode) -> None:
-        """A node started."""
+        """Add a node that has started."""
         siblings = self.roots if node.parent is None else self._children.get(node.parent, self.roots)
         siblings.append(node)
         self._children[node] = []
 
     def children(self, node: TaskTreeNode) -> tuple[TaskTreeNode, ...]:
-        """What started inside this node, in order."""
+        """Return the nodes that started inside this one, in order."""
         return tuple(self._children[node])
 
     def depth(self, node: TaskTreeNode) -> int:
-        """How many nodes of the tree are above this one."""
+        """Return the number of the node's ancestors in the tree."""
         above = 0
         while node.parent in self._children:
             node = node.parent
@@ -115,7 +114,7 @@ class CollectedTree:
         return len(self._children)
 
     def __iter__(self) -> Iterator[TaskTreeNode]:
-        """Every node, a parent before its children, siblings in the order they started."""
+        """Iterate over all nodes, parents before their children, siblings in the order of their start."""
         ahead = self.roots[::-1]
         while ahead:
             node = ahead.pop()
@@ -144,14 +143,14 @@ def _line(node: TaskTreeNode) -> str:
 
 
 collecting: ContextVar[tuple[CollectedTree, ...]] = ContextVar("collecting", default=())
-"""The trees that collect in this context."""
+"""The trees that collect the nodes of this context."""
 
 
 @contextmanager
 def collected_tree() -> Iterator[CollectedTree]:
     """Collect the nodes of this context, and of the tasks it starts, into a tree; with or without a memory.
 
-    Unlike a plan without it, the tree keeps every node, and with it its designator, failure and result.
+    The tree keeps every node in memory, with its designator, failure and result.
     """
     tree = CollectedTree()
     token = collecting.set((*collecting.get(), tree))

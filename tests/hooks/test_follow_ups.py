@@ -30,7 +30,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import ChosenRobot, MoveMotion, SimulatedTaskTree
 from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.motions.process_modules import simulated_robot
 from pycrorm_async.plan.object_designators import ObjectDesignator
@@ -207,7 +207,7 @@ class Driving:
         self._sink = sink
 
     async def navigate(self, motion: MoveMotion) -> None:
-        body = robot_here().body
+        body = require_robot().body
         while len(self._sink.sequences) == 1:
             body.set_pose(Pose([body.pose.position.x + 0.01, 0, 0]))
         body.set_pose(Pose([5, 0, 0]))

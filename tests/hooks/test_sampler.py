@@ -23,7 +23,7 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
@@ -41,7 +41,7 @@ class Robot:
         self.drive = drive
 
     async def navigate(self, motion: MoveMotion) -> None:
-        going = self.drive(robot_here().body, motion.target)
+        going = self.drive(require_robot().body, motion.target)
         if asyncio.iscoroutine(going):
             await going
 
@@ -98,7 +98,7 @@ async def test_the_first_sample_of_an_episode_has_every_channel_and_the_next_wha
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
         await MoveTorsoActionPerformable(0.25).perform()
         await NavigateActionPerformable(Pose([0.5, 0.25, 0], TURNED)).perform()
-    robot = robot_here().body
+    robot = require_robot().body
     first, *others = samples(rig)
     assert set(first.channels) == BASE | set(robot.joints)
     assert (first.channels["base.x"], first.channels["base.qw"], first.channels["torso_lift_joint"]) == (0.0, 1.0, 0.0)
@@ -123,7 +123,7 @@ async def test_a_motion_that_changes_nothing_has_no_sample(rig: Rig) -> None:
 async def test_what_changed_between_motions_is_in_the_first_sample_of_the_next(rig: Rig) -> None:
     with rig.episode():
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
-        robot_here().body.set_pose(Pose([2, 3, 0]))
+        require_robot().body.set_pose(Pose([2, 3, 0]))
         await NavigateActionPerformable(Pose([4, 3, 0])).perform()
     assert [each.channels for each in samples(rig)[2:]] == [{"base.x": 2.0, "base.y": 3.0}, {"base.x": 4.0}]
 
@@ -203,7 +203,7 @@ async def test_a_motion_that_is_cancelled_ends_with_the_state_it_was_left_in(rig
         with pytest.raises(asyncio.CancelledError):
             await task
         count = len(samples(rig))
-        robot_here().body.set_pose(Pose([7, 0, 0]))
+        require_robot().body.set_pose(Pose([7, 0, 0]))
         await asyncio.sleep(0.02)
         assert len(samples(rig)) == count
     assert values(rig, "base.x") == [0.0, 0.25, 0.375]
@@ -266,7 +266,7 @@ async def test_a_fault_of_ours_is_counted_and_the_motion_goes_on(rig: Rig) -> No
 
         rig.emitter.offer = broken  # type: ignore[method-assign,assignment]
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    assert robot_here().body.pose == Pose([1, 0, 0])
+    assert require_robot().body.pose == Pose([1, 0, 0])
     assert rig.emitter.faults.total == before + 1
     assert rig.emitter.faults.last == "StateSampled: RuntimeError: the sampler is on fire"
 

@@ -16,7 +16,7 @@ from pycrorm_async.learning.policies.policy import GRASPS, Leaf, PickUpChoice
 from pycrorm_async.learning.rollouts.feasible_places import free_and_visible, rectangles
 from pycrorm_async.learning.rollouts.scene import Stage
 from pycrorm_async.plan import MoveTCPMotion, Retry
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.failures import ManipulationGoalInCollision, ObjectUnreachable
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
@@ -209,7 +209,7 @@ def test_a_turned_object_is_grounded_in_the_same_places_of_the_map(yaw: float) -
     inside = []
     for turn in (0.0, yaw):
         with Scene(kitchen=True, torso_height=0.3, yaw=turn).entered() as there:
-            region = free_and_visible(robot_here(), there.target)
+            region = free_and_visible(require_robot(), there.target)
             x = math.cos(turn) * east + math.sin(turn) * north
             y = math.cos(turn) * north - math.sin(turn) * east
             inside.append(region.contains(x, y))

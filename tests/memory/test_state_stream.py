@@ -21,7 +21,7 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     simulated_robot,
 )
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.commands import environment
 from tests.memory.note_actions import url_of
@@ -37,7 +37,7 @@ class Driving:
         self.log: list[tuple[int, float]] = []
 
     async def navigate(self, motion: MoveMotion) -> None:
-        body = robot_here().body
+        body = require_robot().body
         start = body.pose.position.x
         for step in range(1, STEPS + 1):
             await asyncio.sleep(0.005)
@@ -141,7 +141,7 @@ async def test_a_memory_that_is_closed_in_the_midst_of_a_motion_takes_its_thread
         await memory.__aexit__(None, None, None)
         assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
         await driving
-        assert robot_here().body.pose == Pose([1, 0, 0])
+        assert require_robot().body.pose == Pose([1, 0, 0])
 
 
 def test_a_forked_child_goes_on_without_sampling_and_the_parent_with_it(tmp_path: Path) -> None:

@@ -318,7 +318,7 @@ async def test_one_arm_at_a_time(scene: Scene) -> None:
         PickUpActionPerformable(scene.milk, Arms.BOTH, Grasp.FRONT),
         PlaceActionPerformable(scene.milk, Arms.BOTH, Pose()),
     ):
-        with pytest.raises(IllPosedGoalFailure, match="one arm, LEFT or RIGHT, not with BOTH"):
+        with pytest.raises(IllPosedGoalFailure, match="one arm, LEFT or RIGHT, and does not work with BOTH"):
             await action.perform()
 
 

@@ -209,7 +209,7 @@ async def test_what_nothing_moves_is_neither_opened_nor_closed(
     before = scene.world.save_state()
     with pytest.raises(EnvironmentManipulationImpossible, match="no joint of kitchen moves sink_area_tap"):
         await action(ObjectPart("sink_area_tap", scene.kitchen), Arms.LEFT).perform()
-    with pytest.raises(IllPosedGoalFailure, match="not with BOTH"):
+    with pytest.raises(IllPosedGoalFailure, match="does not work with BOTH"):
         await action(ObjectPart("fridge_door_handle", scene.kitchen), Arms.BOTH).perform()
     assert scene.world.save_state() == before
     scene.world.remove(scene.kitchen)
@@ -246,7 +246,7 @@ async def test_accessing_moves_a_joint_by_a_distance(
             EnvironmentManipulationImpossible,
             "no joint fridge_door_joint of kitchen moves sink_area_drawer_handle",
         ),
-        ({"arm": Arms.BOTH}, IllPosedGoalFailure, "not with BOTH"),
+        ({"arm": Arms.BOTH}, IllPosedGoalFailure, "does not work with BOTH"),
     ],
 )
 async def test_accessing_what_cannot_be_says_why_and_moves_nothing(

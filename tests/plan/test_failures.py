@@ -14,7 +14,7 @@ from pycrorm_async.plan.failures import (
     PlanFailure,
     PlanFailures,
     ResourceDeadlock,
-    in_words,
+    describe_error,
     is_plan_failure,
 )
 from pycrorm_async.plan.language.resources import Resource
@@ -103,7 +103,7 @@ def test_the_tree_is_the_one_that_plans_know() -> None:
         if isinstance(kind, type) and issubclass(kind, PlanFailure)
     }
     assert found == parents()
-    assert sorted(failures.__all__) == sorted([*found, "is_plan_failure", "in_words"])
+    assert sorted(failures.__all__) == sorted([*found, "is_plan_failure", "describe_error"])
 
 
 @pytest.mark.parametrize("name", sorted(set(parents()) - {"IKError", "PlanFailures", "ResourceDeadlock"}))
@@ -163,8 +163,8 @@ def test_several_failures_are_a_plan_failure_and_a_group() -> None:
 def test_a_wait_without_end_names_the_part_and_the_three_concerned() -> None:
     failure = ResourceDeadlock(Resource.BASE, "PickUpAction", "NavigateAction", "Tidying")
     assert str(failure) == (
-        "NavigateAction would wait for BASE for ever: PickUpAction holds it and waits, in the end, for Tidying,"
-        " which NavigateAction is part of"
+        "NavigateAction would wait forever for BASE: PickUpAction holds it and waits, directly or indirectly,"
+        " for Tidying, which contains NavigateAction"
     )
     again = pickle.loads(pickle.dumps(failure))
     assert (again.args, str(again)) == (failure.args, str(failure))
@@ -175,7 +175,7 @@ def test_an_exception_is_put_in_a_short_line_whatever_it_is() -> None:
         def __str__(self) -> str:
             raise ValueError
 
-    assert in_words(ObjectLost("the gripper\nis empty")) == "ObjectLost: the gripper is empty"
-    assert in_words(ObjectLost()) == "ObjectLost"
-    assert in_words(Broken()) == "Broken"
-    assert in_words(ObjectLost("x" * 300)) == f"ObjectLost: {'x' * 199}…"
+    assert describe_error(ObjectLost("the gripper\nis empty")) == "ObjectLost: the gripper is empty"
+    assert describe_error(ObjectLost()) == "ObjectLost"
+    assert describe_error(Broken()) == "Broken"
+    assert describe_error(ObjectLost("x" * 300)) == f"ObjectLost: {'x' * 199}…"

@@ -161,8 +161,8 @@ async def test_a_wait_that_would_never_end_is_refused_and_names_the_part(scene: 
         "AroundAction",
     )
     assert str(failure) == (
-        "StepAction would wait for LEFT_ARM for ever: AroundAction holds it and waits, in the end, for AroundAction,"
-        " which StepAction is part of"
+        "StepAction would wait forever for LEFT_ARM: AroundAction holds it and waits, directly or indirectly,"
+        " for AroundAction, which contains StepAction"
     )
     assert drawn(tree) == [
         "TryAll SUCCEEDED",

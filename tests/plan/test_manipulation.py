@@ -232,7 +232,7 @@ def one_handed(scene: Scene, arm: Arms) -> list[ActionAbstract | BaseMotion]:
 async def test_both_arms_where_one_is_needed_is_a_failure_and_moves_nothing(scene: Scene) -> None:
     before = scene.world.save_state()
     for action in one_handed(scene, Arms.BOTH):
-        with pytest.raises(IllPosedGoalFailure, match="one arm, LEFT or RIGHT, not with BOTH") as caught:
+        with pytest.raises(IllPosedGoalFailure, match="one arm, LEFT or RIGHT, and does not work with BOTH") as caught:
             await action.perform()
         assert caught.value.data == (Arms.BOTH,)
     assert scene.world.save_state() == before

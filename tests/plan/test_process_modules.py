@@ -88,7 +88,7 @@ async def test_without_a_world_or_a_robot_the_caller_is_told() -> None:
             with pytest.raises(NoRobotHere, match="no robot"):
                 await MoveMotion(THERE).perform()
             Object("walle", ObjectType.ROBOT, '<robot name="walle"><link name="walle"/></robot>')
-            with pytest.raises(NoRobotHere, match="'walle' is not of a kind"):
+            with pytest.raises(NoRobotHere, match="no robot description is registered for the robot 'walle'"):
                 await MoveMotion(THERE).perform()
 
 

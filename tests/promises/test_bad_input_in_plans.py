@@ -151,7 +151,7 @@ CASES = {
     "both arms for one thing": Case(
         lambda scene: PickUpActionPerformable(scene.milk, Arms.BOTH, Grasp.FRONT).perform(),
         "IllPosedGoalFailure",
-        "this is done with one arm, LEFT or RIGHT, not with BOTH",
+        "this designator needs one arm, LEFT or RIGHT, and does not work with BOTH",
         ["BOTH"],
         ("PickUpAction",),
     ),

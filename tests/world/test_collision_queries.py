@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.queries.collision_queries import touched_at
+from pycrorm_async.world.queries.collision_queries import collisions_at
 from tests.world.fakes import Witness
 
 BOX = """<robot name="box"><link name="box">
@@ -34,14 +34,14 @@ def box_at(world: BulletWorld, x: float, y: float, z: float, name: str = "box") 
 def test_an_arm_is_in_a_box_on_its_line_and_not_in_one_beside_it(world: BulletWorld, robot: Object) -> None:
     along = robot.link_pose(FOREARM).position
     box = box_at(world, along.x + 0.1, along.y, along.z)
-    met = touched_at(robot, STRAIGHT, links=links(robot))
+    met = collisions_at(robot, STRAIGHT, links=links(robot))
     assert (FOREARM, box) in met
     assert {thing for _, thing in met} == {box}
-    assert touched_at(robot, ASIDE, links=links(robot)) == []
+    assert collisions_at(robot, ASIDE, links=links(robot)) == []
     box.set_pose(Pose([along.x + 0.1, along.y + 0.3, along.z]))
-    assert touched_at(robot, STRAIGHT, links=links(robot)) == []
+    assert collisions_at(robot, STRAIGHT, links=links(robot)) == []
     box.set_pose(Pose([along.x + 0.1, along.y, along.z]))
-    assert touched_at(robot, STRAIGHT, links=[]) == []
+    assert collisions_at(robot, STRAIGHT, links=[]) == []
 
 
 def test_what_is_carried_counts_as_the_arm_does(world: BulletWorld, robot: Object) -> None:
@@ -49,9 +49,9 @@ def test_what_is_carried_counts_as_the_arm_does(world: BulletWorld, robot: Objec
     held = box_at(world, tool.x + 0.05, tool.y, tool.z, "held")
     robot.attach(held, TOOL)
     wall = box_at(world, tool.x + 0.12, tool.y, tool.z, "wall")
-    assert touched_at(robot, STRAIGHT, links=[], carried=[held]) == [("held", wall)]
-    assert touched_at(robot, ASIDE, links=[], carried=[held]) == []
-    assert touched_at(robot, STRAIGHT, links=links(robot)) == []  # it reaches as far as what it holds alone
+    assert collisions_at(robot, STRAIGHT, links=[], carried=[held]) == [("held", wall)]
+    assert collisions_at(robot, ASIDE, links=[], carried=[held]) == []
+    assert collisions_at(robot, STRAIGHT, links=links(robot)) == []  # it reaches as far as what it holds alone
 
 
 def test_nothing_is_moved_and_nobody_is_told(world: BulletWorld, robot: Object, witness: Witness) -> None:
@@ -60,7 +60,7 @@ def test_nothing_is_moved_and_nobody_is_told(world: BulletWorld, robot: Object, 
     robot.attach(held, TOOL)
     before = (robot.joint_positions(), held.pose, robot.link_pose(TOOL), held.bounding_box())
     witness.told.clear()
-    touched_at(robot, ASIDE, links=links(robot), carried=[held])
+    collisions_at(robot, ASIDE, links=links(robot), carried=[held])
     assert (robot.joint_positions(), held.pose, robot.link_pose(TOOL), held.bounding_box()) == before
     assert witness.told == []
 
@@ -70,6 +70,6 @@ def test_what_only_touches_is_no_collision(world: BulletWorld, robot: Object) ->
     held = box_at(world, tool.x + 0.05, tool.y, tool.z, "held")
     robot.attach(held, TOOL)
     table = box_at(world, tool.x + 0.05, tool.y, tool.z - 0.1, "table")
-    assert touched_at(robot, STRAIGHT, links=[], carried=[held]) == []
+    assert collisions_at(robot, STRAIGHT, links=[], carried=[held]) == []
     table.set_pose(Pose([tool.x + 0.05, tool.y, tool.z - 0.09]))
-    assert touched_at(robot, STRAIGHT, links=[], carried=[held]) == [("held", table)]
+    assert collisions_at(robot, STRAIGHT, links=[], carried=[held]) == [("held", table)]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.learning.policies.evidence import Rectangle, Region
-from pycrorm_async.plan.current_robot import RobotHere
+from pycrorm_async.plan.current_robot import CurrentRobot
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.costmaps import Costmap, OccupancyCostmap, VisibilityCostmap
@@ -27,7 +27,7 @@ _CELLS = round(2 * REACH_M / _RESOLUTION_M)
 _VISIBLE_SHARE_MIN = 0.5
 
 
-def free_and_visible(robot: RobotHere, target: Object) -> Region:
+def free_and_visible(robot: CurrentRobot, target: Object) -> Region:
     """Return the places where the robot's base is clear of obstacles and its camera sees the object. Moves nothing."""
     world, ignored = target.world, robot.with_load()
     ground = Pose((target.pose.position.x, target.pose.position.y, 0.0))

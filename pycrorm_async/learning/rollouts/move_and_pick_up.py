@@ -16,7 +16,7 @@ from pycrorm_async.learning.rollouts.feasible_places import free_and_visible
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
 from pycrorm_async.plan.actions.descriptions import ActionDescription
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
 from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, designator_of, in_world
 from pycrorm_async.task_status import TaskStatus
@@ -97,7 +97,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     @property
     def height(self) -> float:
         """Height of the object over the lifted torso at this moment, m. Raises `NoWorld`, `NoRobotHere`."""
-        robot = robot_here()
+        robot = require_robot()
         torso = robot.body.joint_position(robot.description.torso_joint)
         return self.target.pose.position.z - robot.body.pose.position.z - torso
 
@@ -110,7 +110,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
         Raises `ObjectUnreachable` if that has probability 0.
         """
-        region = free_and_visible(robot_here(), in_world(self.target))
+        region = free_and_visible(require_robot(), in_world(self.target))
         return self._condition(Evidence(region=region, height=_around(self.height)), "in this scene")
 
     def _condition(self, evidence: Evidence, where: str) -> Policy:

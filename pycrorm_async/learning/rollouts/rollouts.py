@@ -23,7 +23,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.policies.policy import Policy
 from pycrorm_async.learning.policies.policy_file import name_of
 from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.plan.current_robot import world_here
+from pycrorm_async.plan.current_robot import require_world
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.progress_bar import watched
@@ -106,7 +106,7 @@ async def batch_rollout(
         raise CallerError(f"count, first and seed of rollouts must be >= 0, got {count}, {first} and {seed}")
     tally = Tally()
     with _progress_bar(count) if tell is None else nullcontext(tell) as report:
-        run = _Run(action, action.policy_here(), reset or world_here().reset, stop, tally, report)
+        run = _Run(action, action.policy_here(), reset or require_world().reset, stop, tally, report)
         slices = ((index, 1) for index in range(first, first + count)) if each_in is not None else ((first, count),)
         for begin, length in slices:
             if stop():

@@ -13,11 +13,11 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retracted
+from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retract
 from pycrorm_async.plan.geometry.gripper_checks import check_takable, take
 from pycrorm_async.plan.language.resources import Resource, arms, reaching
 from pycrorm_async.plan.motions.motions import (
@@ -65,7 +65,7 @@ class MoveTorsoActionPerformable(CheckedAction):
         return frozenset({Resource.TORSO})
 
     async def perform(self) -> None:
-        await MoveJointsMotion([robot_here().description.torso_joint], [self.position]).perform()
+        await MoveJointsMotion([require_robot().description.torso_joint], [self.position]).perform()
 
 
 @dataclass
@@ -96,7 +96,7 @@ class ParkArmsActionPerformable(CheckedAction):
         return arms(self.arm)
 
     async def perform(self) -> None:
-        parked = {arm: dict(each.park) for arm, each in robot_here().each_arm(self.arm).items()}
+        parked = {arm: dict(each.park) for arm, each in require_robot().each_arm(self.arm).items()}
         await MoveArmJointsMotion(parked.get(Arms.LEFT), parked.get(Arms.RIGHT)).perform()
 
 
@@ -155,7 +155,7 @@ class PickUpActionPerformable(CheckedAction):
         return reaching(self.arm)
 
     async def perform(self) -> None:
-        robot = robot_here()
+        robot = require_robot()
         wanted = in_world(self.object_designator)
         check_takable(robot, self.arm, wanted)
         tool_frame = robot.one_arm(self.arm).tool_frame
@@ -188,7 +188,7 @@ class PlaceActionPerformable(CheckedAction):
         return reaching(self.arm)
 
     async def perform(self) -> None:
-        robot = robot_here()
+        robot = require_robot()
         body, held = robot.body, in_world(self.object_designator)
         tool_frame = robot.one_arm(self.arm).tool_frame
         if body.attachments.get(held) != tool_frame:
@@ -197,7 +197,7 @@ class PlaceActionPerformable(CheckedAction):
         await MoveTCPMotion(goal, self.arm).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         body.detach(held)
-        await MoveTCPMotion(retracted(goal), self.arm).perform()
+        await MoveTCPMotion(retract(goal), self.arm).perform()
 
 
 @dataclass
@@ -212,7 +212,7 @@ class FaceAtPerformable(CheckedAction):
         return frozenset({Resource.BASE, Resource.HEAD})
 
     async def perform(self) -> None:
-        here = robot_here().body.pose
+        here = require_robot().body.pose
         dx, dy = self.pose.position.x - here.position.x, self.pose.position.y - here.position.y
         heading = yaw_quaternion(math.atan2(dy, dx))
         await NavigateActionPerformable(Pose(here.position, heading, here.frame)).perform()

@@ -70,7 +70,7 @@ class ActionDescription(Composable, Generic[P]):
 
     def __init__(self, performable: Callable[..., P], **alternatives: Any) -> None:
         self._performable = performable
-        self._alternatives = {name: _among(each) for name, each in alternatives.items()}
+        self._alternatives = {name: _as_alternatives(each) for name, each in alternatives.items()}
 
     if not TYPE_CHECKING:  # a type checker finds the fault by itself
 
@@ -102,7 +102,7 @@ class ActionDescription(Composable, Generic[P]):
         return among
 
 
-def _among(given: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
+def _as_alternatives(given: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
     """The alternatives that are given; what holds none is the only one, and so is a word, whose letters are none."""
     if isinstance(given, ObjectDesignatorDescription):
         return given

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from pycrorm_async.plan.actions.basic import CheckedAction
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import GripperClosedCompletely, IllPosedGoalFailure, ObjectLost
 from pycrorm_async.plan.geometry.articulation import grasp_pose, handle_of
-from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, approached, between
+from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, approach, distance_to_box
 from pycrorm_async.plan.geometry.gripper_checks import check_free, check_takable, take
 from pycrorm_async.plan.language.resources import Resource, reaching
 from pycrorm_async.plan.motions.motions import ClosingMotion, MoveGripperMotion, MoveTCPMotion, OpeningMotion
@@ -55,14 +55,14 @@ class GripActionPerformable(CheckedAction):
         return reaching(self.gripper)
 
     async def perform(self) -> None:
-        robot = robot_here()
+        robot = require_robot()
         tool_frame = robot.one_arm(self.gripper).tool_frame
         wanted = in_world(self.object_designator)
         if not self.effort >= 0:
             raise IllPosedGoalFailure(f"an effort of {self.effort} N holds nothing", self.effort)
         check_takable(robot, self.gripper, wanted)
         tool = robot.body.link_pose(tool_frame)
-        apart = min(between(tool, wanted.bounding_box(link)) for link in wanted.links)
+        apart = min(distance_to_box(tool, wanted.bounding_box(link)) for link in wanted.links)
         if apart > HOLD_DISTANCE_M_MAX:
             message = f"the {self.gripper.name} gripper would close on nothing: {wanted.name} is {apart:.3f} m from it"
             raise GripperClosedCompletely(message, wanted.name, apart)
@@ -89,7 +89,7 @@ class ReleaseActionPerformable(CheckedAction):
         return reaching(self.gripper)
 
     async def perform(self) -> None:
-        robot = robot_here()
+        robot = require_robot()
         tool_frame = robot.one_arm(self.gripper).tool_frame
         held = in_world(self.object_designator)
         if robot.body.attachments.get(held) != tool_frame:
@@ -121,10 +121,10 @@ class GraspingActionPerformable(CheckedAction):
         return reaching(self.arm)
 
     async def perform(self) -> None:
-        robot = robot_here()
+        robot = require_robot()
         goal = grasp_pose(self.object_desig)
         check_free(robot, self.arm)
-        await MoveTCPMotion(approached(goal), self.arm).perform()
+        await MoveTCPMotion(approach(goal), self.arm).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(goal, self.arm, allow_gripper_collision=True).perform()
         await MoveGripperMotion(GripperState.CLOSE, self.arm, allow_gripper_collision=True).perform()

@@ -16,7 +16,7 @@ from pycrorm_async.plan.actions.basic import (
     PickUpActionPerformable,
     PlaceActionPerformable,
 )
-from pycrorm_async.plan.current_robot import robot_here
+from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnfetchable, ObjectUnreachable
 from pycrorm_async.plan.geometry.gripper_checks import check_takable
 from pycrorm_async.plan.language.resources import Resource, reaching
@@ -73,7 +73,7 @@ class TransportActionPerformable(CheckedAction):
         return reaching(Arms.BOTH)
 
     async def perform(self) -> None:
-        robot = robot_here()
+        robot = require_robot()
         tool_frame = robot.one_arm(self.arm).tool_frame
         wanted = in_world(self.object_designator)
         check_takable(robot, self.arm, wanted)
@@ -88,7 +88,7 @@ class TransportActionPerformable(CheckedAction):
         await self._park_arms()
 
     async def _park_arms(self) -> None:
-        arms = robot_here().description.arms
+        arms = require_robot().description.arms
         await ParkArmsActionPerformable(Arms.BOTH if len(arms) > 1 else self.arm).perform()
 
     def _stand_to_fetch(self, body: Object) -> Pose:

@@ -1,1 +1,1 @@
-"""The execution of a designator: its node, its context, its observer."""
+"""Execute designators: create nodes, enter execution contexts, notify the observer, simulate plans."""

@@ -1,7 +1,7 @@
-"""What a node starts within, besides its parent: monitors that watch it, and parallel branches it takes turns with.
+"""The execution context of a node: the monitors around it, and the arbiter and claims of its parallel branches.
 
-Nothing, for most plans: then a perform asks one ContextVar and goes on. Otherwise `entered` comes before the
-node, so that a node that is interrupted first, or waits for a part of the robot, has not started yet.
+Most plans have none; then a perform reads one ContextVar only. Otherwise `ExecutionContext.enter` runs before the node
+is created, so that a node that is interrupted or waits for a part of the robot has not started yet.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ if TYPE_CHECKING:
     from pycrorm_async.plan.language.monitor_watch import Watch
     from pycrorm_async.plan.language.resource_arbiter import Arbiter, Claim
 
-__all__ = ["ExecutionContext", "surroundings"]
+__all__ = ["ExecutionContext", "execution_context"]
 
 
 @dataclass(frozen=True, slots=True)
 class ExecutionContext:
-    """Inherited by asyncio tasks, as the current node is.
+    """The monitors and claims that apply in a context; asyncio tasks inherit it.
 
     Attributes:
-        watches: of the monitors around, the outermost first.
-        arbiter: of the outermost parallel expression around.
-        claim: the nearest node above that holds parts of the robot, and through it those above that one.
+        watches: the watches of all enclosing monitors, the outermost first.
+        arbiter: the arbiter of the outermost enclosing parallel expression.
+        claim: the claim of the nearest ancestor that holds parts of the robot; its `parent` leads to the others.
     """
 
     watches: tuple[Watch, ...] = ()
@@ -34,14 +34,16 @@ class ExecutionContext:
 
     @property
     def interrupted(self) -> bool:
-        """Whether a monitor around has interrupted what is inside."""
+        """Whether an enclosing monitor has interrupted its operand."""
         return any(watch.fired for watch in self.watches)
 
-    async def entered(self, designator: Designator) -> Claim | None:
-        """A node of this designator may start; release the claim, if there is one, when it has ended.
+    async def enter(self, designator: Designator) -> Claim | None:
+        """Check the monitors, then wait for the parts of the robot that the designator needs.
+
+        The caller releases the returned claim, if there is one, when the node has ended.
 
         Raises:
-            CancelledError: a monitor's condition holds now.
+            CancelledError: a monitor's condition holds.
             ResourceDeadlock: the wait for a part of the robot would never end.
         """
         if self.watches and not self.interrupted:
@@ -49,7 +51,7 @@ class ExecutionContext:
                 await watch.check()
         if self.arbiter is None:
             return None
-        return await self.arbiter.claimed(designator, self)
+        return await self.arbiter.claim(designator, self)
 
 
-surroundings: ContextVar[ExecutionContext | None] = ContextVar("surroundings", default=None)
+execution_context: ContextVar[ExecutionContext | None] = ContextVar("execution_context", default=None)

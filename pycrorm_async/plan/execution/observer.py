@@ -1,8 +1,7 @@
-"""What the plan layer asks of a memory: to be told what happens. Without one a plan runs the same.
+"""Port through which the plan layer reports its execution to an observer, usually a memory; plans run without one too.
 
-`recorder` is the memory of this context. It is told in the caller's task, synchronously, and must be quick;
-what it raises from `node_started` refuses the perform before it runs, everything else it must keep to
-itself.
+`recorder` is the observer of the current context. It is called synchronously in the plan's task, so it must be quick.
+An exception of `node_started` refuses the perform before it runs; its other methods must not raise.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ __all__ = ["PlanObserver", "Candidate", "Seen", "Thought", "recorder", "thinking
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A place a location designator offers: a pose, and the arms that reach from there.
+    """A place that a location designator offers: a pose, and the arms that reach the target from there.
 
-    A place that comes from experience also says with which grasp and torso height (m) it went well.
+    A place from experience also has the grasp and the torso height (m) of the past success.
     """
 
     pose: Pose
@@ -39,20 +38,20 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """An object that was perceived, and the share of it that was seen, 0 to 1 (None: nobody looked)."""
+    """A perceived object and its visible share, 0 to 1 (None if visibility was not computed)."""
 
     thing: Object
     visible: float | None = None
 
 
 class Thought:
-    """Something that is thought through in a copy of the world, and does not happen (`plan.thinking`).
+    """A running simulation: plans performed in a copy of the world (see `execution.simulation`).
 
     Attributes:
-        description: in words; None: nobody said.
+        description: in words; None if the caller passed none.
         world: the copy; None if there was no world to copy.
-        by: the node in which it is thought; None outside any.
-        record: belongs to whoever records the plan.
+        by: the node that runs the simulation; None outside any node.
+        record: reserved for the observer that records the plan.
     """
 
     __slots__ = ("by", "description", "record", "world")
@@ -65,18 +64,18 @@ class Thought:
 
 
 class PlanObserver(Protocol):
-    """Told of every node, resolved location, perception and thought of the plans in its context."""
+    """Receives every node, resolved location, perception and simulation of the plans in its context."""
 
     def admit(self) -> Awaitable[None] | None:
-        """None if a node may start at once; otherwise what must be awaited first (it may raise)."""
+        """Return None if a node may start at once, otherwise an awaitable to await before (it may raise)."""
         ...
 
     def node_started(self, node: TaskTreeNode) -> None:
-        """Status RUNNING; `perform` has not run yet. May raise to refuse it. May set `node.record`."""
+        """Called before `perform` runs, with status RUNNING. May raise to refuse it. May set `node.record`."""
         ...
 
     def node_ended(self, node: TaskTreeNode) -> None:
-        """Status, failure and result are set. Called exactly once for every node that started."""
+        """Called exactly once for every started node, after its status, failure and result are set."""
         ...
 
     def location_resolved(
@@ -88,10 +87,15 @@ class PlanObserver(Protocol):
         considered: int,
         node: TaskTreeNode | None,
     ) -> None:
-        """A location designator was asked: what it offered, which was taken, how many places it looked at.
+        """Called after a location designator was resolved or iterated.
 
-        Called once for each time it is asked, perhaps in another context (a loop over places that is
-        dropped).
+        Args:
+            location: the designator's class name.
+            offered: the places it offered.
+            taken: index of the offered place that was taken; None if none was.
+            considered: number of places it tried.
+
+        Called once per resolution, in another context if a loop over places was dropped.
         """
         ...
 
@@ -103,19 +107,22 @@ class PlanObserver(Protocol):
         seen: tuple[Seen, ...],
         node: TaskTreeNode | None,
     ) -> None:
-        """Perception answered: what was looked for, and what was found, best seen first."""
+        """Called after a perception, with the perceived objects, the best visible first."""
         ...
 
     def thought_began(self, thought: Thought) -> None:
-        """From now on what happens in this context is only thought. May set `thought.record`."""
+        """Called when a simulation starts in this context. May set `thought.record`."""
         ...
 
     def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
-        """It is over; `failure` left it. Called exactly once for every thought that began, its world still open."""
+        """Called exactly once at the end of every started simulation, before its world closes.
+
+        `failure` is the exception that left the simulation, if any.
+        """
         ...
 
 
 recorder: ConnectedVar[PlanObserver] = ConnectedVar("recorder")
 
 thinking: ContextVar[Thought | None] = ContextVar("thinking", default=None)
-"""The innermost thought of this context; None where things really happen."""
+"""The innermost simulation of this context; None outside a simulation."""

@@ -1,13 +1,13 @@
-"""Thinking a plan through: performed in a copy of the world, it changes nothing, and shows what would come of it.
+"""Simulate plans: perform them in a copy of the world, without changing the original.
 
 >>> with SimulatedTaskTree() as tree:
-...     await TransportActionPerformable(milk, Arms.LEFT, there).perform()
+...     await TransportActionPerformable(milk, Arms.LEFT, target_location).perform()
 >>> [node.status for node in tree if node.failure is not None]
 []
 
-Designators mean the objects of the copy inside, and the real ones again outside, also those that were resolved
-inside. A world `Object` itself stays what it is: act on it directly, and it really moves. What a memory
-records of a thought is an episode of its own, which ordinary questions leave out.
+Inside a simulation designators refer to the objects of the copy, and outside to the original ones again, also those
+resolved inside. A world `Object` used directly still belongs to the original world, and moving it changes that world.
+A memory records a simulation as an episode of its own, which ordinary queries leave out.
 """
 
 from __future__ import annotations
@@ -28,34 +28,34 @@ __all__ = ["SimulatedTaskTree"]
 
 
 class SimulatedTaskTree:
-    """A thought, to be entered once with `with`; gives the tree of what is performed inside.
+    """A simulation, entered once with `with`; yields the tree of the nodes performed inside.
 
-    Inside, the current world is a copy of the one there was (none, if there was none), and what is performed
-    has no parent outside. However it is left, everything is as it was before; exceptions go through. Thoughts
-    nest, and several tasks may think at once. Entering takes some 25 ms.
+    Inside, the current world is a copy of the former one (None if there was none), and nodes have no parent outside.
+    At the end the former world and node are current again; exceptions propagate. Simulations nest, and several tasks
+    may simulate at the same time. Entering takes about 25 ms.
 
-    The chosen robot is that of the context: one whose modules move something outside the world does so in a
-    thought too. Think with `with SimulatedTaskTree() as tree, simulated_robot:` then.
+    The chosen robot is that of the context. If its modules move a real robot, they do so in a simulation too: use
+    `with SimulatedTaskTree() as tree, simulated_robot:` then.
 
     Args:
-        description: what a memory calls it; left out, it says which node thinks.
+        description: its description in a memory; None means one that names the node that runs it.
 
     Raises:
-        CallerError: the description is no text; on entering, that it was entered before.
+        CallerError: the description is not a str, or the simulation is entered a second time.
     """
 
     def __init__(self, description: str | None = None) -> None:
         if description is not None and not isinstance(description, str):
-            raise CallerError(f"the description of a thought is a str, not {description!r:.100}")
+            raise CallerError(f"the description of a simulation must be a str, not {description!r:.100}")
         self._description = description
         self._stack: ExitStack | None = None
 
     def __enter__(self) -> CollectedTree:
         if self._stack is not None:
-            raise CallerError("a thought is entered once; make a new SimulatedTaskTree()")
+            raise CallerError("a simulation can be entered once; make a new SimulatedTaskTree()")
         self._stack = ExitStack()
         with ExitStack() as entering:
-            tree = entering.enter_context(_thought(self._description))
+            tree = entering.enter_context(_simulate(self._description))
             self._stack = entering.pop_all()
         return tree
 
@@ -67,7 +67,7 @@ class SimulatedTaskTree:
 
 
 @contextmanager
-def _thought(description: str | None) -> Iterator[CollectedTree]:
+def _simulate(description: str | None) -> Iterator[CollectedTree]:
     world, node, observer, tree = current_world.get(), current_node.get(), recorder.get(), CollectedTree()
     with ExitStack() as stack:
         copy = stack.enter_context(copied(world)) if world is not None else None
@@ -86,11 +86,14 @@ def _thought(description: str | None) -> Iterator[CollectedTree]:
         finally:
             if observer is not None:
                 observer.thought_ended(thought, failure)
-            del failure  # its traceback holds this frame
+            del failure  # its traceback holds this frame: break the reference cycle
 
 
 def _set(stack: ExitStack, variable: ContextVar[Any], value: object) -> None:
-    """Until the stack is unwound. In another context, where a plan that nobody awaits is closed, nothing is ours."""
+    """Set a context variable until the stack unwinds; leave it alone if that happens in another context.
+
+    A dropped plan is closed in another context.
+    """
     token = variable.set(value)
 
     def reset() -> None:

@@ -1,11 +1,26 @@
-"""Notices performs that were called and never awaited: `action.perform()` alone makes a coroutine and does nothing.
+"""Detect performs that were called and never awaited: `action.perform()` without `await` does nothing.
 
-Theory of operation. A call puts a weak reference to its coroutine into a list that only the frame of that coroutine
-holds. A frame that starts empties the list. A coroutine that is closed or cancelled before it starts drops its frame,
-and with it the list and the reference, while the coroutine still exists: that await was not forgotten. Only when a
-coroutine is collected with its frame untouched does the reference outlive it, and its callback reports the designator.
-An episode counts its calls that have not started. Only where some are left at its end are the objects of the process
-searched for their coroutines, and those reported that no task holds and is about to run.
+Theory of operation
+-------------------
+
+The actors are the coroutine that a call of `perform` creates, its frame, and a `CalledPerforms` object per episode (or
+per memory outside any episode). A coroutine is in one of three states: not started, started, or ended without a start.
+
+A call creates a list and passes it to the coroutine as its argument `unstarted`, so that only the coroutine's frame
+holds it. The list contains the `CalledPerforms` and a weak reference to the coroutine, whose callback reports the
+designator's class. `CalledPerforms.waiting` counts the calls that have not started.
+
+When the frame starts, it decrements the count and empties the list, which removes the weak reference: its callback
+cannot run any more. A coroutine that is closed or cancelled before its start drops its frame while the coroutine itself
+still exists; the list and the reference vanish with the frame, and no callback runs. That is correct, because such a
+coroutine was awaited or handed to a task. Only a coroutine that is garbage collected without a start has its frame
+until the end; then the weak reference outlives the coroutine, and its callback reports the missing `await`.
+
+At the end of an episode some coroutines may still be referenced and not started. If `waiting` is not 0, `close`
+searches the objects of the process for coroutines that have not started and belong to this episode, and reports those
+that no task is about to run. It empties their lists, so that their collection does not report them again. Without
+such calls the search is skipped. A coroutine is reported by `close` or by its callback and never by both, because
+emptying the list removes the reference.
 """
 
 from __future__ import annotations
@@ -22,20 +37,20 @@ from pycrorm_async.connected_var import ConnectedVar
 __all__ = ["CalledPerforms", "Unstarted", "called_performs"]
 
 Unstarted: TypeAlias = list[Any]
-"""The calls it is counted among and the weak reference, held by the frame of a coroutine that has not started.
+"""The `CalledPerforms` and the weak reference, held by the frame of a coroutine that has not started.
 
-Empty once it has started, and once it was reported.
+Empty after the start, and after `close` has reported the coroutine.
 """
 
 
 class CalledPerforms:
-    """The performs that were called in one context and have not started.
+    """The performs of one context that were called and have not started.
 
-    `plan.performing` counts them, in a few steps of its own, for this is done at every call.
+    `node_execution` updates the count itself, because it does so at every call.
 
     Attributes:
-        waiting: how many have not started; those that were closed before they started are among them.
-        callbacks: by the class of a designator, what its coroutine's weak reference calls.
+        waiting: number of calls that have not started, including those closed before their start.
+        callbacks: the callback of a coroutine's weak reference, by the designator's class.
     """
 
     def __init__(self, on_unawaited: Callable[[type], None]) -> None:
@@ -44,7 +59,7 @@ class CalledPerforms:
         self._on_unawaited = on_unawaited
 
     def close(self) -> None:
-        """Report those that exist and that no task runs. What is collected later is still reported."""
+        """Report the coroutines that have not started and belong to no task; later collections still report theirs."""
         if not self.waiting:
             return
         in_tasks = _coroutines_of_tasks()
@@ -62,7 +77,7 @@ class CalledPerforms:
 
 
 class _Callbacks(dict[type, Callable[[object], None]]):
-    """One for each class, made when the first of it is called."""
+    """One callback per designator class, created at the first call."""
 
     def __init__(self, collected: Callable[[type], None]) -> None:
         super().__init__()
@@ -76,9 +91,9 @@ class _Callbacks(dict[type, Callable[[object], None]]):
 def _coroutines_of_tasks() -> set[int]:
     try:
         return {id(task.get_coro()) for task in asyncio.all_tasks()}
-    except RuntimeError:  # no loop runs here, and none of its tasks
+    except RuntimeError:  # no event loop runs in this thread
         return set()
 
 
 called_performs: ConnectedVar[CalledPerforms] = ConnectedVar("called_performs")
-"""Those of this context's episode, or of its memory outside any; None without a memory."""
+"""The calls of the context's episode, or of its memory outside an episode; None without a memory."""

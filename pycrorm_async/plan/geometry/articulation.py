@@ -26,7 +26,7 @@ __all__ = [
     "hand_poses",
     "handle_of",
     "handle_poses",
-    "hold",
+    "hold_pose",
     "moved_position",
     "opened_position",
 ]
@@ -118,7 +118,7 @@ def handle_poses(handle: Handle, goal: float, start: float | None = None) -> lis
     ]
 
 
-def hold(handle: Handle) -> Pose:
+def hold_pose(handle: Handle) -> Pose:
     """How a hand takes the handle: the tool frame as seen from the handle's.
 
     What slides is taken from the front: the hand is turned as the handle is. What swings is taken from the side
@@ -141,7 +141,7 @@ def hold(handle: Handle) -> Pose:
 
 def hand_poses(handle: Handle, goal: float, start: float | None = None) -> list[Pose]:
     """As `handle_poses`, of the tool frame of a hand that took the handle as `hold` says."""
-    taken = hold(handle)
+    taken = hold_pose(handle)
     return [each @ taken for each in handle_poses(handle, goal, start)]
 
 
@@ -157,7 +157,7 @@ def grasp_pose(wanted: ObjectLike) -> Pose:
     whole = in_world(wanted.part_of)
     if not whole.joints_above(wanted.name):
         return whole.link_pose(wanted.name)
-    return whole.link_pose(wanted.name) @ hold(handle_of(wanted))
+    return whole.link_pose(wanted.name) @ hold_pose(handle_of(wanted))
 
 
 def _limits(handle: Handle) -> tuple[float, float]:

@@ -20,11 +20,11 @@ __all__ = [
     "LIFT_M",
     "RETRACT_M",
     "PickUpPoses",
-    "approached",
-    "between",
+    "approach",
+    "distance_to_box",
     "pick_up_poses",
     "place_pose",
-    "retracted",
+    "retract",
 ]
 
 APPROACH_M = 0.1
@@ -64,17 +64,17 @@ def place_pose(target: Pose, held: Pose, tool: Pose) -> Pose:
     return target @ tool.relative_to(held)
 
 
-def approached(tool: Pose) -> Pose:
+def approach(tool: Pose) -> Pose:
     """The tool frame before it goes straight ahead, along its fingers, to `tool`."""
     return tool @ Pose((-APPROACH_M, 0.0, 0.0))
 
 
-def retracted(tool: Pose) -> Pose:
+def retract(tool: Pose) -> Pose:
     """The tool frame after moving back along its fingers."""
     return tool @ Pose((-RETRACT_M, 0.0, 0.0))
 
 
-def between(tool: Pose, box: BoundingBox) -> float:
+def distance_to_box(tool: Pose, box: BoundingBox) -> float:
     """How far the tool frame is from the box around something, m; 0 inside."""
     return math.hypot(
         *(max(low - at, at - high, 0.0) for at, low, high in zip(tool.position, box.min, box.max, strict=True))

@@ -22,12 +22,12 @@ from typing import Any, ClassVar, Self, TypeAlias
 
 from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.execution.execution_context import ExecutionContext, surroundings
-from pycrorm_async.plan.failures import NotALanguageExpression, in_words
+from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
+from pycrorm_async.plan.failures import NotALanguageExpression, describe_error
 from pycrorm_async.plan.language.operators import Composable
-from pycrorm_async.plan.language.outcome import Attempt, Outcome, attempted, together
+from pycrorm_async.plan.language.outcome import Attempt, Outcome, attempt, combine_failures
 from pycrorm_async.plan.language.resource_arbiter import Arbiter
-from pycrorm_async.plan.language.task_branches import ended, raise_what_broke
+from pycrorm_async.plan.language.task_branches import join_tasks, raise_errors
 from pycrorm_async.plan.task_tree import NodeKind
 
 __all__ = ["Code", "Expression", "Operand", "Parallel", "Repeat", "Sequential", "TryAll", "TryInOrder"]
@@ -53,7 +53,7 @@ class Expression(Designator):
 
     def hold(self, operands: Iterable[Composable]) -> None:
         """These are its operands, once they are checked."""
-        self.operands = tuple(_checked(each, type(self).__name__) for each in operands)
+        self.operands = tuple(_check_operand(each, type(self).__name__) for each in operands)
         if not self.operands:
             raise NotALanguageExpression(f"{type(self).__name__} needs something to perform")
 
@@ -81,7 +81,7 @@ class Sequential(Expression):
     """`a + b`: one after the other. Raises the first failure; what would come after it is not performed."""
 
     async def perform(self) -> Outcome:
-        results = [await performed(operand) for operand in self.operands]
+        results = [await perform_operand(operand) for operand in self.operands]
         return Outcome(tuple(results), tuple(range(len(results))))
 
 
@@ -91,25 +91,25 @@ class TryInOrder(Expression):
     async def perform(self) -> Outcome:
         failures: list[Exception] = []
         for position, operand in enumerate(self.operands):
-            result, failure = await attempted(functools.partial(performed, operand))
+            result, failure = await attempt(functools.partial(perform_operand, operand))
             if failure is None:
                 before, after = (None,) * position, (None,) * (len(self.operands) - position - 1)
                 return Outcome((*before, result, *after), (position,), tuple(failures))
             failures.append(failure)
             del failure
-        raise together(failures, f"none of {len(failures)} alternatives succeeded")
+        raise combine_failures(failures, f"none of {len(failures)} alternatives succeeded")
 
 
 class Parallel(Expression):
     """`a | b`: all at once, each in a task of its own, all to their end. Raises the failures together, if any."""
 
     async def perform(self) -> Outcome:
-        attempts = await _at_once(self)
+        attempts = await _run_branches(self)
         failures = [each.failure for each in attempts if each.failure is not None]
         if failures:
             count = len(attempts)
             del attempts
-            raise together(failures, f"{len(failures)} of {count} branches failed")
+            raise combine_failures(failures, f"{len(failures)} of {count} branches failed")
         return Outcome(tuple(each.result for each in attempts), tuple(range(len(attempts))))
 
 
@@ -117,12 +117,12 @@ class TryAll(Expression):
     """`a ^ b`: all at once, all to their end; one must succeed. If none does, raises all failures together."""
 
     async def perform(self) -> Outcome:
-        attempts = await _at_once(self)
+        attempts = await _run_branches(self)
         succeeded = tuple(position for position, each in enumerate(attempts) if each.failure is None)
         failures = [each.failure for each in attempts if each.failure is not None]
         if not succeeded:
             del attempts
-            raise together(failures, f"none of {len(failures)} branches succeeded")
+            raise combine_failures(failures, f"none of {len(failures)} branches succeeded")
         return Outcome(tuple(each.result for each in attempts), succeeded, tuple(failures))
 
 
@@ -154,7 +154,7 @@ class Repeat(Expression):
         failures: list[Exception] = []
         failed: list[int] = []
         for number in range(1, self.times + 1):
-            result, failure = await attempted(functools.partial(performed, operand))
+            result, failure = await attempt(functools.partial(perform_operand, operand))
             results.append(result)
             if failure is not None:
                 failures.append(failure)
@@ -168,7 +168,7 @@ class Repeat(Expression):
         if len(failures) == 1:
             failures[0].add_note(f"this was round {failed[0]} of {self.times}; the others succeeded")
         rounds = f"{', '.join(map(str, failed[:10]))}{', …' if len(failed) > 10 else ''}"
-        return together(failures, f"{len(failed)} of {self.times} rounds failed ({rounds})")
+        return combine_failures(failures, f"{len(failed)} of {self.times} rounds failed ({rounds})")
 
 
 @dataclass(init=False, repr=False, eq=False)
@@ -205,10 +205,10 @@ class Code(Designator):
         return await result if inspect.isawaitable(result) else result
 
 
-async def performed(operand: Operand) -> Any:
+async def perform_operand(operand: Operand) -> Any:
     """Perform it; a description is resolved now."""
     designator = operand if isinstance(operand, Designator) else operand.resolve()
-    return await _checked(designator, "an expression").perform()
+    return await _check_operand(designator, "an expression").perform()
 
 
 def name_of(value: Any) -> str:
@@ -224,30 +224,30 @@ def name_of(value: Any) -> str:
     return f"{module}.{named.__qualname__}" if module not in (None, "builtins") else str(named.__qualname__)
 
 
-async def _at_once(expression: Expression) -> list[Attempt]:
+async def _run_branches(expression: Expression) -> list[Attempt]:
     """All operands as tasks, in order of the operands; what needs the same part of the robot takes turns."""
-    around = surroundings.get() or ExecutionContext()
+    around = execution_context.get() or ExecutionContext()
     if around.arbiter is None or around.arbiter.loop is not asyncio.get_running_loop():
         around = ExecutionContext(around.watches, Arbiter())
 
     async def branch(operand: Operand) -> Attempt:
-        surroundings.set(around)
-        return await attempted(functools.partial(performed, operand))
+        execution_context.set(around)
+        return await attempt(functools.partial(perform_operand, operand))
 
     tasks = [
         asyncio.create_task(branch(operand), name=f"{expression.dtype} {number}: {name_of(operand)}")
         for number, operand in enumerate(expression.operands)
     ]
-    outside = await ended(tasks)
+    outside = await join_tasks(tasks)
     try:
-        raise_what_broke(tasks, outside)
+        raise_errors(tasks, outside)
         return [task.result() for task in tasks]
     finally:
         # The traceback of an exception holds this frame: no cycle for the collector.
         del tasks, outside
 
 
-def _checked(operand: Any, where: str) -> Any:
+def _check_operand(operand: Any, where: str) -> Any:
     """The operand. Raises `NotALanguageExpression` if it is none."""
     if isinstance(operand, Expression) and not operand.is_complete:
         raise NotALanguageExpression(
@@ -268,5 +268,5 @@ def _short(value: Any) -> str:
     try:
         text = repr(value)
     except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything
-        text = f"<{type(value).__name__}: {in_words(error)}>"
+        text = f"<{type(value).__name__}: {describe_error(error)}>"
     return text if len(text) <= 100 else f"{text[:99]}…"

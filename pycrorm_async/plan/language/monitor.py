@@ -14,16 +14,16 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
-from pycrorm_async.plan.execution.execution_context import surroundings
+from pycrorm_async.plan.execution.execution_context import execution_context
 from pycrorm_async.plan.failures import NotALanguageExpression
-from pycrorm_async.plan.language.expressions import Expression, name_of, performed
+from pycrorm_async.plan.language.expressions import Expression, name_of, perform_operand
 from pycrorm_async.plan.language.monitor_watch import Condition, Watch
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import Outcome
-from pycrorm_async.plan.language.task_branches import ended, raise_what_broke
+from pycrorm_async.plan.language.task_branches import join_tasks, raise_errors
 from pycrorm_async.plan.task_tree import TaskStatus, current_node
 
-__all__ = ["Monitor", "watched"]
+__all__ = ["Monitor", "watch_operand"]
 
 
 @dataclass(init=False, repr=False, eq=False)
@@ -77,19 +77,19 @@ class Monitor(Expression):
         if not self.operands:
             raise NotALanguageExpression("this Monitor watches nothing: write plan >> Monitor(condition)")
         watch = Watch(self._condition)
-        task = asyncio.create_task(self._watched(watch), name=f"watched by {self.condition}")
+        task = asyncio.create_task(self._perform_watched(watch), name=f"watched by {self.condition}")
         watch.of(task)
-        asking = asyncio.create_task(watch.keep_asking(self.interval_s), name=f"asks {self.condition}")
+        asking = asyncio.create_task(watch.poll(self.interval_s), name=f"asks {self.condition}")
         try:
-            outside = await ended([task])
+            outside = await join_tasks([task])
         finally:
             asking.cancel()
-        outside = await ended([asking]) or outside
+        outside = await join_tasks([asking]) or outside
         try:
             if outside is None and watch.error is not None:
                 raise watch.error
             if outside is not None or not watch.fired or not (task.cancelled() or task.exception() is None):
-                raise_what_broke([task], outside)
+                raise_errors([task], outside)
             if not watch.fired:
                 return Outcome(results=(task.result(),), succeeded=(0,), interrupted=False)
             node = current_node.get()
@@ -100,12 +100,12 @@ class Monitor(Expression):
             # The traceback of an exception holds this frame: no cycle for the collector.
             del outside, task, watch, asking
 
-    async def _watched(self, watch: Watch) -> Any:
-        surroundings.set(watch.inside())
-        return await performed(self.operands[0])
+    async def _perform_watched(self, watch: Watch) -> Any:
+        execution_context.set(watch.inside())
+        return await perform_operand(self.operands[0])
 
 
-def watched(operand: Composable, monitor: Composable) -> Monitor:
+def watch_operand(operand: Composable, monitor: Composable) -> Monitor:
     """`operand >> monitor`: a monitor like this one, which watches the operand. Raises `NotALanguageExpression`."""
     if not isinstance(monitor, Monitor):
         raise NotALanguageExpression(

@@ -13,7 +13,7 @@ from collections.abc import Awaitable, Callable, Generator
 from contextvars import Context, copy_context
 from typing import Any, TypeAlias
 
-from pycrorm_async.plan.execution.execution_context import ExecutionContext, surroundings
+from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
 
 __all__ = ["Condition", "Watch"]
 
@@ -41,29 +41,29 @@ class Watch:
 
     def inside(self) -> ExecutionContext:
         """The surroundings of what it watches."""
-        outside = self._context.get(surroundings) or ExecutionContext()
+        outside = self._context.get(execution_context) or ExecutionContext()
         return ExecutionContext((*outside.watches, self), outside.arbiter, outside.claim)
 
     async def check(self) -> None:
         """Raise `CancelledError` if the condition holds, and interrupt the task that is watched."""
-        holds, error = await self._asked()
+        holds, error = await self._evaluate()
         if holds and self._fire(error):
             raise asyncio.CancelledError("interrupted by a monitor")
 
-    async def keep_asking(self, interval_s: float) -> None:
+    async def poll(self, interval_s: float) -> None:
         """Interrupt the task as soon as the condition holds. Ends then, or when it is cancelled or the task is over."""
         assert self._task is not None
         if isinstance(self._condition, asyncio.Event):
             await self._condition.wait()
         # A condition may swallow the cancellation with which the monitor ends the asking.
         while not (self.fired or self._task.done()):
-            holds, error = await self._asked()
+            holds, error = await self._evaluate()
             if holds:
                 self._fire(error)
             else:
                 await asyncio.sleep(interval_s)
 
-    async def _asked(self) -> tuple[bool, BaseException | None]:
+    async def _evaluate(self) -> tuple[bool, BaseException | None]:
         """Whether to interrupt, and what the condition raised, if that is why: the monitor raises it."""
         try:
             return await self._holds(), None
@@ -86,7 +86,7 @@ class Watch:
         answer = context.run(self._condition)
         if not inspect.isawaitable(answer):
             return bool(answer)
-        return bool(await _Within(context, answer))
+        return bool(await _InContext(context, answer))
 
     def _fire(self, error: BaseException | None) -> bool:
         """Whether it interrupts: only once, and not what is over already."""
@@ -101,7 +101,7 @@ class Watch:
         return True
 
 
-class _Within:
+class _InContext:
     """Awaits in the same task, but in another context."""
 
     def __init__(self, context: Context, awaitable: Awaitable[Any]) -> None:
@@ -118,7 +118,7 @@ class _Within:
                     yield wanted
                     step = functools.partial(next, steps)
                 except BaseException as raised:  # noqa: BLE001  a cancellation, say, is for the one that is awaited
-                    step = functools.partial(_thrown, steps, raised)
+                    step = functools.partial(_throw, steps, raised)
         except StopIteration as done:
             return done.value
         finally:
@@ -126,5 +126,5 @@ class _Within:
             del step
 
 
-def _thrown(steps: Generator[Any, Any, Any], raised: BaseException) -> Any:
+def _throw(steps: Generator[Any, Any, Any], raised: BaseException) -> Any:
     return steps.throw(raised)

@@ -58,9 +58,9 @@ class Composable:
 
     def __rshift__(self, monitor: Monitor) -> Monitor:
         """Until it is done, or until the monitor's condition holds."""
-        from pycrorm_async.plan.language.monitor import watched
+        from pycrorm_async.plan.language.monitor import watch_operand
 
-        return watched(self, monitor)
+        return watch_operand(self, monitor)
 
     # The left operand has none of these operators, so it is no operand; the classes say so.
 
@@ -77,6 +77,6 @@ class Composable:
         return Composable.__xor__(other, self)
 
     def __rrshift__(self, other: Composable) -> Monitor:
-        from pycrorm_async.plan.language.monitor import watched
+        from pycrorm_async.plan.language.monitor import watch_operand
 
-        return watched(other, self)
+        return watch_operand(other, self)

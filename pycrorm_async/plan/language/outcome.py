@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-from pycrorm_async.plan.failures import PlanFailures, in_words, is_plan_failure
+from pycrorm_async.plan.failures import PlanFailures, describe_error, is_plan_failure
 
-__all__ = ["Attempt", "Outcome", "attempted", "together"]
+__all__ = ["Attempt", "Outcome", "attempt", "combine_failures"]
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -46,7 +46,7 @@ class Outcome:
             return {"rounds": self.rounds}
         brief: dict[str, Any] = {"succeeded": list(self.succeeded)}
         if self.failures:
-            brief["failures"] = [in_words(each) for each in self.failures]
+            brief["failures"] = [describe_error(each) for each in self.failures]
         return brief
 
 
@@ -57,7 +57,7 @@ class Attempt(NamedTuple):
     failure: Exception | None = None
 
 
-async def attempted(perform: Callable[[], Any]) -> Attempt:
+async def attempt(perform: Callable[[], Any]) -> Attempt:
     """What performing it gives. Whatever is raised that is no plan failure passes through."""
     try:
         return Attempt(await perform())
@@ -67,19 +67,21 @@ async def attempted(perform: Callable[[], Any]) -> Attempt:
         return Attempt(failure=error)
 
 
-def together(failures: list[Exception], summary: str) -> Exception:
+def combine_failures(failures: list[Exception], summary: str) -> Exception:
     """The only failure itself, or all of them as `PlanFailures`, to be raised.
 
     Takes them out of the list: the traceback of a failure holds the frame that raises it, and so what is in its
     variables; no cycle for the collector.
     """
-    error = failures[0] if len(failures) == 1 else PlanFailures(f"{summary}: {_listed(failures)}", tuple(failures))
+    error = (
+        failures[0] if len(failures) == 1 else PlanFailures(f"{summary}: {_list_failures(failures)}", tuple(failures))
+    )
     failures.clear()
     return error
 
 
-def _listed(failures: list[Exception]) -> str:
-    named = [in_words(each) for each in failures[:_NAMED_MAX]]
+def _list_failures(failures: list[Exception]) -> str:
+    named = [describe_error(each) for each in failures[:_NAMED_MAX]]
     more = len(failures) - len(named)
     return "; ".join([*named, f"and {more} more"] if more else named)
 

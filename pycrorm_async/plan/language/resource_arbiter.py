@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextvars import Token
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from pycrorm_async.plan.execution.execution_context import ExecutionContext, surroundings
+from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
 from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.plan.language.resources import Resource
 from pycrorm_async.world.observers import current_world
@@ -49,14 +49,14 @@ class Claim:
 
     def enter(self, around: ExecutionContext) -> None:
         """From now on what starts in this context is inside."""
-        self._token = surroundings.set(ExecutionContext(around.watches, self._arbiter, self))
+        self._token = execution_context.set(ExecutionContext(around.watches, self._arbiter, self))
 
     def release(self) -> None:
         """The node ended: the next ones may go on."""
         self._arbiter.release(self)
         assert self._token is not None
         try:
-            surroundings.reset(self._token)
+            execution_context.reset(self._token)
         except ValueError:
             # A dropped plan is closed in another context, whose surroundings are not ours to change.
             return
@@ -67,39 +67,39 @@ class Arbiter:
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
-        self._held: list[Claim] = []
+        self._holding: list[Claim] = []
         self._waiting: list[Claim] = []
 
-    async def claimed(self, designator: Designator, around: ExecutionContext) -> Claim | None:
+    async def claim(self, designator: Designator, around: ExecutionContext) -> Claim | None:
         """What the designator needs is its own; None if it needs nothing. Raises `ResourceDeadlock`."""
         wanted = designator.resources()
         if not wanted or asyncio.get_running_loop() is not self.loop:
             return None
         world = current_world.get()
         claim = Claim(self, designator, frozenset((world, resource) for resource in wanted), around.claim)
-        self._refuse_endless(claim)
+        self._check_deadlock(claim)
         self._waiting.append(claim)
         self._grant()
-        if claim not in self._held:
+        if claim not in self._holding:
             claim.granted = self.loop.create_future()
             try:
                 await claim.granted
             except BaseException:
-                self._give_up(claim)
+                self._withdraw(claim)
                 raise
         claim.enter(around)
         return claim
 
     def release(self, claim: Claim) -> None:
         """What it held is free, but for those above it."""
-        self._held.remove(claim)
+        self._holding.remove(claim)
         self._grant()
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _give_up(self, claim: Claim) -> None:
+    def _withdraw(self, claim: Claim) -> None:
         """The wait was cancelled, perhaps just after it was over."""
-        (self._held if claim in self._held else self._waiting).remove(claim)
+        (self._holding if claim in self._holding else self._waiting).remove(claim)
         self._grant()
 
     def _grant(self) -> None:
@@ -108,24 +108,24 @@ class Arbiter:
         while granted:
             granted = False
             for claim in tuple(self._waiting):
-                if not self._holders(claim) and not self._queues(claim):
+                if not self._holders(claim) and not self._must_queue(claim):
                     granted = True
                     self._waiting.remove(claim)
-                    self._held.append(claim)
+                    self._holding.append(claim)
                     if claim.granted is not None and not claim.granted.done():
                         claim.granted.set_result(None)
 
     def _holders(self, claim: Claim) -> list[Claim]:
         """Those in its way: they hold a part it needs, and it is not inside of them."""
         above = set(claim.above())
-        return [each for each in self._held if each not in above and each.parts & claim.parts]
+        return [each for each in self._holding if each not in above and each.parts & claim.parts]
 
-    def _queues(self, claim: Claim) -> bool:
+    def _must_queue(self, claim: Claim) -> bool:
         """Whether one who came earlier goes first."""
         above = set(claim.above())
-        return any(not self._waits_for(earlier, above) for earlier in self._earlier(claim))
+        return any(not self._waits_for(earlier, above) for earlier in self._earlier_rivals(claim))
 
-    def _earlier(self, claim: Claim) -> list[Claim]:
+    def _earlier_rivals(self, claim: Claim) -> list[Claim]:
         """Those before it in the queue that need some of the same."""
         before = self._waiting[: self._waiting.index(claim)]
         return [each for each in before if each.parts & claim.parts]
@@ -142,14 +142,14 @@ class Arbiter:
                 if holder in ends:
                     return True
                 ahead += self._waiting_in(holder)
-            ahead += self._earlier(each)
+            ahead += self._earlier_rivals(each)
         return False
 
     def _waiting_in(self, holder: Claim) -> list[Claim]:
         """Those it cannot end before: they wait inside of it."""
         return [each for each in self._waiting if holder in each.above()]
 
-    def _refuse_endless(self, claim: Claim) -> None:
+    def _check_deadlock(self, claim: Claim) -> None:
         """Raise `ResourceDeadlock` if one that is in the way waits, in the end, for what the claim is inside of."""
         ends = set(claim.above())
         for first in self._holders(claim):

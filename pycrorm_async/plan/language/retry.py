@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.failures import IllPosedGoalFailure, NotALanguageExpression, in_words
-from pycrorm_async.plan.language.expressions import Expression, performed
+from pycrorm_async.plan.failures import IllPosedGoalFailure, NotALanguageExpression, describe_error
+from pycrorm_async.plan.language.expressions import Expression, perform_operand
 from pycrorm_async.plan.language.operators import Composable
-from pycrorm_async.plan.language.outcome import attempted, together
+from pycrorm_async.plan.language.outcome import attempt, combine_failures
 
 __all__ = ["Retry"]
 
@@ -47,17 +47,17 @@ class Retry(Expression):
         failures: list[Exception] = []
         notes: list[str] = []
         for number, performable in enumerate(itertools.islice(self._alternatives(), self.max_tries), start=1):
-            result, failure = await attempted(functools.partial(performed, performable))
+            result, failure = await attempt(functools.partial(perform_operand, performable))
             if failure is None:
                 return result
             failures = [failure]
-            notes.append(f"try {number}: {in_words(failure)}")
+            notes.append(f"try {number}: {describe_error(failure)}")
             del failure
         if not failures:
             raise IllPosedGoalFailure(f"{self!r}: the description has no alternative")
         for note in notes[:-1]:
             failures[0].add_note(note)
-        raise together(failures, "")
+        raise combine_failures(failures, "")
 
     def _alternatives(self) -> Iterator[Any]:
         (operand,) = self.operands

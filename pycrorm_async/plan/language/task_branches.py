@@ -10,10 +10,10 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["ended", "raise_what_broke"]
+__all__ = ["join_tasks", "raise_errors"]
 
 
-async def ended(tasks: Sequence[asyncio.Task[Any]]) -> asyncio.CancelledError | None:
+async def join_tasks(tasks: Sequence[asyncio.Task[Any]]) -> asyncio.CancelledError | None:
     """All have ended; as soon as one was cancelled or raised, the others are cancelled.
 
     They are cancelled as often as this is, and at least once if one broke: a branch that cleans up is left alone.
@@ -45,7 +45,7 @@ async def ended(tasks: Sequence[asyncio.Task[Any]]) -> asyncio.CancelledError | 
         del outside
 
 
-def raise_what_broke(tasks: Sequence[asyncio.Task[Any]], outside: asyncio.CancelledError | None) -> None:
+def raise_errors(tasks: Sequence[asyncio.Task[Any]], outside: asyncio.CancelledError | None) -> None:
     """Raise what a task raised, all of it if there were several; else the cancellation, if there was one.
 
     An exception goes before a cancellation, as one that is raised while a plan is cleaned up does.

@@ -10,23 +10,23 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 
-from pycrorm_async.plan.current_robot import RobotHere, check_in_map, world_here
+from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_world
 from pycrorm_async.plan.errors import NoRobotHere
-from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retracted
+from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retract
 from pycrorm_async.plan.motions.process_modules import chosen_limits
-from pycrorm_async.plan.object_designators import ObjectLike, in_world, place_of
+from pycrorm_async.plan.object_designators import ObjectLike, in_world, pose_of
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 from pycrorm_async.world.queries.costmaps import Costmap, GaussianCostmap, OccupancyCostmap, VisibilityCostmap
 from pycrorm_async.world.robots.kinematics import Unreachable, solve
 
-__all__ = ["facing", "reaching_arms", "robot_meant", "stands"]
+__all__ = ["face", "reaching_arms", "resolve_robot", "base_poses"]
 
 CELLS_MAX = 600
 VISIBLE_SHARE_MIN = 0.5
 
 
-def stands(
+def base_poses(
     target: Pose | ObjectLike,
     *,
     reachable_for: ObjectLike | None,
@@ -34,13 +34,13 @@ def stands(
     reachable_arm: Arms | None,
 ) -> Iterator[tuple[Pose, tuple[Arms, ...] | None]]:
     """Poses of the base that face the target, best first, each with the arms that reach; None if it will not do."""
-    reacher = robot_meant(reachable_for) if reachable_for is not None else None
-    seer = robot_meant(visible_for) if visible_for is not None else None
-    goal = target if isinstance(target, Pose) else place_of(target)
+    reacher = resolve_robot(reachable_for) if reachable_for is not None else None
+    seer = resolve_robot(visible_for) if visible_for is not None else None
+    goal = target if isinstance(target, Pose) else pose_of(target)
     check_in_map(goal)
     costmap = _costmap(target, goal, [each for each in (reacher, seer) if each is not None], seer)
     for cell in costmap.best(CELLS_MAX):
-        stand = facing(cell, goal)
+        stand = face(cell, goal)
         if seer is not None and not _sees(seer, stand, target, goal):
             yield stand, None
         elif reacher is not None:
@@ -49,15 +49,15 @@ def stands(
             yield stand, ()
 
 
-def robot_meant(meant: ObjectLike) -> RobotHere:
+def resolve_robot(meant: ObjectLike) -> CurrentRobot:
     """The robot that is meant. Raises `NoRobotHere` if it is none, or of a kind that is not known here."""
     body = in_world(meant)
     if body.robot_description is None:
         raise NoRobotHere(f"{body.name!r} is not a robot of a kind that is known here")
-    return RobotHere(body, body.robot_description)
+    return CurrentRobot(body, body.robot_description)
 
 
-def facing(place: Pose, goal: Pose, *, turned: float = 0.0) -> Pose:
+def face(place: Pose, goal: Pose, *, turned: float = 0.0) -> Pose:
     """On the floor at the place, looking towards the goal, or `turned` (rad) from that to the left."""
     x, y, _ = place.position
     heading = math.atan2(goal.position.y - y, goal.position.x - x) + turned
@@ -65,7 +65,7 @@ def facing(place: Pose, goal: Pose, *, turned: float = 0.0) -> Pose:
 
 
 def reaching_arms(
-    robot: RobotHere,
+    robot: CurrentRobot,
     wanted: Arms | None,
     stand: Pose,
     goals: Callable[[Arms], Iterable[Pose]],
@@ -94,8 +94,8 @@ def reaching_arms(
     return tuple(reaching) if enough else None
 
 
-def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[RobotHere], seer: RobotHere | None) -> Costmap:
-    world = world_here()
+def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[CurrentRobot], seer: CurrentRobot | None) -> Costmap:
+    world = require_world()
     origin = Pose((goal.position.x, goal.position.y, 0.0))
     ignored = {part for robot in robots for part in robot.with_load()}
     costmap = OccupancyCostmap(world, origin, ignore=ignored) * GaussianCostmap(origin)
@@ -106,7 +106,7 @@ def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[RobotHere], see
     return costmap * VisibilityCostmap(world, seen, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored)
 
 
-def _goals(robot: RobotHere, stand: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
+def _goals(robot: CurrentRobot, stand: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
     body, description = robot
     tool_frame = description.arms[arm].tool_frame
     tool = body.link_pose(tool_frame)
@@ -114,13 +114,13 @@ def _goals(robot: RobotHere, stand: Pose, target: Pose | ObjectLike, goal: Pose,
         return pick_up_poses(goal, Grasp.FRONT, stand @ tool.relative_to(body.pose))
     held = next((each for each, link in body.attachments.items() if link == tool_frame), None)
     there = place_pose(goal, held.pose, tool) if held is not None else goal
-    return there, retracted(there)
+    return there, retract(there)
 
 
-def _sees(robot: RobotHere, stand: Pose, target: Pose | ObjectLike, goal: Pose) -> bool:
+def _sees(robot: CurrentRobot, stand: Pose, target: Pose | ObjectLike, goal: Pose) -> bool:
     """Whether the camera would have the target in plain view from there."""
     body, description = robot
     eye = (stand @ body.link_pose(description.camera_link).relative_to(body.pose)).position
     if isinstance(target, Pose):
-        return world_here().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
-    return world_here().visible(in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN
+        return require_world().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
+    return require_world().visible(in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN

@@ -26,10 +26,10 @@ from pycrorm_async.plan.failures import (
     ReachabilityFailure,
 )
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.locations.base_poses import stands
-from pycrorm_async.plan.locations.opening_poses import opening_stands
-from pycrorm_async.plan.locations.surfaces import places_on
-from pycrorm_async.plan.object_designators import ObjectLike, ObjectPart, place_of
+from pycrorm_async.plan.locations.base_poses import base_poses
+from pycrorm_async.plan.locations.opening_poses import opening_poses
+from pycrorm_async.plan.locations.surfaces import surface_poses
+from pycrorm_async.plan.object_designators import ObjectLike, ObjectPart, pose_of
 from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose
@@ -61,11 +61,11 @@ class LocationDesignator(ABC):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
-    def _look(self) -> Iterator[Location | None]:
+    def _candidates(self) -> Iterator[Location | None]:
         """Every place it looks at, in order; None for one that will not do."""
 
     @abstractmethod
-    def _nowhere(self) -> PlanFailure:
+    def _no_place_failure(self) -> PlanFailure:
         """What it means for a plan that there is no place."""
 
     def _name(self) -> str:
@@ -80,7 +80,7 @@ class LocationDesignator(ABC):
         finally:
             places.close()
         if place is None:
-            raise self._nowhere()
+            raise self._no_place_failure()
         return place
 
     def __iter__(self) -> Generator[Location, None, None]:
@@ -90,7 +90,7 @@ class LocationDesignator(ABC):
         taken: int | None = None
         considered = 0
         try:
-            for place in self._look():
+            for place in self._candidates():
                 considered += 1
                 if place is not None:
                     taken = len(offered)
@@ -120,10 +120,10 @@ class Location(LocationDesignator):
     grasp: Grasp | None = None
     torso_height: float | None = None
 
-    def _look(self) -> Iterator[Location | None]:
+    def _candidates(self) -> Iterator[Location | None]:
         yield self
 
-    def _nowhere(self) -> PlanFailure:
+    def _no_place_failure(self) -> PlanFailure:
         raise AssertionError("a place is somewhere")
 
 
@@ -134,10 +134,10 @@ class ObjectRelativeLocation(LocationDesignator):
     relative_pose: Pose
     reference_object: ObjectLike
 
-    def _look(self) -> Iterator[Location | None]:
-        yield Location(place_of(self.reference_object) @ self.relative_pose)
+    def _candidates(self) -> Iterator[Location | None]:
+        yield Location(pose_of(self.reference_object) @ self.relative_pose)
 
-    def _nowhere(self) -> PlanFailure:
+    def _no_place_failure(self) -> PlanFailure:
         raise AssertionError("beside a thing is somewhere")
 
 
@@ -164,8 +164,8 @@ class CostmapLocation(LocationDesignator):
     visible_for: ObjectLike | None = None
     reachable_arm: Arms | None = None
 
-    def _look(self) -> Iterator[Location | None]:
-        for pose, arms in stands(
+    def _candidates(self) -> Iterator[Location | None]:
+        for pose, arms in base_poses(
             self.target,
             reachable_for=self.reachable_for,
             visible_for=self.visible_for,
@@ -173,7 +173,7 @@ class CostmapLocation(LocationDesignator):
         ):
             yield Location(pose, arms) if arms is not None else None
 
-    def _nowhere(self) -> PlanFailure:
+    def _no_place_failure(self) -> PlanFailure:
         if self.reachable_for is None:
             return LookingHighLevelFailure("there is no place to see it from")
         if isinstance(self.target, Pose):
@@ -206,11 +206,11 @@ class AccessingLocation(LocationDesignator):
     robot: ObjectLike
     arm: Arms | None = None
 
-    def _look(self) -> Iterator[Location | None]:
-        for pose, arms in opening_stands(self.handle, self.robot, self.arm):
+    def _candidates(self) -> Iterator[Location | None]:
+        for pose, arms in opening_poses(self.handle, self.robot, self.arm):
             yield Location(pose, arms) if arms is not None else None
 
-    def _nowhere(self) -> PlanFailure:
+    def _no_place_failure(self) -> PlanFailure:
         name = self.handle.name
         return EnvironmentUnreachable(f"there is no place to stand and open and close {name}", name)
 
@@ -233,10 +233,10 @@ class SemanticCostmapLocation(LocationDesignator):
     part_of: ObjectLike
     for_object: ObjectLike | None = None
 
-    def _look(self) -> Iterator[Location | None]:
-        for pose in places_on(self.urdf_link_name, self.part_of, self.for_object):
+    def _candidates(self) -> Iterator[Location | None]:
+        for pose in surface_poses(self.urdf_link_name, self.part_of, self.for_object):
             yield Location(pose) if pose is not None else None
 
-    def _nowhere(self) -> PlanFailure:
+    def _no_place_failure(self) -> PlanFailure:
         what = self.for_object.name if self.for_object is not None else "anything"
         return ObjectUnavailable(f"there is no room for {what} on {self.urdf_link_name}", self.urdf_link_name, what)

@@ -13,14 +13,14 @@ from collections.abc import AsyncIterator, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan.current_robot import RobotHere, world_here
+from pycrorm_async.plan.current_robot import CurrentRobot, require_world
 from pycrorm_async.plan.experience import Experience, PastSuccess, experience
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses
-from pycrorm_async.plan.locations.base_poses import reaching_arms, robot_meant
+from pycrorm_async.plan.locations.base_poses import reaching_arms, resolve_robot
 from pycrorm_async.plan.locations.designators import Location, LocationDesignator
-from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectLike, designator_of, place_of
+from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectLike, designator_of, pose_of
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, rotated, yaw_quaternion
@@ -74,7 +74,7 @@ class DatabaseCostmapLocation:
 
     def __aiter__(self) -> AsyncIterator[Location]:
         """One place after another, the best first; the last one asked for counts as taken, none if all were."""
-        return _Places(self)
+        return _PlaceIterator(self)
 
     async def remembered(self) -> LocationDesignator:
         """The same places as an ordinary location designator, with what is known at this moment."""
@@ -85,17 +85,17 @@ class DatabaseCostmapLocation:
                 " or give it as `experience`"
             )
         past = await known.successes(designator_of(self.target).object_type, arm=self.reachable_arm)
-        return _Remembered(self.target, self.reachable_for, past)
+        return _ExperienceLocation(self.target, self.reachable_for, past)
 
 
-class _Places:
+class _PlaceIterator:
     """No async generator: left in the middle, it is over at once, and not when the loop gets round to it."""
 
     def __init__(self, asked: DatabaseCostmapLocation) -> None:
         self._asked = asked
         self._places: Iterator[Location] | None = None
 
-    def __aiter__(self) -> _Places:
+    def __aiter__(self) -> _PlaceIterator:
         return self
 
     async def __anext__(self) -> Location:
@@ -107,7 +107,7 @@ class _Places:
 
 
 @dataclass(frozen=True)
-class _Remembered(LocationDesignator):
+class _ExperienceLocation(LocationDesignator):
     """The same question, once the experience is known."""
 
     target: ObjectLike
@@ -117,13 +117,13 @@ class _Remembered(LocationDesignator):
     def _name(self) -> str:
         return DatabaseCostmapLocation.__name__
 
-    def _look(self) -> Iterator[Location | None]:
-        there = place_of(self.target)
-        robot = robot_meant(self.reachable_for) if self.reachable_for is not None else None
+    def _candidates(self) -> Iterator[Location | None]:
+        there = pose_of(self.target)
+        robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
         origin = Pose((there.position.x, there.position.y, 0.0))
         ignored = robot.with_load() if robot is not None else None
         free = OccupancyCostmap(
-            world_here(), origin, distance_to_obstacle_m=CLEARANCE_M, size_cells=_CELLS, ignore=ignored
+            require_world(), origin, distance_to_obstacle_m=CLEARANCE_M, size_cells=_CELLS, ignore=ignored
         )
         for each in self.past:
             stand = _stand(there @ each.stand)
@@ -133,7 +133,7 @@ class _Remembered(LocationDesignator):
             reaches = robot is None or _reaches(robot, stand, there, each)
             yield Location(stand, (each.arm,), each.grasp, each.torso_height) if reaches else None
 
-    def _nowhere(self) -> PlanFailure:
+    def _no_place_failure(self) -> PlanFailure:
         name = self.target.name
         return ObjectUnreachable(f"nothing that is remembered fits for {name}", name)
 
@@ -145,7 +145,7 @@ def _stand(base: Pose) -> Pose | None:
     return Pose((base.position.x, base.position.y, 0.0), yaw_quaternion(base.yaw), base.frame)
 
 
-def _reaches(robot: RobotHere, stand: Pose, there: Pose, past: PastSuccess) -> bool:
+def _reaches(robot: CurrentRobot, stand: Pose, there: Pose, past: PastSuccess) -> bool:
     """Whether that arm reaches all three goals of that grasp from there, with the torso at that height."""
     body, description = robot
     if past.arm not in description.arms:

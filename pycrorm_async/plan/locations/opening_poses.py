@@ -10,17 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from pycrorm_async.plan.current_robot import RobotHere
+from pycrorm_async.plan.current_robot import CurrentRobot
 from pycrorm_async.plan.geometry.articulation import Handle, closed_position, hand_poses, handle_of, opened_position
-from pycrorm_async.plan.geometry.grasp_poses import approached
-from pycrorm_async.plan.locations.base_poses import facing, reaching_arms, robot_meant
+from pycrorm_async.plan.geometry.grasp_poses import approach
+from pycrorm_async.plan.locations.base_poses import face, reaching_arms, resolve_robot
 from pycrorm_async.plan.object_designators import ObjectLike
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.queries.costmaps import Costmap, GaussianCostmap, OccupancyCostmap
 
-__all__ = ["opening_stands"]
+__all__ = ["opening_poses"]
 
 CLEARANCE_M = 0.4
 CELLS_MAX = 600
@@ -31,7 +31,7 @@ _SIGMA_CELLS = 6.0  # 0.3 m, as for picking up
 _SWEEP_STEPS = 10
 
 
-def opening_stands(
+def opening_poses(
     part: ObjectLike, robot: ObjectLike, arm: Arms | None
 ) -> Iterator[tuple[Pose, tuple[Arms, ...] | None]]:
     """Poses of the base, best first, each with the arms that can do it all from there; None if it will not do.
@@ -39,14 +39,14 @@ def opening_stands(
     First the places that what is opened does not sweep, facing the handle; then turned from that by each
     multiple of 45 degrees; then the same for the places that it does sweep.
     """
-    handle, reacher = handle_of(part), robot_meant(robot)
+    handle, reacher = handle_of(part), resolve_robot(robot)
     there = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
     goals = _goals(handle)
     for costmap in _costmaps(handle, there, reacher):
         cells = costmap.best(CELLS_MAX)
         for number in range(HEADINGS):
             for cell in cells:
-                stand = facing(cell, there, turned=number * math.tau / HEADINGS)
+                stand = face(cell, there, turned=number * math.tau / HEADINGS)
                 yield stand, reaching_arms(reacher, arm, stand, lambda _: goals)
 
 
@@ -60,10 +60,10 @@ def _goals(handle: Handle) -> list[Pose]:
         from_here = hand_poses(handle, opened)
         ends.append(from_here[0])
         ways += [*from_here[1:], *hand_poses(handle, closed)[1:]]
-    return [*ends, *(approached(each) for each in ends), *ways]
+    return [*ends, *(approach(each) for each in ends), *ways]
 
 
-def _costmaps(handle: Handle, there: Pose, robot: RobotHere) -> Iterator[Costmap]:
+def _costmaps(handle: Handle, there: Pose, robot: CurrentRobot) -> Iterator[Costmap]:
     """Near the handle and clear of all that is there: first what is not swept, then what is."""
     world, origin = handle.whole.world, Pose((there.position.x, there.position.y, 0.0))
     near = GaussianCostmap(origin, sigma_cells=_SIGMA_CELLS, size_cells=_CELLS, resolution_m=CELL_M)

@@ -10,13 +10,13 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, yaw_quaternion
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, box_around
 
-__all__ = ["places_on"]
+__all__ = ["surface_poses"]
 
 STEP_M = 0.02
 _POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
 
 
-def places_on(link: str, whole: ObjectLike, thing: ObjectLike | None) -> Iterator[Pose | None]:
+def surface_poses(link: str, whole: ObjectLike, thing: ObjectLike | None) -> Iterator[Pose | None]:
     """Poses for `thing` on top of the link, turned as the link is; None for a place where something is already."""
     support = in_world(whole)
     put = in_world(thing) if thing is not None else None
@@ -27,15 +27,15 @@ def places_on(link: str, whole: ObjectLike, thing: ObjectLike | None) -> Iterato
     occupied = [
         each.bounding_box() for each in support.world.objects if each is not support and not _moves_along(each, put)
     ]
-    for x, y in _scattered(surface, extent):
-        there = _moved(extent, x, y, z)
+    for x, y in _grid_points(surface, extent):
+        there = _translate(extent, x, y, z)
         if put is not None and any(_overlap(there, box) for box in occupied):
             yield None
         else:
             yield Pose((x, y, z), heading)
 
 
-def _scattered(surface: BoundingBox, extent: BoundingBox) -> Iterator[tuple[float, float]]:
+def _grid_points(surface: BoundingBox, extent: BoundingBox) -> Iterator[tuple[float, float]]:
     """Points at which a thing of that extent does not stick out; only the middle, if it does everywhere."""
     ranges = []
     for low, high, below, above in zip(surface.min[:2], surface.max[:2], extent.min[:2], extent.max[:2], strict=True):
@@ -59,7 +59,7 @@ def _extent(thing: Object, turn: Quaternion) -> BoundingBox:
     return box_around(placed) or _POINT
 
 
-def _moved(box: BoundingBox, x: float, y: float, z: float) -> BoundingBox:
+def _translate(box: BoundingBox, x: float, y: float, z: float) -> BoundingBox:
     return BoundingBox(
         Vector(box.min.x + x, box.min.y + y, box.min.z + z), Vector(box.max.x + x, box.max.y + y, box.max.z + z)
     )

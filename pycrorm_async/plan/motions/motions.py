@@ -13,7 +13,7 @@ from typing import ClassVar
 from pycrorm_async.plan.designator import BaseMotion
 from pycrorm_async.plan.errors import ResolutionError
 from pycrorm_async.plan.language.resources import NOTHING, Resource, arms, moving, reaching
-from pycrorm_async.plan.motions.perception import perceived
+from pycrorm_async.plan.motions.perception import report_perception
 from pycrorm_async.plan.motions.process_modules import chosen_robot
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
 from pycrorm_async.world.enums import Arms, GripperState, ObjectType
@@ -174,7 +174,7 @@ class DetectingMotion(BaseMotion):
 
     async def perform(self) -> ObjectDesignator:
         looking = chosen_robot(self, "detecting").detecting(self)
-        return await perceived(looking, source="camera", object_type=self.object_type)
+        return await report_perception(looking, source="camera", object_type=self.object_type)
 
 
 @dataclass
@@ -187,7 +187,7 @@ class WorldStateDetectingMotion(BaseMotion):
 
     async def perform(self) -> ObjectDesignator:
         asking = chosen_robot(self, "world_state_detecting").world_state_detecting(self)
-        return await perceived(asking, source="world_state", object_type=self.object_type)
+        return await report_perception(asking, source="world_state", object_type=self.object_type)
 
 
 @dataclass

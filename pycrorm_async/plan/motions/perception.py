@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Awaitable, Sequence
 from typing import Literal, TypeAlias
 
-from pycrorm_async.plan.current_robot import RobotHere, world_here
+from pycrorm_async.plan.current_robot import CurrentRobot, require_world
 from pycrorm_async.plan.execution.observer import Seen, recorder
 from pycrorm_async.plan.failures import PerceptionObjectNotFound
 from pycrorm_async.plan.object_designators import ObjectDesignator, designator_of
@@ -22,7 +22,7 @@ from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.visibility import met_towards
 from pycrorm_async.world.robots.robot_description import FieldOfView
 
-__all__ = ["SEEN_SHARE_MIN", "in_field_of_view", "perceived", "seen_by_camera", "told_by_world"]
+__all__ = ["SEEN_SHARE_MIN", "in_field_of_view", "report_perception", "seen_by_camera", "objects_in_world"]
 
 Source: TypeAlias = Literal["camera", "world_state"]
 
@@ -30,7 +30,9 @@ SEEN_SHARE_MIN = 0.8
 """Of an object that is seen, at least this share is not hidden."""
 
 
-async def perceived(looking: Awaitable[Sequence[Seen]], *, source: Source, object_type: ObjectType) -> ObjectDesignator:
+async def report_perception(
+    looking: Awaitable[Sequence[Seen]], *, source: Source, object_type: ObjectType
+) -> ObjectDesignator:
     """The best of what was perceived; the recorder is told of all of it, also of nothing.
 
     Raises:
@@ -40,15 +42,15 @@ async def perceived(looking: Awaitable[Sequence[Seen]], *, source: Source, objec
     try:
         seen = tuple(await looking)
     except PerceptionObjectNotFound:
-        _tell(source, object_type, seen)
+        _notify(source, object_type, seen)
         raise
-    _tell(source, object_type, seen)
+    _notify(source, object_type, seen)
     if not seen:
         raise PerceptionObjectNotFound(f"no {object_type.name} was perceived", object_type)
     return designator_of(seen[0].thing)
 
 
-def seen_by_camera(robot: RobotHere, object_type: ObjectType) -> tuple[Seen, ...]:
+def seen_by_camera(robot: CurrentRobot, object_type: ObjectType) -> tuple[Seen, ...]:
     """The objects of that type that the head's camera sees, the best seen first.
 
     What the robot itself hides, or what it carries, is looked past.
@@ -59,10 +61,10 @@ def seen_by_camera(robot: RobotHere, object_type: ObjectType) -> tuple[Seen, ...
     camera = robot.body.link_pose(robot.description.camera_link)
     seen: list[Seen] = []
     unseen: dict[str, str] = {}
-    for thing in world_here().objects:
+    for thing in require_world().objects:
         if thing.object_type is not object_type or thing is robot.body:
             continue
-        share, reason = _looked_at(robot, camera, thing)
+        share, reason = _visibility(robot, camera, thing)
         if reason is None:
             seen.append(Seen(thing, share))
         else:
@@ -74,9 +76,9 @@ def seen_by_camera(robot: RobotHere, object_type: ObjectType) -> tuple[Seen, ...
     return tuple(sorted(seen, key=lambda each: -(each.visible or 0.0)))
 
 
-def told_by_world(object_type: ObjectType) -> tuple[Seen, ...]:
+def objects_in_world(object_type: ObjectType) -> tuple[Seen, ...]:
     """The objects of that type that there are, in the order they came. Raises `PerceptionObjectNotFound`."""
-    there = tuple(Seen(thing) for thing in world_here().objects if thing.object_type is object_type)
+    there = tuple(Seen(thing) for thing in require_world().objects if thing.object_type is object_type)
     if not there:
         raise PerceptionObjectNotFound(f"there is no {object_type.name} in the world", object_type)
     return there
@@ -88,13 +90,13 @@ def in_field_of_view(camera: Pose, view: FieldOfView, point: Sequence[float]) ->
     return abs(math.atan2(x, z)) <= view.horizontal / 2 and abs(math.atan2(y, z)) <= view.vertical / 2
 
 
-def _tell(source: Source, object_type: ObjectType, seen: tuple[Seen, ...]) -> None:
+def _notify(source: Source, object_type: ObjectType, seen: tuple[Seen, ...]) -> None:
     observer = recorder.get()
     if observer is not None:
         observer.object_detected(source=source, object_type=object_type, seen=seen, node=current_node.get())
 
 
-def _looked_at(robot: RobotHere, camera: Pose, thing: Object) -> tuple[float, str | None]:
+def _visibility(robot: CurrentRobot, camera: Pose, thing: Object) -> tuple[float, str | None]:
     """The share of it that is not hidden, and why it is not seen, if it is not."""
     if not in_field_of_view(camera, robot.description.camera_view_rad, thing.bounding_box().centre):
         return 0.0, "is outside the camera's field of view"

@@ -9,7 +9,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from pycrorm_async.plan.current_robot import RobotHere, check_in_map, robot_here
+from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_robot
 from pycrorm_async.plan.execution.observer import Seen
 from pycrorm_async.plan.failures import (
     ConfigurationNotReached,
@@ -27,14 +27,14 @@ from pycrorm_async.plan.geometry.articulation import (
     moved_position,
     opened_position,
 )
-from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, between
-from pycrorm_async.plan.geometry.gripper_checks import check_beside
-from pycrorm_async.plan.motions.perception import seen_by_camera, told_by_world
+from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, distance_to_box
+from pycrorm_async.plan.geometry.gripper_checks import check_same_world
+from pycrorm_async.plan.motions.perception import objects_in_world, seen_by_camera
 from pycrorm_async.plan.object_designators import ObjectPart
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import JointLimitExceeded, UnknownJoint
 from pycrorm_async.world.pose import Pose
-from pycrorm_async.world.queries.collision_queries import touched_at
+from pycrorm_async.world.queries.collision_queries import collisions_at
 from pycrorm_async.world.robots.kinematics import Limits, Unreachable, solve
 
 if TYPE_CHECKING:
@@ -67,29 +67,29 @@ class SimulatedModules:
         self._collisions = collisions
 
     async def navigate(self, motion: MoveMotion) -> None:
-        robot_here().body.set_pose(motion.target)
+        require_robot().body.set_pose(motion.target)
 
     async def move_tcp(self, motion: MoveTCPMotion) -> None:
-        robot = robot_here()
-        joints = self._reaching(robot, motion.arm, motion.target)
+        robot = require_robot()
+        joints = self._solve(robot, motion.arm, motion.target)
         if self._collisions:
             self._check_clear(robot, motion, joints)
         robot.body.set_joint_positions(joints)
 
     async def looking(self, motion: LookingMotion) -> None:
-        robot = robot_here()
+        robot = require_robot()
         check_in_map(motion.target)
         robot.body.set_joint_positions(head_joints(robot, motion.target))
 
     async def move_gripper(self, motion: MoveGripperMotion) -> None:
-        robot = robot_here()
+        robot = require_robot()
         joints: dict[str, float] = {}
         for arm in robot.each_arm(motion.gripper).values():
             joints |= arm.gripper_joints[motion.motion]
         robot.body.set_joint_positions(joints)
 
     async def move_arm_joints(self, motion: MoveArmJointsMotion) -> None:
-        robot = robot_here()
+        robot = require_robot()
         wanted: dict[str, float] = {}
         for arm, positions in ((Arms.LEFT, motion.left_arm_poses), (Arms.RIGHT, motion.right_arm_poses)):
             for joint in positions or {}:
@@ -99,46 +99,46 @@ class SimulatedModules:
         _set_joints(robot, wanted)
 
     async def move_joints(self, motion: MoveJointsMotion) -> None:
-        _set_joints(robot_here(), dict(zip(motion.names, motion.positions, strict=True)))
+        _set_joints(require_robot(), dict(zip(motion.names, motion.positions, strict=True)))
 
     async def detecting(self, motion: DetectingMotion) -> Sequence[Seen]:
-        return seen_by_camera(robot_here(), motion.object_type)
+        return seen_by_camera(require_robot(), motion.object_type)
 
     async def world_state_detecting(self, motion: WorldStateDetectingMotion) -> Sequence[Seen]:
-        return told_by_world(motion.object_type)
+        return objects_in_world(motion.object_type)
 
     async def open(self, motion: OpeningMotion) -> None:
         handle = handle_of(motion.object_part)
-        self._lead(robot_here(), motion.arm, handle, opened_position(handle))
+        self._move_handle(require_robot(), motion.arm, handle, opened_position(handle))
 
     async def close(self, motion: ClosingMotion) -> None:
         handle = handle_of(motion.object_part)
-        self._lead(robot_here(), motion.arm, handle, closed_position(handle))
+        self._move_handle(require_robot(), motion.arm, handle, closed_position(handle))
 
     async def accessing(self, motion: AccessingMotion) -> None:
-        robot = robot_here()
+        robot = require_robot()
         tool_frame = robot.one_arm(motion.arm).tool_frame
         if motion.gripper != tool_frame:
             message = f"the gripper of the {motion.arm.name} arm is {tool_frame}, not {motion.gripper}"
             raise IllPosedGoalFailure(message, motion.gripper)
         handle = handle_of(ObjectPart(motion.drawer_handle, motion.part_of), motion.drawer_joint)
-        self._lead(robot, motion.arm, handle, moved_position(handle, motion.distance))
+        self._move_handle(robot, motion.arm, handle, moved_position(handle, motion.distance))
 
-    def _lead(self, robot: RobotHere, arm: Arms, handle: Handle, goal: float) -> None:
+    def _move_handle(self, robot: CurrentRobot, arm: Arms, handle: Handle, goal: float) -> None:
         """Bring the handle's joint to `goal` with the hand that is on it; the hand is on it as before then."""
-        check_beside(robot, handle.whole)
+        check_same_world(robot, handle.whole)
         tool_frame = robot.one_arm(arm).tool_frame
         tool = robot.body.link_pose(tool_frame)
-        apart = between(tool, handle.whole.bounding_box(handle.link))
+        apart = distance_to_box(tool, handle.whole.bounding_box(handle.link))
         if apart > HOLD_DISTANCE_M_MAX:
             message = f"{tool_frame} is not on {handle.link} but {apart:.3f} m away: grasp it first"
             raise EnvironmentManipulationImpossible(message, handle.link, apart)
         grip = tool.relative_to(handle.whole.link_pose(handle.link))
-        way = [self._reaching(robot, arm, each @ grip) for each in handle_poses(handle, goal)]
+        way = [self._solve(robot, arm, each @ grip) for each in handle_poses(handle, goal)]
         robot.body.set_joint_positions(way[-1])
         handle.whole.set_joint_position(handle.joint, goal)
 
-    def _reaching(self, robot: RobotHere, arm: Arms, target: Pose) -> dict[str, float]:
+    def _solve(self, robot: CurrentRobot, arm: Arms, target: Pose) -> dict[str, float]:
         """The arm's joints with which its tool frame is at the target. Raises `IKError`."""
         tool_frame = robot.one_arm(arm).tool_frame
         try:
@@ -146,7 +146,7 @@ class SimulatedModules:
         except Unreachable as unreachable:
             raise IKError(target, arm, tool_frame, unreachable.reason) from unreachable
 
-    def _check_clear(self, robot: RobotHere, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
+    def _check_clear(self, robot: CurrentRobot, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
         """Raise `ManipulationGoalInCollision` if the arm would be in something with these joints."""
         arm = robot.one_arm(motion.arm)
         last = arm.joints[-1] if motion.allow_gripper_collision else None
@@ -154,14 +154,14 @@ class SimulatedModules:
         above = {link: body.joints_above(link) for link in body.links if body.body.solids[link]}
         links = [link for link, found in above.items() if arm.joints[0] in found and last not in found]
         held = [thing for thing, link in body.attachments.items() if link == arm.tool_frame]
-        met = touched_at(body, joints, links=links, carried=held)
+        met = collisions_at(body, joints, links=links, carried=held)
         if met:
             part, thing = met[0]
             message = f"there the {motion.arm.name} arm would be in {thing.name} with {part}"
             raise ManipulationGoalInCollision(message, part, thing.name)
 
 
-def head_joints(robot: RobotHere, target: Pose) -> dict[str, float]:
+def head_joints(robot: CurrentRobot, target: Pose) -> dict[str, float]:
     """Pan and tilt (rad) with which the camera's axis goes towards the target, as far as the neck can turn.
 
     Pan turns about z of the pan link. Tilt turns about y of the tilt link, whose origin the pan carries
@@ -176,16 +176,16 @@ def head_joints(robot: RobotHere, target: Pose) -> dict[str, float]:
     ahead = math.hypot(seen.x, seen.y) - tilt_origin.x
     tilt = -math.atan2(seen.z - tilt_origin.z, ahead)
     return {
-        description.head_pan_joint: _clamped(pan, body.joint_limits(description.head_pan_joint)),
-        description.head_tilt_joint: _clamped(tilt, body.joint_limits(description.head_tilt_joint)),
+        description.head_pan_joint: _clamp(pan, body.joint_limits(description.head_pan_joint)),
+        description.head_tilt_joint: _clamp(tilt, body.joint_limits(description.head_tilt_joint)),
     }
 
 
-def _clamped(value: float, limits: tuple[float, float]) -> float:
+def _clamp(value: float, limits: tuple[float, float]) -> float:
     return max(limits[0], min(limits[1], value))
 
 
-def _set_joints(robot: RobotHere, positions: Mapping[str, float]) -> None:
+def _set_joints(robot: CurrentRobot, positions: Mapping[str, float]) -> None:
     body, description = robot
     try:
         body.set_joint_positions(positions)

@@ -11,13 +11,13 @@ from pycrorm_async.world.bullet_loader import engine
 if TYPE_CHECKING:
     from pycrorm_async.world.objects import Object
 
-__all__ = ["touched_at", "TOUCH_M"]
+__all__ = ["collisions_at", "TOUCH_M"]
 
 TOUCH_M = 1e-3
 """Penetrations up to this depth count as contact, not as collision: an object standing on a table has one."""
 
 
-def touched_at(
+def collisions_at(
     robot: Object,
     positions: Mapping[str, float],
     *,
