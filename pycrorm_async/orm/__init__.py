@@ -1,7 +1,7 @@
-"""What people ask: mapped classes with the thesis' names, complete in an editor. All of them stand on views.
+"""Map the public views to classes with the thesis' names, which editors can complete.
 
-`select(PickUpAction)`, `select(Action)`, `select(TaskTreeNode)` … are ordinary SQLAlchemy; everything an object names
-is loaded with it.
+`select(PickUpAction)`, `select(Action)`, `select(TaskTreeNode)` … are ordinary SQLAlchemy. Relationships are loaded
+together with their object.
 """
 
 from pycrorm_async.orm.actions import (

@@ -1,7 +1,7 @@
-"""The built-in actions: those of the thesis' table 4.1, and those a plan has besides.
+"""Map the built-in actions: those of the thesis' table 4.1, and further ones of this package.
 
-Columns are named like the designators' fields. The first pose is also `pose`, the first object also `object`: the names
-the thesis' queries use. Enum columns give and take members.
+Columns have the names of the designators' fields. The first pose is also `pose`, the first object also `object`, as in
+the thesis' queries. Enum columns return and accept members.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class SetGripperAction(Action):
 
 
 class ReleaseAction(Action):
-    """Let go of an object."""
+    """Release an object."""
 
     __tablename__ = "release_action"
 
@@ -106,7 +106,7 @@ class GripAction(Action):
 
 
 class PickUpAction(Action):
-    """Grasp an object and lift it; `object` is as it was before."""
+    """Grasp an object and lift it; `object` is its row from before the action."""
 
     __tablename__ = "pick_up_action"
 
@@ -121,7 +121,7 @@ class PickUpAction(Action):
 
 
 class PlaceAction(Action):
-    """Put a held object where it shall stand."""
+    """Place a grasped object at a pose."""
 
     __tablename__ = "place_action"
 
@@ -183,7 +183,7 @@ class DetectAction(Action):
 
 
 class OpenAction(Action):
-    """Open what `object`, a handle, belongs to."""
+    """Open the container that `object`, a handle, belongs to."""
 
     __tablename__ = "open_action"
 
@@ -197,7 +197,7 @@ class OpenAction(Action):
 
 
 class CloseAction(Action):
-    """Close what `object`, a handle, belongs to."""
+    """Close the container that `object`, a handle, belongs to."""
 
     __tablename__ = "close_action"
 
@@ -258,11 +258,11 @@ class BatchRolloutAction(Action):
     """Try one action many times, each chosen by a policy (`pycrorm_async.learning.batch_rollout`).
 
     Attributes:
-        policy: its name, made from what it says.
-        scene: where, in words.
-        seed: of the random numbers; with the index they make a rollout.
-        first: the index of the first child that ended; the next one has the next.
-        count: how many it was to be; fewer, if it was interrupted.
+        policy: its name, which describes it.
+        scene: a description of the world.
+        seed: of the random numbers; seed and index determine a rollout.
+        first: the index of the first rollout; later ones count on from it.
+        count: the number of rollouts requested; an interrupted batch has fewer children.
     """
 
     __tablename__ = "batch_rollout_action"

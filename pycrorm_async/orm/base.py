@@ -1,7 +1,7 @@
-"""What every mapped class is built on, and the smallest of them: episodes and poses.
+"""Define the base of the mapped classes, and the classes of episodes, poses and the robot's state.
 
-All classes are for asking: they stand on views, which the projections keep, and nothing is ever inserted through them.
-Relationships are loaded with the object that has them, so that reading an attribute never waits for the database.
+All mapped classes are read-only: they select from the public views. Relationships are loaded together with their
+object, so that reading an attribute never waits for the database.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["Base", "ProcessMetaData", "Position", "Quaternion", "Pose", "RobotSt
 
 
 class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
-    """The root of the mapped classes. Its repr shows what is loaded and never waits for more."""
+    """The root of the mapped classes. Its repr shows loaded attributes only and never queries the database."""
 
     type_annotation_map: ClassVar[dict[Any, Any]] = {
         int: BigInteger(),
@@ -47,7 +47,7 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
 
 
 class ProcessMetaData(Base):
-    """An episode: who ran what, why, with what, and how it ended. `id` is the episode's number in this database.
+    """An episode with its user, plan, software and outcome. `id` is the episode's number in this database.
 
     `status` is RUNNING, SUCCEEDED, FAILED, ERROR, INTERRUPTED or LOST.
     """
@@ -60,7 +60,7 @@ class ProcessMetaData(Base):
     created_by: Mapped[str]
     description: Mapped[str]
     version: Mapped[str]
-    """Of the software that recorded it."""
+    """The version of the software that recorded it."""
     host: Mapped[str]
     python: Mapped[str]
     plan: Mapped[str | None]
@@ -71,19 +71,19 @@ class ProcessMetaData(Base):
     failure_type: Mapped[str | None]
     failure_message: Mapped[str | None]
     simulated: Mapped[bool]
-    """It was thought through in a copy of the world, and nothing of it happened."""
+    """Whether it is a simulation, performed in a copy of the world."""
     thought_by: Mapped[str | None]
-    """UUID of the episode it was thought through in."""
+    """UUID of the episode that performed this simulation."""
     thought_by_node: Mapped[int | None]
-    """The sequence, in that episode, of the node that thought it through."""
+    """The sequence, in that episode, of the node that performed this simulation."""
     continues: Mapped[str | None]
-    """UUID of the episode that came near its last sequence, and of which this one is the rest."""
+    """UUID of the episode that this one continues, because that one came near its last possible sequence."""
     continued_in: Mapped[str | None]
-    """UUID of the episode that is the rest of this one."""
+    """UUID of the episode that continues this one."""
 
 
 class Position(Base):
-    """Metres. One for each pose, with the same id."""
+    """The position of a pose in m, with the pose's id."""
 
     __tablename__ = "position"
 
@@ -95,7 +95,7 @@ class Position(Base):
 
 
 class Quaternion(Base):
-    """A rotation of length one. One for each pose, with the same id."""
+    """The orientation of a pose as a unit quaternion, with the pose's id."""
 
     __tablename__ = "quaternion"
 
@@ -108,7 +108,7 @@ class Quaternion(Base):
 
 
 class Pose(Base):
-    """Where something was and how it was turned. The numbers are here too, so that a query needs no join for them."""
+    """A position (m) and an orientation (unit quaternion), also as columns, so that queries need no join for them."""
 
     __tablename__ = "pose"
 
@@ -132,7 +132,7 @@ class Pose(Base):
 
 
 class RobotState(Base):
-    """The robot when a node started: base pose and torso position (m). None of it exists without a robot."""
+    """The robot's base pose and torso position (m) when a node started. Nodes without a robot have no row."""
 
     __tablename__ = "robot_state"
 

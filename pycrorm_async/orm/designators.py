@@ -1,10 +1,10 @@
-"""What was performed: designators, which are actions, motions or expressions of the plan language.
+"""Map performed designators: actions, motions and expressions of the plan language.
 
-`select(Action)` gives every action, each as the nearest class this process has: the built-in ones, those declared with
-`class ORMSaying(Action)`, those a memory makes for types that have none; without any of these it is an `Action`, whose
-fields are in `parameters` (`await action.awaitable_attrs.parameters`).
+`select(Action)` returns every action as an instance of the nearest class in this process: a built-in one, one declared
+with `class ORMSaying(Action)`, or one that the memory generates for a type without a class. If none exists the object
+is an `Action`, whose fields are in `parameters` (`await action.awaitable_attrs.parameters`).
 
-Descend from `Action` or `Motion` to map a designator of your own; its table is named like the class:
+Derive from `Action` or `Motion` to map a designator of your own; its table has the name of the class:
 
 >>> class ORMSaying(Action):
 ...     id: Mapped[int] = mapped_column(ForeignKey(f"{Action.__tablename__}.id"), primary_key=True)
@@ -30,12 +30,12 @@ __all__ = ["DesignatorType", "ParameterItem", "Designator", "Action", "Motion", 
 
 
 class DesignatorType(Base):
-    """A designator type as a process declared it; several rows of one `dtype` if its fields changed over time.
+    """A declaration of a designator type; a `dtype` has several rows if its fields changed over time.
 
     Attributes:
         fingerprint: of the declaration.
-        leaf: the table its parameters are in.
-        concept: the SOMA concept it stands for, if one is known.
+        leaf: the table of its parameters.
+        concept: its SOMA concept, if it declares one.
         fields: name, column and type of each field.
     """
 
@@ -50,13 +50,13 @@ class DesignatorType(Base):
 
 
 class ParameterItem(Base):
-    """One entry of a list or dict field. Its value is in the column of its type; a pose lies in x to frame.
+    """One entry of a list or dict field. Its value is in the column of its type; a pose is in x to frame.
 
     Attributes:
         field: the field's name.
         position: 0, 1, 2 … in the order of the list or dict.
         key: of a dict; None in a list.
-        object_id: the object as it was; for one the world does not hold, its name and type are here instead.
+        object_id: the object's row at that moment; for an object outside the world, its name and type are set instead.
     """
 
     __tablename__ = "parameter_item"
@@ -87,7 +87,7 @@ class ParameterItem(Base):
 
     @property
     def value(self) -> Any:
-        """A scalar, or the item itself where it is a pose or an object."""
+        """The scalar, or this item itself if it is a pose or an object."""
         if self.x is not None or self.object_id is not None or self.object_name is not None:
             return self
         values = (self.integer, self.real, self.text, self.boolean, self.time)
@@ -95,30 +95,30 @@ class ParameterItem(Base):
 
 
 class Designator(Base):
-    """Something that was performed; its id is that of its task tree node.
+    """A performed designator; it has the id of its task tree node.
 
     Attributes:
-        dtype: the type's name, `PickUpAction`, also where there is no class for it.
+        dtype: the type's name, such as `PickUpAction`, also if no class exists for it.
         kind: action, motion or language.
-        robot_state: of the moment it started; None without a robot.
+        robot_state: at the moment it started; None without a robot.
         items: the entries of its list and dict fields.
-        parameters: its fields as they were recorded. Not loaded unless asked for: `undefer(Action.parameters)`, or
+        parameters: its fields as recorded. Deferred: load them with `undefer(Action.parameters)` or
             `await action.awaitable_attrs.parameters`.
-        node: its node of the task tree, above all to join: `select(...).join(PickUpAction.node)`. Not loaded unless
-            asked for: `selectinload(Action.node)`, or `await action.awaitable_attrs.node`.
+        node: its node of the task tree, mainly for joins: `select(...).join(PickUpAction.node)`. Not loaded by default:
+            use `selectinload(Action.node)` or `await action.awaitable_attrs.node`.
     """
 
     __tablename__ = "designator"
 
     def __init_subclass__(cls, **arguments: Any) -> None:
-        # A class of one's own has a table of its own, named like the class unless it says otherwise.
+        # A user's class gets a table of its own, named like the class unless the class names one.
         if not vars(cls).keys() & {"__tablename__", "__table__", "__abstract__"}:
             cls.__tablename__ = cls.__name__
         super().__init_subclass__(**arguments)
 
     @declared_attr.directive
     def __mapper_args__(cls) -> dict[str, Any]:  # noqa: N805  SQLAlchemy calls it with the class
-        # "selectin" at every level: a query for a base loads what the leaves add without a join for each of them.
+        # "selectin" at every level: a query for a base loads the columns of all leaves without a join for each.
         arguments = {"polymorphic_identity": cls.__name__, "polymorphic_load": "selectin"}
         return {"polymorphic_on": "_lineage", **arguments} if cls.__name__ == "Designator" else arguments
 
@@ -140,16 +140,16 @@ class Designator(Base):
     )
 
     def entries(self, field: str) -> list[Any]:
-        """The values of a list field, in order."""
+        """Return the values of a list field, in order."""
         return [item.value for item in self.items if item.field == field]
 
     def mapping(self, field: str) -> dict[str, Any]:
-        """The values of a dict field by key."""
+        """Return the values of a dict field by key."""
         return {item.key: item.value for item in self.items if item.field == field and item.key is not None}
 
 
 class Action(Designator):
-    """An action: something a plan wanted done."""
+    """A performed action: a task that a plan requests."""
 
     __tablename__ = "action"
 
@@ -157,7 +157,7 @@ class Action(Designator):
 
 
 class Motion(Designator):
-    """A motion: something a robot's controllers did at once."""
+    """A performed motion: one command to a robot's controllers."""
 
     __tablename__ = "motion"
 
@@ -165,7 +165,7 @@ class Motion(Designator):
 
 
 class Language(Designator):
-    """An expression of the plan language: how actions and motions were put together. Its node has theirs below it."""
+    """A performed expression of the plan language. The nodes of its operands are children of its node."""
 
     __tablename__ = "language"
 

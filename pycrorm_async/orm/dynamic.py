@@ -1,4 +1,4 @@
-"""Classes for types that have none: made from the declarations in a memory, and belonging to that memory alone.
+"""Generate mapped classes for declared types without one; the classes belong to one memory.
 
     classes = DynamicClasses()
     united = unite(layout, payloads)
@@ -7,9 +7,9 @@
     SayingAction = classes.of("SayingAction")
     classes.dispose()
 
-Enum fields are names (text): the enum's class is not here. A type that descends from one with a class has the
-attributes of both. Two memories may have different `SayingAction`s in one process: each class has an identity of its
-own, and only the engines that use it know that identity.
+Enum fields are names (text), because the enum's class may not be importable. A type that descends from one with a class
+has the attributes of both. Two memories in one process may have different `SayingAction`s: each class has its own
+identity, and only the engines that use it resolve that identity.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from pycrorm_async.orm.types import Moment, known_classes
 __all__ = ["DynamicClasses"]
 
 _DEPTH_MAX = 32
-"""Classes that one descends from: a question joins the views of all of them, and SQLite joins 64."""
+"""Bounds the ancestors of a class, because a query joins the views of all of them, and SQLite joins at most 64."""
 _ROOTS: dict[str, type[Designator]] = {"action": Action, "motion": Motion, "language": Language}
 _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "integer": BigInteger(),
@@ -46,7 +46,7 @@ _TYPES: dict[FieldType, TypeEngine[Any]] = {
 
 
 class DynamicClasses:
-    """The classes of one memory's own types. Used from one thread; `dispose` ends them."""
+    """The generated classes of one memory, until `dispose`. Used from one thread."""
 
     def __init__(self) -> None:
         self._registry = registry()
@@ -60,10 +60,10 @@ class DynamicClasses:
     def learn(
         self, declarations: Iterable[DesignatorTypeDeclared], renamed: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Makes classes for the declared types that have none, and gives known ones their new fields.
+        """Generate classes for declared types without one, and add new fields to existing classes.
 
-        Only what the tables accepted, all of it, in the order of its arrival: classes of what contradicts each other
-        would make every question for a common base fail. `renamed` gives the present names of types that had others.
+        Pass all declarations that the tables accepted, in their order, and no others: classes of contradicting
+        declarations would make every query of a common base fail. `renamed` maps former names of types to present ones.
         """
         self._renamed = dict(renamed)
         self._declared = {}
@@ -74,52 +74,56 @@ class DynamicClasses:
             if self._shared(dtype) is None:
                 grown |= self._make(dtype)
         if grown:
-            # A statement compiled before knows nothing of new classes and would meet them unfinished. The shared
-            # mappers first: finished later, they would meet classes that are unmapped by then and not yet collected.
+            # Configure now, because a cached statement would meet the new mappers unconfigured. Shared mappers come
+            # first: configured later, they would meet classes that are disposed of but not yet garbage collected.
             Base.registry.configure()
             self._registry.configure(cascade=True)
             for engine in self._engines:
                 self._introduce(engine)
 
     def use_in(self, engine: AsyncEngine) -> None:
-        """Sessions of this engine make objects of these classes."""
+        """Let sessions of this engine return objects of these classes."""
         self._engines.append(engine)
         self._introduce(engine)
 
     def of(self, name: str | type) -> type[Designator]:
-        """The mapped class of a dtype, a table or a designator class, built-in ones too. Raises `CallerError`."""
+        """Return the mapped class of a dtype, a table or a designator class, also built-in. Raises `CallerError`."""
         wanted = getattr(name, "dtype", name.__name__) if isinstance(name, type) else name
-        of_table = (dtype for dtype, known in self._declared.items() if any(each.table == wanted for each in known))
+        of_table = (
+            dtype
+            for dtype, declarations in self._declared.items()
+            if any(each.table == wanted for each in declarations)
+        )
         for dtype in map(self._present_name, (wanted, *of_table)):
-            found = self._classes.get(dtype) or self._shared(dtype)
-            if found is not None:
-                return found
-        raise CallerError(f"this memory holds nothing of the type {wanted!r} (it holds: {', '.join(self._declared)})")
+            mapped = self._classes.get(dtype) or self._shared(dtype)
+            if mapped is not None:
+                return mapped
+        raise CallerError(f"this memory has no type {wanted!r} (its types: {', '.join(self._declared)})")
 
     def dispose(self) -> None:
-        """Unmaps all of them: what is left of the objects are plain values. The shared classes forget them."""
+        """Unmap all generated classes; existing objects keep plain values. Shared classes drop references to them."""
         for engine in self._engines:
             known_classes(engine.dialect).adopt({})
             engine.sync_engine.clear_compiled_cache()
         self._engines.clear()
         identities = Designator.__mapper__.polymorphic_map
-        for made in self._classes.values():
-            identities.pop(made.__mapper__.polymorphic_identity, None)
+        for class_ in self._classes.values():
+            identities.pop(class_.__mapper__.polymorphic_identity, None)
         self._classes.clear()
         self._registry.dispose()
-        # The shared mappers remember paths they ever loaded along, those through our classes too. What they remember
-        # is made again when needed; SQLAlchemy itself forgets it this way whenever a subclass is mapped.
+        # Shared mappers cache their loading paths, also those through generated classes, which keeps the classes alive.
+        # The caches are rebuilt when needed; SQLAlchemy clears them in the same way when a subclass is mapped.
         for mapper in Base.registry.mappers:
             vars(mapper).pop("_path_registry", None)
             mapper._expire_memoizations()  # noqa: SLF001  there is no public way, and classes would never be freed
 
-    # --- inside -----------------------------------------------------------------------------------------------
+    # --- generating classes -----------------------------------------------------------------------------------
 
     def _present_name(self, dtype: str) -> str:
         return self._renamed.get(dtype, dtype)
 
     def _rename(self) -> bool:
-        """Whether a class made before its type was renamed is that of the new name now."""
+        """Move generated classes to the new names of their types; return whether any was moved."""
         moved = [(old, new) for old, new in self._renamed.items() if old in self._classes and new not in self._classes]
         for old, new in moved:
             if new not in self._classes:
@@ -127,74 +131,74 @@ class DynamicClasses:
         return bool(moved)
 
     def _shared(self, dtype: str) -> type[Designator] | None:
-        """The class every memory of this process shares, known by the type's name or one of its tables."""
-        known = self._declared.get(dtype, [])
-        wanted = {dtype, *(each.table for each in known)}
+        """Return the class that all memories of this process share, by the type's name or one of its tables."""
+        declarations = self._declared.get(dtype, [])
+        wanted = {dtype, *(each.table for each in declarations)}
         for mapper in Designator.__mapper__.self_and_descendants:
             identity = str(mapper.polymorphic_identity)
             table = mapper.local_table
             assert isinstance(table, Table)
-            fits = not known or _root(mapper.class_) is _ROOTS[known[0].kind]
+            fits = not declarations or _root(mapper.class_) is _ROOTS[declarations[0].kind]
             if fits and "@" not in identity and wanted & {identity, table.name}:
                 return mapper.class_
         return None
 
     def _make(self, dtype: str, descendants: tuple[str, ...] = ()) -> bool:
-        """Whether the class is new or has grown."""
+        """Generate the class, or add its new fields; return whether anything was added."""
         fields = [field for each in self._declared[dtype] for field in each.fields]
-        known = self._classes.get(dtype)
-        if known is not None:
-            return self._add_fields(dtype, known, fields)
+        existing = self._classes.get(dtype)
+        if existing is not None:
+            return self._add_fields(dtype, existing, fields)
         declared = self._declared[dtype][-1]
         base = self._base(declared, (*descendants, dtype))
         table = Table(declared.table, self._metadata, Column("id", ForeignKey(base.__table__.c.id), primary_key=True))
-        made = type(dtype, (base,), {"__abstract__": True, "__doc__": f"{dtype}, as it was declared."})
+        class_ = type(dtype, (base,), {"__abstract__": True, "__doc__": f"{dtype}, as it was declared."})
         identity = f"{dtype}@{id(self):x}"
         self._registry.map_imperatively(
-            made,
+            class_,
             table,
             inherits=base.__mapper__,
             polymorphic_identity=identity,
             polymorphic_load="selectin",
         )
-        self._classes[dtype] = made
+        self._classes[dtype] = class_
         self._fields[dtype] = set()
-        self._add_fields(dtype, made, fields)
+        self._add_fields(dtype, class_, fields)
         return True
 
     def _base(self, declared: DesignatorTypeDeclared, descendants: tuple[str, ...]) -> type[Designator]:
-        """The class of the nearest type it descends from. One of another kind does not count, nor a descendant (two
-        processes may have it the other way round)."""
+        """Return the class of the nearest base of the same kind. Descendants are skipped, because two processes may
+        declare the inheritance in opposite directions."""
         root = _ROOTS[declared.kind]
         for dtype in map(self._present_name, declared.bases):
-            found = self._classes.get(dtype) or self._shared(dtype)
-            if found is None and dtype in self._declared and dtype not in descendants and len(descendants) < _DEPTH_MAX:
+            base = self._classes.get(dtype) or self._shared(dtype)
+            if base is None and dtype in self._declared and dtype not in descendants and len(descendants) < _DEPTH_MAX:
                 self._make(dtype, descendants)
-                found = self._classes.get(dtype)
-            if found is not None and _root(found) is root and len(found.__mro__) - len(root.__mro__) < _DEPTH_MAX:
-                return found
+                base = self._classes.get(dtype)
+            if base is not None and _root(base) is root and len(base.__mro__) - len(root.__mro__) < _DEPTH_MAX:
+                return base
         return root
 
-    def _add_fields(self, dtype: str, made: type[Designator], fields: Iterable[FieldDeclared]) -> bool:
+    def _add_fields(self, dtype: str, class_: type[Designator], fields: Iterable[FieldDeclared]) -> bool:
         present = self._fields[dtype]
         before = len(present)
         for field in fields:
             if field.name in present:
                 continue
             present.add(field.name)
-            if not made.__mapper__.has_property(field.name):  # a base's attribute shows the same value
-                self._add_field(made, field)
+            if not class_.__mapper__.has_property(field.name):  # a base's attribute has the same value
+                self._add_field(class_, field)
         grown = len(present) > before
         if grown:
             for engine in self._engines:
                 engine.sync_engine.clear_compiled_cache()
         return grown
 
-    def _add_field(self, made: type[Designator], field: FieldDeclared) -> None:
+    def _add_field(self, class_: type[Designator], field: FieldDeclared) -> None:
         if field.type in ("list", "dict"):
-            setattr(made, field.name, _entries(field))
+            setattr(class_, field.name, _entries(field))
             return
-        mapper = made.__mapper__
+        mapper = class_.__mapper__
         table = mapper.local_table
         assert isinstance(table, Table)
         if field.type in _TYPES:
@@ -221,19 +225,19 @@ class DynamicClasses:
             mapper.add_property(f"{field.type}_id", synonym(f"{field.name}_id"))
 
     def _introduce(self, engine: AsyncEngine) -> None:
-        identities = {dtype: str(made.__mapper__.polymorphic_identity) for dtype, made in self._classes.items()}
+        identities = {dtype: str(class_.__mapper__.polymorphic_identity) for dtype, class_ in self._classes.items()}
         known_classes(engine.dialect).adopt(identities)
 
 
 def _entries(field: FieldDeclared) -> property:
-    """The values of a list field, or of a dict field by key."""
+    """Return a property with the values of a list field, or of a dict field by key."""
     read = Designator.mapping if field.type == "dict" else Designator.entries  # a field may have these names itself
     return property(lambda designator: read(designator, field.name))
 
 
-def _root(made: type[Designator]) -> type[Designator]:
-    """Which of the classes that are there always it is, or descends from."""
+def _root(class_: type[Designator]) -> type[Designator]:
+    """Return `Action`, `Motion` or `Language` if the class is or descends from it, otherwise `Designator`."""
     for root in (Action, Motion, Language):
-        if issubclass(made, root):
+        if issubclass(class_, root):
             return root
     return Designator

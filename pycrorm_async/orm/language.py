@@ -1,7 +1,7 @@
-"""The expressions of the plan language: each is a node of the task tree, with those of its operands below it.
+"""Map the expressions of the plan language.
 
-`select(Language)` gives all of them; what they performed is found by `TaskTreeNode.parent_id`. There are none among
-actions and motions.
+Each expression is a node of the task tree, and the nodes of its operands are its children (`TaskTreeNode.parent_id`).
+`select(Language)` returns all expressions; `select(Action)` and `select(Motion)` return none.
 
 >>> interrupted = select(Monitor).join(Monitor.node).where(TaskTreeNode.status == TaskStatus.INTERRUPTED)
 """
@@ -17,7 +17,7 @@ __all__ = ["Sequential", "TryInOrder", "Parallel", "TryAll", "Repeat", "Monitor"
 
 
 class Sequential(Language):
-    """One after the other, up to the first that failed."""
+    """Performs its operands in order, up to the first that fails."""
 
     __tablename__ = "sequential"
 
@@ -25,7 +25,7 @@ class Sequential(Language):
 
 
 class TryInOrder(Language):
-    """One after the other, up to the first that succeeded."""
+    """Performs its operands in order, up to the first that succeeds."""
 
     __tablename__ = "try_in_order"
 
@@ -33,7 +33,7 @@ class TryInOrder(Language):
 
 
 class Parallel(Language):
-    """All at once; all had to succeed."""
+    """Performs its operands concurrently; succeeds if all do."""
 
     __tablename__ = "parallel"
 
@@ -41,7 +41,7 @@ class Parallel(Language):
 
 
 class TryAll(Language):
-    """All at once; one had to succeed."""
+    """Performs its operands concurrently; succeeds if one does."""
 
     __tablename__ = "try_all"
 
@@ -49,7 +49,7 @@ class TryAll(Language):
 
 
 class Repeat(Language):
-    """Again and again, so many times."""
+    """Performs its operand `times` times."""
 
     __tablename__ = "repeat"
 
@@ -58,11 +58,11 @@ class Repeat(Language):
 
 
 class Monitor(Language):
-    """Until it was done, or until a condition held; then the status of its node is INTERRUPTED.
+    """Performs its operand until that ends or a condition holds; then the status of its node is INTERRUPTED.
 
     Attributes:
-        condition: the qualified name of what was asked.
-        interval_s: how often it was asked.
+        condition: the qualified name of the condition.
+        interval_s: the time between two evaluations of it.
     """
 
     __tablename__ = "monitor"
@@ -73,7 +73,7 @@ class Monitor(Language):
 
 
 class Code(Language):
-    """A function was called.
+    """Calls a function.
 
     Attributes:
         function: its qualified name.
@@ -86,12 +86,12 @@ class Code(Language):
 
     @property
     def arguments(self) -> dict[str, str]:
-        """By name, each as a short text."""
+        """The call's arguments by name, each as a short text."""
         return self.mapping("arguments")
 
 
 class Retry(Language):
-    """Again, with the next alternative if there was one, until it succeeded; at most so many times."""
+    """Repeats its operand, or its next alternative, until one succeeds, at most `max_tries` times."""
 
     __tablename__ = "retry"
 

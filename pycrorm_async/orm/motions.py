@@ -1,4 +1,4 @@
-"""The built-in motions: those of the thesis' table 4.1, and those that set joints.
+"""Map the built-in motions: those of the thesis' table 4.1, and those that set joints.
 
 The joints of `MoveArmJointsMotion` and `MoveJointsMotion` are rows of `parameter_item`.
 """
@@ -81,7 +81,7 @@ class MoveGripperMotion(Motion):
 
 
 class MoveArmJointsMotion(Motion):
-    """Bring arm joints to positions (rad), by name."""
+    """Move arm joints to positions (rad), by name."""
 
     __tablename__ = "move_arm_joints_motion"
 
@@ -89,17 +89,17 @@ class MoveArmJointsMotion(Motion):
 
     @property
     def left_arm_poses(self) -> dict[str, float]:
-        """By joint name, rad."""
+        """Target positions of the left arm by joint name, rad."""
         return self.mapping("left_arm_poses")
 
     @property
     def right_arm_poses(self) -> dict[str, float]:
-        """By joint name, rad."""
+        """Target positions of the right arm by joint name, rad."""
         return self.mapping("right_arm_poses")
 
 
 class MoveJointsMotion(Motion):
-    """Bring joints to positions (rad or m)."""
+    """Move joints to positions (rad or m)."""
 
     __tablename__ = "move_joints_motion"
 
@@ -107,12 +107,12 @@ class MoveJointsMotion(Motion):
 
     @property
     def names(self) -> list[str]:
-        """In the order they were given."""
+        """The joints' names, in the designator's order."""
         return self.entries("names")
 
     @property
     def positions(self) -> list[float]:
-        """In the order they were given."""
+        """The target positions, in the order of `names`."""
         return self.entries("positions")
 
 
@@ -126,7 +126,7 @@ class DetectingMotion(Motion):
 
 
 class OpeningMotion(Motion):
-    """Move an arm so that what it grasps opens."""
+    """Move an arm so that the container whose handle it grasps opens."""
 
     __tablename__ = "opening_motion"
 
@@ -140,7 +140,7 @@ class OpeningMotion(Motion):
 
 
 class ClosingMotion(Motion):
-    """Move an arm so that what it grasps closes."""
+    """Move an arm so that the container whose handle it grasps closes."""
 
     __tablename__ = "closing_motion"
 
@@ -154,7 +154,7 @@ class ClosingMotion(Motion):
 
 
 class WorldStateDetectingMotion(Motion):
-    """Ask the world itself for objects of a type."""
+    """Read objects of a type from the state of the world instead of a camera."""
 
     __tablename__ = "world_state_detecting_motion"
 

@@ -1,8 +1,8 @@
-"""Objects as they were, and what happened to them.
+"""Map objects at each moment of their history, and their removals, attachments and joint changes.
 
-A row of `object` is an object at a moment: one when it was added and one each time it moved. What an action names is
-the row in force when it started, so `PickUpAction.object.pose` is the pose at execution, wherever the object is now.
-All rows of one object share `identity_id`.
+A row of `object` is an object at one moment: one row when it was added and one each time it moved. An action refers to
+the row that was current when it started, so `PickUpAction.object.pose` is the pose at execution. All rows of one object
+share `identity_id`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,17 @@ from pycrorm_async.world.enums import ObjectType
 __all__ = ["Object", "ObjectPart", "BelieveObject", "LocatedObject", "ObjectRemoval", "Attachment", "JointChange"]
 
 _STEPS_MAX = 6
-"""So many relationships away from what a query is about, the whole of a part is loaded with it; none is farther."""
+"""Bounds the relationships between a query's class and an `ObjectPart` whose `part_of` is loaded; no class needs more.
+"""
 
 
 class Object(Base):
     """An object of the world at a moment.
 
     Attributes:
-        identity_id: the row that was written when it was added; None for what the world does not hold.
+        identity_id: its first row, from when it was added; None for an object outside the world.
         joints: positions (rad or m) when it was added; None in later rows.
-        node_id: the node that moved it, or put it into the world; None if no node did.
+        node_id: the node that moved or added it; None if no node did.
     """
 
     __tablename__ = "object"
@@ -52,7 +53,7 @@ class Object(Base):
 
 
 class ObjectPart(Object):
-    """A link of an object that an action was about; `part_of` is the object it belongs to."""
+    """A link of an object as an action's parameter; `part_of` is the object it belongs to."""
 
     part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
 
@@ -64,7 +65,7 @@ class ObjectPart(Object):
 
 
 class LocatedObject(Object):
-    """An object whose place was told relative to another one, `reference`; `pose` is where that is in the map."""
+    """An object located relative to another one, `reference`; `pose` is its pose in the map."""
 
     reference_id: Mapped[int | None] = mapped_column("part_of_id", ForeignKey("object.id"), use_existing_column=True)
 
@@ -76,13 +77,13 @@ class LocatedObject(Object):
 
 
 class BelieveObject(Object):
-    """An object that was believed to be somewhere and that nobody had seen."""
+    """An object that was assumed to be at a place without having been perceived."""
 
     __mapper_args__ = {"polymorphic_identity": "BelieveObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
 
 class ObjectRemoval(Base):
-    """An object left the world."""
+    """The removal of an object from the world."""
 
     __tablename__ = "object_removal"
 
@@ -98,7 +99,7 @@ class ObjectRemoval(Base):
 
 
 class Attachment(Base):
-    """From `time` on `child` moves with `link` of `parent` (`kind` attached), or no longer does (detached)."""
+    """A change at `time`: `child` begins to move with `link` of `parent` (`kind` attached), or stops (detached)."""
 
     __tablename__ = "attachment"
 
@@ -117,7 +118,7 @@ class Attachment(Base):
 
 
 class JointChange(Base):
-    """A joint of an object has a new position (rad or m). Rows of one motion share their `id`."""
+    """A new position (rad or m) of an object's joint. Rows of one motion share their `id`."""
 
     __tablename__ = "joint_change"
 

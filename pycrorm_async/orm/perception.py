@@ -1,4 +1,4 @@
-"""What perception said, and how the robot moved while it did what it did."""
+"""Map perceived objects, and samples of the robot's state during motions."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ __all__ = ["Detection", "StateSample"]
 
 
 class Detection(Base):
-    """An object that was perceived. Those of one look share their `id`; the best seen has `position` 0.
+    """A perceived object. All objects of one detection share their `id`; the best visible has `position` 0.
 
     Attributes:
-        source: camera, or world_state: the world itself was asked.
-        looked_for: the type that was looked for; None: anything.
-        visible: the share of it that was seen, 0 to 1; None where nobody looked.
-        object: as it was; x to frame is its pose then.
-        node: the node that looked.
+        source: `camera`, or `world_state` where the world's own state was read.
+        looked_for: the requested type; None for any.
+        visible: the visible share of the object, 0 to 1; None without a camera.
+        object: its row at that moment; x to frame is its pose then.
+        node: the node that performed the detection.
     """
 
     __tablename__ = "detection"
@@ -54,10 +54,10 @@ class Detection(Base):
 
 
 class StateSample(Base):
-    """One channel of the robot's state at one moment of a motion, written where it had changed.
+    """One channel of the robot's state at one moment of a motion, recorded if it had changed.
 
     Attributes:
-        id: shared by the channels of one moment.
+        id: the same for all channels of one moment.
         channel: `base.x`, `base.y`, `base.z` (m), `base.qx`, `base.qy`, `base.qz`, `base.qw`, or a joint (rad, m).
         node_id: the motion.
         ns: monotonic time, comparable with `TaskTreeNode.start_ns`.

@@ -1,4 +1,4 @@
-"""The task tree: a node for every perform, and what location designators offered to it."""
+"""Map the task tree: a node for every perform, and the candidates of its location designators."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class TaskTreeNode(Base):
     """One perform, from its start to its end.
 
     Attributes:
-        action: what was performed, an `Action`, a `Motion` or another `Designator`; None at the root of an episode.
-        parent: the node it ran inside, loaded for what a query is about; of nodes that come with something else, and
-            of parents, by `await node.awaitable_attrs.parent`.
-        end_time: None while it runs, and for ever if it was LOST.
+        action: the performed `Action`, `Motion` or other `Designator`; None at the root of an episode.
+        parent: the node that performed it. Loaded for the nodes that a query selects; for nodes loaded through another
+            object, and for parents, use `await node.awaitable_attrs.parent`.
+        end_time: None while it runs, and if it is LOST.
         start_ns, end_ns: monotonic time, for exact durations.
         reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
-        result: what perform returned, as JSON.
-        simulated: it was thought through in a copy of the world.
+        result: the return value of perform, as JSON.
+        simulated: whether it belongs to a simulation, performed in a copy of the world.
     """
 
     __tablename__ = "task_tree_node"
@@ -61,7 +61,7 @@ class TaskTreeNode(Base):
 
     @property
     def duration_s(self) -> float | None:
-        """Seconds it ran; None while it runs, and if it was LOST."""
+        """The duration in s; None while it runs, and if it is LOST."""
         return None if self.end_ns is None else (self.end_ns - self.start_ns) / 1e9
 
 
@@ -81,26 +81,26 @@ class LocationCandidate(Base):
     qw: Mapped[float]
     frame: Mapped[str]
     arms: Mapped[str]
-    """Names of the arms that reach from there, with a comma between them."""
+    """Names of the arms that reach the target from this place, separated by commas."""
     taken: Mapped[bool]
     grasp: Mapped[Grasp | None]
-    """Of a place from experience: the grasp it went well with, and the torso height (m)."""
+    """The grasp that succeeded at a place from experience; `torso_height` (m) is that of the same success."""
     torso_height: Mapped[float | None]
 
     @property
     def reachable_arms(self) -> list[Arms]:
-        """The arms that reach from there."""
+        """The arms that reach the target from this place."""
         return [Arms[name] for name in self.arms.split(",") if name]
 
 
 class LocationResolution(Base):
-    """A location designator was asked for a place.
+    """A location designator's answer to one request for a place.
 
     Attributes:
-        location: its class.
-        considered, offered: how many places it looked at, how many it found good.
-        taken: the rank of the one the plan went on with, and `pose` that place; None if there was none.
-        node: the node that asked.
+        location: the designator's class.
+        considered, offered: the number of places it checked, and of those it offered.
+        taken: the rank of the place that the plan used, whose pose is `pose`; None if it used none.
+        node: the node that made the request.
     """
 
     __tablename__ = "location_resolution"

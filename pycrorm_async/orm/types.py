@@ -1,9 +1,9 @@
-"""How values of the memory are held in a column: moments, enum members, JSON, and which class a row becomes.
+"""Define the column types: times, enum members, JSON, and the class of a designator's row.
 
 | Python | column |
 |---|---|
 | aware `datetime` | integer, µs since 1970 UTC |
-| enum member | its name as text; a name this process does not know stays text |
+| enum member | its name as text; a name that the enum lacks stays text |
 | JSON | text |
 | the class of a designator | its lineage as text, see `ClassOfRow` |
 """
@@ -29,7 +29,7 @@ _MICROSECOND = timedelta(microseconds=1)
 
 
 class Moment(TypeDecorator[datetime]):
-    """An aware datetime, exact to the microsecond. A naive one is refused: nobody knows which moment it means."""
+    """An aware datetime, exact to the microsecond. A naive one is refused, because its time zone is ambiguous."""
 
     impl = BigInteger
     cache_ok = True
@@ -78,59 +78,58 @@ class JsonText(TypeDecorator[Any]):
 
 
 class KnownClasses:
-    """Which mapped class stands for a lineage, in one engine: the first of its names that has a class.
+    """Resolves lineages to mapped classes in one engine: the first name of a lineage that has a class wins.
 
-    The names are types and tables. `mapped` holds the classes everyone shares, `own` those of one memory alone.
+    The names are types and tables. `own` maps those of one memory's generated classes to their identities.
     """
 
     def __init__(self) -> None:
         self.own: dict[str, str] = {}
-        self._found: dict[str, str] = {}
+        self._identities: dict[str, str] = {}
         self._size = -1
 
     def identity(self, lineage: str, mapped: Mapping[str, Any]) -> str:
-        """The polymorphic identity for this lineage; its last name is a class always.
+        """Return the polymorphic identity for this lineage; its last name always has a class.
 
-        Classes of another kind are passed over: an author may map as an action what another process does as a motion.
+        `mapped` has all mapped classes by identity. Classes of another kind are skipped, because an author may map as
+        an action a type that another process declares as a motion.
         """
-        if self._size != len(mapped):  # a class was declared since
-            self._found.clear()
+        if self._size != len(mapped):  # a class was mapped since the last call
+            self._identities.clear()
             self._size = len(mapped)
-        found = self._found.get(lineage)
-        if found is None:
-            tables = {
-                mapper.local_table.name: identity for identity, mapper in list(mapped.items()) if "@" not in identity
-            }
-            known = {name: name for name in mapped} | tables | self.own
+        identity = self._identities.get(lineage)
+        if identity is None:
+            tables = {mapper.local_table.name: key for key, mapper in list(mapped.items()) if "@" not in key}
+            identities = {name: name for name in mapped} | tables | self.own
             *names, root = lineage.split(" ")
-            candidates = (known.get(each) for name in names for each in (name, table_name(name)))
+            candidates = (identities.get(each) for name in names for each in (name, table_name(name)))
             fitting = (each for each in candidates if each is not None and _root(mapped[each]) == root)
-            found = self._found[lineage] = next(fitting, root)
-        return found
+            identity = self._identities[lineage] = next(fitting, root)
+        return identity
 
     def adopt(self, own: Mapping[str, str]) -> None:
-        """From now on these names mean these identities in this engine."""
+        """Replace the identities of generated classes in this engine."""
         self.own = dict(own)
-        self._found.clear()
+        self._identities.clear()
 
 
 def _root(mapper: Mapper[Any]) -> str:
-    """Action, Motion, Language or Designator, whichever is nearest."""
+    """Return the nearest of Action, Motion, Language and Designator."""
     identities = (str(each.polymorphic_identity) for each in mapper.iterate_to_root())
     return next(each for each in identities if each in ("Action", "Motion", "Language", "Designator"))
 
 
 def known_classes(dialect: Dialect) -> KnownClasses:
-    """Those of the engine this dialect belongs to; they live and die with it."""
-    known: KnownClasses = vars(dialect).setdefault("pycrorm_known_classes", KnownClasses())
-    return known
+    """Return the `KnownClasses` of the engine that this dialect belongs to, which owns them."""
+    classes: KnownClasses = vars(dialect).setdefault("pycrorm_known_classes", KnownClasses())
+    return classes
 
 
 class ClassOfRow(TypeDecorator[str]):
-    """The discriminator of designators: a lineage, nearest name first, read as the nearest class there is.
+    """The discriminator of designators: a lineage, nearest name first, read as the identity of the nearest class.
 
-    `CarefulPickUpAction PickUpAction Action` becomes a `CarefulPickUpAction` where such a class is mapped, else a
-    `PickUpAction`. No query compares it, so a type without a class is never left out and never raises.
+    `CarefulPickUpAction PickUpAction Action` becomes a `CarefulPickUpAction` if that class is mapped, else a
+    `PickUpAction`. No query compares it, so the rows of a type without a class are returned too.
     """
 
     impl = String

@@ -1,4 +1,4 @@
-"""Views that join what learning asks for; users register more of them, as `projections.schema.user_views` says."""
+"""Map the built-in view for learning; users register more of them with `projections.schema.user_views`."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ __all__ = ["PickUpWithContextView"]
 
 
 class PickUpWithContextView(Base):
-    """Every pick-up with what was around it: the sample the thesis learns from (section 5.2).
+    """Every pick-up with the poses of robot and object: the sample that the thesis learns from (section 5.2).
 
-    Where the robot stood is there twice: along the axes of the map, as in the thesis, and as seen from the object. The
-    latter is what can be learned for an object that is turned otherwise.
+    The robot's position is given twice: along the axes of the map, as in the thesis, and in the object's frame, which
+    also applies to an object with another orientation.
 
     Attributes:
         torso_height: of the robot, m.
         relative_x, relative_y: robot minus object, m, along the axes of the map.
         quaternion_x, quaternion_y, quaternion_z, quaternion_w: of the robot's base.
-        obj_type: of the object, as it was when the action started.
+        obj_type: of the object when the action started.
         status: of the action's node.
         process_metadata_id: the episode.
         node_id: the node; the same number as `id`.
         object_x, object_y, object_z: of the robot's base in the object's own frame, m.
-        object_qx, object_qy, object_qz, object_qw: of the robot's base, turned into the object's own frame. They and
-            `object_z` are read only when asked for by name: `select(PickUpWithContextView.object_z)`.
-        height_over_torso: how much higher than the robot's torso is lifted the object is, m: its z minus that of the
-            robot's base minus `torso_height`. What an arm reaches depends on it. Read when asked for by name.
+        object_qx, object_qy, object_qz, object_qw: of the robot's base in the object's own frame. They and `object_z`
+            are deferred: select them by name, as in `select(PickUpWithContextView.object_z)`.
+        height_over_torso: height of the object above the robot's torso, m: its z minus that of the robot's base minus
+            `torso_height`. The reach of an arm depends on it. Deferred.
     """
 
     __tablename__ = "PickUpWithContextView"

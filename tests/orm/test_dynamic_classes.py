@@ -173,7 +173,7 @@ async def test_a_class_is_found_by_type_table_or_designator(log: EventLog) -> No
         assert classes.of(SayingActionPerformable) is saying
         assert classes.of("PickUpAction") is PickUpAction
         assert classes.of("pick_up_action") is PickUpAction
-        with pytest.raises(CallerError, match="holds nothing of the type 'Waving'"):
+        with pytest.raises(CallerError, match="this memory has no type 'Waving'"):
             classes.of("Waving")
 
 

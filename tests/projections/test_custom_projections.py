@@ -222,7 +222,7 @@ async def test_another_version_is_not_folded_before_it_is_rebuilt(
     await log.append(tries(3).records)
     await before.catch_up()  # it knows version 1 only, and leaves it
     assert await shown(log) == new
-    assert "not kept up to date any more" in caplog.text
+    assert "this process stops folding the projection grasp_rate" in caplog.text
     assert await projector.catch_up() == 0
 
 

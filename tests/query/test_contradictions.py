@@ -101,7 +101,7 @@ async def test_a_type_of_which_nothing_was_accepted_has_no_class(log: EventLog) 
     await told(log, WAVE_AS_POSE)
     async with Reading.open_address(log.address) as reading:
         assert await asked(reading, select(Designator)) == [("SayingAction", "SayingAction")]
-        with pytest.raises(CallerError, match=r"holds nothing of the type 'Wave' \(it holds: SayingAction\)"):
+        with pytest.raises(CallerError, match=r"this memory has no type 'Wave' \(its types: SayingAction\)"):
             reading.mapped("Wave")
 
 
