@@ -1,4 +1,4 @@
-"""The composition root: opens a memory, wires its parts, drains and closes it.
+"""Open a memory, wire its parts, drain and close it. This is the composition root of the package.
 
 >>> async with Memory.open("sqlite:///memory.db") as memory:
 ...     async with memory.episode(description="Tutorial"):
@@ -71,9 +71,8 @@ _log = logging.getLogger("pycrorm_async")
 class Memory:
     """The memory of one process in one database. Use `Memory.open` as an async context manager.
 
-    While it is open, every plan performed in its context is remembered: in the episode that is open, or in one of its
-    own. Reading an older memory at the same time is fine; what is performed goes to the one opened last, or to the one
-    whose episode is open.
+    While it is open, it records every plan performed in its context: in the open episode, or in one of the plan's own.
+    Of several open memories the one whose episode is open records, or else the one opened last.
     """
 
     def __init__(
@@ -95,7 +94,7 @@ class Memory:
         self._unadopted: dict[str, PycrormError] = {}
         self._stack = AsyncExitStack()
         self._parts: Parts | None = None
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         call_in_forked_child(self._forked)
 
     @classmethod
@@ -110,33 +109,33 @@ class Memory:
         settings: Settings | None = None,
         clock: Clock = SYSTEM_CLOCK,
     ) -> Memory:
-        """A memory to be entered with `async with`, once.
+        """Return a memory to enter with `async with`, once.
 
         Args:
-            url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that is gone when closed.
+            url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that exists in this
+                process only and is deleted when it is closed.
             spool: folder of the write-ahead queue; by default `memory.db.spool` beside `memory.db`.
-            views: questions with a name, kept beside the tables.
-            projections: of your own, kept up to date with those that installed packages offer. What one cannot fold
-                stops its episode there alone: `flush` does not raise for it, `pycrorm status` says why.
-            writer: who moves events to the database, by default as the settings say: a `thread` of this process, or
-                the `daemon`, a `pycrorm writer` for the same URL and spool. With a daemon this process has no
-                connection for writing, the database need not be there yet, and `session()`, `dataframe()` and
-                `reading` open their own connection at the first question.
-            settings, clock: limits and rhythms; where the time comes from.
+            views: named queries to create beside the tables.
+            projections: custom projections to fold besides the installed ones. An event that one cannot fold parks the
+                episode in that projection only: `flush` does not raise, `pycrorm status` shows the reason.
+            writer: `thread` for a thread of this process that moves events to the database, or `daemon` for a
+                `pycrorm writer` with the same URL and spool; by default as in the settings. With a daemon this process
+                has no connection for writing, the database may not exist yet, and `session()`, `dataframe()` and
+                `reading` open their own connection at the first query.
+            settings, clock: limits and intervals; the time source.
 
         Raises:
             UnknownUrl: at once. `CallerError`: at once, for a private database or views of this process with a daemon.
-                On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`,
-                `SpoolForeign`.
+                On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`, `SpoolForeign`.
         """
         address, settings = DatabaseAddress.parse(url), settings or Settings()
         keep_s = 0.0 if address.is_private else settings.keep_stored_s  # sqlite:// is never restored
         settings = replace(settings, writer=writer or settings.writer, keep_stored_s=keep_s)
         if settings.writer == "daemon" and address.is_private:
-            raise CallerError("sqlite:// is private to this process: no daemon can write it")
+            raise CallerError("sqlite:// is private to this process, so no daemon can write it: use writer='thread'")
         if settings.writer == "daemon" and (views or projections):
             what = "views" if views else "projections"
-            raise CallerError(f"a daemon makes the tables and knows no {what} of this process: use writer='thread'")
+            raise CallerError(f"the daemon creates the tables, without the {what} of this process: use writer='thread'")
         return cls(
             address,
             spool=Path(spool) if spool is not None else None,
@@ -159,16 +158,16 @@ class Memory:
     ) -> Memory:
         """Open a memory for all contexts of this process that have none of their own, until `close`; as `open` does.
 
-        For notebooks, whose cells have a context each: what the following cells perform is recorded, each action in an
-        episode of its own or in that of its cell. If several are connected, the last one records. A thread of the
-        user's own finds it as well. One that is not closed keeps in its spool what was not stored when the process
-        ends, and the next memory of that database stores it.
+        It is meant for notebooks, where each cell has a context of its own: actions of the following cells are
+        recorded, each in an episode of its own or in that of its cell, also in threads that the user starts. If several
+        memories are connected, the last one records. Events that are not stored when the process ends without `close`
+        stay in the spool, and the next memory of that database stores them.
         """
         memory = cls.open(url, spool=spool, views=views, projections=projections, writer=writer, settings=settings)
         return await memory._enter(Parts.in_process)  # noqa: SLF001  its own class
 
     async def close(self) -> None:
-        """Store and fold what is left; open episodes end as INTERRUPTED. Twice is once."""
+        """Store and fold all recorded events; open episodes end as INTERRUPTED. A second call has no effect."""
         await self.__aexit__(None, None, None)
 
     # --- opening and closing ----------------------------------------------------------------------------------
@@ -176,10 +175,10 @@ class Memory:
     async def __aenter__(self) -> Self:
         return await self._enter(Parts.in_context)
 
-    async def _enter(self, found: Callable[[Parts], AbstractContextManager[None]]) -> Self:
+    async def _enter(self, connect: Callable[[Parts], AbstractContextManager[None]]) -> Self:
         try:
             self._parts = await self._open()
-            self._stack.enter_context(found(self._parts))
+            self._stack.enter_context(connect(self._parts))
         except BaseException:
             await self._stack.aclose()
             raise
@@ -190,7 +189,7 @@ class Memory:
         by_daemon = self._settings.writer == "daemon"
         spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
-            # The database first: where it is refused, no spool is made. Then bound, while this recorder is not in it.
+            # Open the database before making a spool, and bind the spool before this recorder adds its folder to it.
             access, expected = spool.access, expected_log(address, spool)
             log = await EventLog.open(address, create=True, clock=self._clock, file_access=access, belongs_to=expected)
             await log.close()
@@ -204,10 +203,10 @@ class Memory:
         if by_daemon:
             writer = DelegatedWriter(queue, self._settings)
         else:
-            opened = partial(open_destination, address, spool, clock=self._clock, settings=self._settings)
+            open_ = partial(open_destination, address, spool, clock=self._clock, settings=self._settings)
             writer = WriterThread(
                 source=queue,
-                open_destination=partial(opened, views=self._views, projections=self._projections),
+                open_destination=partial(open_, views=self._views, projections=self._projections),
                 adopt=lambda: dead_queues(spool, self._unadopted, settings=self._settings),
                 settings=self._settings,
             )
@@ -216,22 +215,22 @@ class Memory:
         reading = Reading(address)
         self._stack.push_async_callback(reading.close)
         if not by_daemon:
-            with suppress(TablesForeign):  # recording goes on; who asks, or flushes, is told
+            with suppress(TablesForeign):  # recording works without tables; queries and `flush` raise this again
                 await reading.refresh()
         emitter = Emitter(queue, self._settings)
-        told = Recorder(emitter, clock=self._clock, software=__version__)
-        return Parts(queue, writer, reading, emitter, told, PickUpExperience(reading))
+        recorder = Recorder(emitter, clock=self._clock, software=__version__)
+        return Parts(queue, writer, reading, emitter, recorder, PickUpExperience(reading))
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._parts is None:  # a forked child leaves the memory of its parent alone
+        if self._parts is None:  # in a forked child the memory belongs to the parent
             return
-        told = self._parts.recorder
-        for episode in told.open_episodes:
-            told.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
-        self._parts.emitter.is_closed = self._parts.experience.over = True
-        told.close()
+        recorder = self._parts.recorder
+        for episode in recorder.open_episodes:
+            recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
+        self._parts.emitter.is_closed = self._parts.experience.is_closed = True
+        recorder.close()
         await self._stack.__aexit__(kind, error, traceback)
 
     async def _drain(
@@ -242,33 +241,33 @@ class Memory:
         error: BaseException | None,
         _traceback: TracebackType | None,
     ) -> None:
-        """Store and fold what is left. A failure of ours never hides the plan's own.
+        """Store and fold all recorded events. An error in doing so is logged, not raised, if the plan failed itself.
 
-        A parked episode is no failure of closing: it is logged, and `pycrorm status` names it. `flush` raises for it.
+        A parked episode is logged and does not make closing fail; `pycrorm status` lists it, and `flush` raises for it.
         """
         self._parts = None
         queue.close()
         try:
             await writer.close()
         except PycrormError as fault:
-            news = self._news(fault)
-            if news is not None and error is None and not isinstance(news, EpisodeParked):
-                raise news from fault
-            if news is not None:
-                _log.error("when closing the memory: %s", news)
+            unreported = self._unreported(fault)
+            if unreported is not None and error is None and not isinstance(unreported, EpisodeParked):
+                raise unreported from fault
+            if unreported is not None:
+                _log.error("when closing the memory: %s", unreported)
 
-    def _news(self, fault: PycrormError) -> PycrormError | None:
-        """The fault without the parked episodes that a flush has told already; None if nothing is left of it."""
+    def _unreported(self, fault: PycrormError) -> PycrormError | None:
+        """Return the fault without parked episodes that a flush has reported; None if no other is left."""
         if not isinstance(fault, EpisodeParked):
             return fault
-        reasons = {episode: reason for episode, reason in fault.reasons.items() if episode not in self._told}
-        self._told.update(reasons)
+        reasons = {episode: reason for episode, reason in fault.reasons.items() if episode not in self._reported}
+        self._reported.update(reasons)
         return EpisodeParked(reasons) if reasons else None
 
     def _forked(self) -> None:
-        """In a forked child: the memory is its parent's; plans go on and nothing is told."""
+        """Disconnect a forked child: the memory belongs to its parent, and plans of the child are not recorded."""
         if self._parts is not None:
-            self._parts.emitter.is_closed = self._parts.experience.over = True
+            self._parts.emitter.is_closed = self._parts.experience.is_closed = True
             self._parts = None
 
     # --- recording --------------------------------------------------------------------------------------------
@@ -277,23 +276,23 @@ class Memory:
     async def episode(
         self, *, description: str | None = None, plan: str | None = None, seed: int | None = None
     ) -> AsyncIterator[Episode]:
-        """An episode: what is performed inside belongs to it, and so does the world that is entered inside or before.
+        """Record an episode: plans performed inside, and the world that was entered before or is entered inside.
 
-        Waits for room in a full spool, or raises `SpoolFull`, as `Settings.on_full` says.
+        If the spool is full, waits for space or raises `SpoolFull`, according to `Settings.on_full`.
 
         Args:
-            description: why; default: the plan's name.
+            description: the purpose; default: the plan's name.
             plan: the plan's name.
-            seed: of the plan's random numbers, to find it again; 64 bits.
+            seed: of the plan's random numbers, 64 bits, so that it can be repeated.
 
         Raises:
-            EpisodeRefused: one is open in this task already. A child task may open its own.
+            EpisodeRefused: an episode is open in this task already. A child task may open its own.
         """
-        parts = self._now
-        told = parts.recorder
-        if (room := told.admit()) is not None:
+        parts = self._open_parts
+        recorder = parts.recorder
+        if (room := recorder.admit()) is not None:
             await room
-        episode = told.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
+        episode = recorder.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
         failure: BaseException | None = None
         with (
             parts.in_context(),
@@ -306,95 +305,95 @@ class Memory:
                 failure = raised
                 raise
             finally:
-                told.close_episode(episode, failure)
+                recorder.close_episode(episode, failure)
 
     async def synced(self) -> None:
-        """All emitted so far survives power loss when this returns.
+        """Wait until all events recorded so far survive a power loss.
 
-        Raises `SpoolUnavailable` when the disk refuses, or when files of the spool were deleted or replaced: recording
-        goes on in a new folder where one can be made, and `status` says what was lost.
+        Raises `SpoolUnavailable` if the disk fails, or if files of the spool were deleted or replaced. Recording then
+        continues in a new folder if one can be created, and `status` lists the lost records.
         """
-        await self._now.queue.synced_to(self._now.queue.written)
+        await self._open_parts.queue.synced_to(self._open_parts.queue.written)
 
     async def flush(self) -> None:
-        """All emitted so far is stored and visible in the tables when this returns.
+        """Wait until all events recorded so far are stored and visible in the tables.
 
         Raises:
-            EpisodeParked: with the reason, if an episode could not be stored or folded; each is told once.
-            FlushTimeout: nothing was stored or folded for `flush_timeout_s`. What was emitted is safe in the spool.
+            EpisodeParked: an episode could not be stored or folded, with the reason; each episode is reported once.
+            FlushTimeout: nothing was stored or folded for `flush_timeout_s`. The events are safe in the spool.
         """
-        parts = self._now
+        parts = self._open_parts
         position = parts.queue.written
         await parts.queue.synced_to(position)
         try:
             await parts.writer.flush(position)
         except EpisodeParked as fault:
-            news = self._news(fault)
-            if news is not None:
-                raise news from fault
+            unreported = self._unreported(fault)
+            if unreported is not None:
+                raise unreported from fault
         if parts.reading.is_open:
             await parts.reading.refresh()
 
     @property
     def status(self) -> MemoryStatus:
-        """How the memory is, at this moment."""
-        return MemoryStatus.of(self._now, self._unadopted)
+        """The present state of the memory."""
+        return MemoryStatus.of(self._open_parts, self._unadopted)
 
     @property
     def recent_episodes(self) -> tuple[str, ...]:
         """The ids of the last hundred episodes this memory opened."""
-        return self._now.recorder.recent_episodes
+        return self._open_parts.recorder.recent_episodes
 
     @property
     def opened_count(self) -> int:
-        """How many episodes this memory opened."""
-        return self._now.recorder.opened_count
+        """The number of episodes this memory opened."""
+        return self._open_parts.recorder.opened_count
 
     @property
     def is_open(self) -> bool:
-        """Whether it can be used."""
+        """Whether the memory is open."""
         return self._parts is not None
 
-    # --- asking -----------------------------------------------------------------------------------------------
+    # --- reading ----------------------------------------------------------------------------------------------
 
     @property
     def reading(self) -> Reading:
-        """The asking side on its own: named questions, sessions, frames."""
-        return self._now.reading
+        """The reading side of this memory: named queries, sessions, data frames."""
+        return self._open_parts.reading
 
     def session(self, *, simulated: bool = False) -> AbstractAsyncContextManager[AsyncSession]:
-        """An ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager.
+        """Return an ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager.
 
-        With `simulated` it also sees what was only thought through (`SimulatedTaskTree`).
+        With `simulated` it also sees simulations (`SimulatedTaskTree`).
         """
-        return self._now.reading.session(simulated=simulated)
+        return self._open_parts.reading.session(simulated=simulated)
 
     async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> DataFrame:
-        """The answer as a pandas DataFrame (extra `learning`); with `simulated`, thoughts too."""
-        return await self._now.reading.dataframe(statement, simulated=simulated)
+        """Return the rows as a pandas DataFrame (extra `learning`); with `simulated`, those of simulations too."""
+        return await self._open_parts.reading.dataframe(statement, simulated=simulated)
 
     def mapped(self, designator: str | type) -> Any:
-        """The mapped class of a designator type, by its dtype or its class, once one of it was flushed.
+        """Return the mapped class of a designator type, by its dtype or its class, after one of it was flushed.
 
-        Where a daemon writes, also once something was asked, for until then there is no connection.
+        With a daemon it needs an earlier query, because until then this memory has no connection.
         """
-        reading = self._now.reading
+        reading = self._open_parts.reading
         if not reading.is_open:
-            raise CallerError("open a session first: until then this memory does not know its types")
+            raise CallerError("this memory has not read its types yet: open a session first")
         return reading.mapped(designator)
 
     async def as_of(
         self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
     ) -> Moment:
-        """The task tree and the world at any moment of an episode, as far as it was flushed; see `Reading.as_of`."""
-        return await self._now.reading.as_of(episode, time=time, sequence=sequence)
+        """Return the task tree and the world at any moment of an episode, up to the last flush; see `Reading.as_of`."""
+        return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence)
 
     async def number_of(self, episode: Episode) -> int:
-        """The number this database gave the episode; after `flush`."""
-        return await self._now.reading.number_of(str(episode))
+        """Return the number that this database gave to the episode, after `flush`."""
+        return await self._open_parts.reading.number_of(str(episode))
 
     @property
-    def _now(self) -> Parts:
+    def _open_parts(self) -> Parts:
         if self._parts is None:
             raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
         return self._parts

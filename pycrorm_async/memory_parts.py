@@ -1,4 +1,4 @@
-"""The parts an open memory is made of, and the ways in which plans find them: in a context, or in the whole process."""
+"""Hold the parts of an open memory and connect plans to them, in one context or in the whole process."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ __all__ = ["Parts"]
 
 
 class Parts(NamedTuple):
-    """What an open memory is made of."""
+    """The parts of an open memory."""
 
     queue: RecorderQueue
     writer: WriterThread | DelegatedWriter
@@ -34,7 +34,7 @@ class Parts(NamedTuple):
 
     @contextmanager
     def in_context(self) -> Iterator[None]:
-        """What is performed and entered in this context is recorded here, and this memory knows what went well."""
+        """Record plans and worlds of this context, and give its plans the experience of this memory."""
         with ExitStack() as stack:
             for variable, value in self._variables():
                 stack.enter_context(set_inside(variable, value))
@@ -42,7 +42,7 @@ class Parts(NamedTuple):
 
     @contextmanager
     def in_process(self) -> Iterator[None]:
-        """The same for all contexts of this process that have no memory of their own."""
+        """Do so for all contexts of this process that have no memory of their own."""
         for variable, value in self._variables():
             variable.connect(value)
         try:

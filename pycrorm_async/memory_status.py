@@ -1,4 +1,4 @@
-"""What an open memory reports about itself at one moment."""
+"""Report the state of an open memory at one moment."""
 
 from __future__ import annotations
 
@@ -16,24 +16,26 @@ __all__ = ["MemoryStatus"]
 
 
 class MemoryStatus(NamedTuple):
-    """How a memory is.
+    """The state of a memory.
 
     Attributes:
-        written, synced, stored: positions of what survives the process, the machine, and is in the database.
-        bytes_spooled: what the queue holds on disk.
-        faults: what the hooks failed to record, and performs that were never awaited.
-        unawaited: for each type of designator whose perform was called and never awaited, a sentence that says so.
-        missing: values that could not be recorded, and the reason of the last.
-        samples_left_out, episodes_continued: samples that found no room; episodes that went on in a follow-up episode.
-        folded: position up to which all shows in the tables, as the daemon says; None where a thread writes.
-        drained: whether somebody moves events out of the queue now.
-        writer: what the writer of this process does; None where a daemon writes.
-        unadopted: folders of dead recorders that could not be recovered, and why.
-        spool_fault: what befell the queue's files last (a failed sync; deleted or replaced files, and where recording
-            goes on); None if nothing did.
-        spool_lost: the records that were lost with deleted files, one line for each run of positions.
-        declarations_unrepeated: declarations that are in one segment only, for want of room in the others: of a log
-            that went back their episodes can be healed as long as that segment is kept.
+        written, synced, stored: positions up to which records survive a killed process, survive a power loss, and are
+            in the database.
+        bytes_spooled: the size of the queue on disk.
+        faults: events that the hooks failed to record, and performs that were never awaited.
+        unawaited: one sentence for each designator type whose perform was called but never awaited.
+        missing: the number of values that could not be recorded, and the reason of the last.
+        samples_left_out, episodes_continued: the number of samples dropped for lack of space, and of episodes that were
+            continued in a follow-up episode.
+        folded: position up to which records are visible, as reported by the daemon; None with a writer thread.
+        drained: whether a process drains the queue now.
+        writer: the state of the writer thread; None with a daemon.
+        unadopted: by folder of a dead recorder that could not be recovered, the error.
+        spool_fault: the last fault of the queue's files (a failed sync; deleted or replaced files, and the folder in
+            which recording continues); None without one.
+        spool_lost: the records lost with deleted files, one line for each run of positions.
+        declarations_unrepeated: the number of declarations that one segment contains and the later ones had no space
+            to repeat: if the log goes back, their episodes can be healed only while that segment is kept.
     """
 
     written: int
@@ -55,21 +57,21 @@ class MemoryStatus(NamedTuple):
 
     @classmethod
     def of(cls, parts: Parts, unadopted: Mapping[str, PycrormError]) -> Self:
-        """How the memory with these parts is, at this moment."""
-        queue, emitter, told = parts.queue, parts.emitter, parts.recorder
-        outside = queue.external_drain_status
+        """Collect the present state of the memory with these parts."""
+        queue, emitter, recorder = parts.queue, parts.emitter, parts.recorder
+        drain_status = queue.external_drain_status
         return cls(
             written=queue.written,
             synced=queue.synced,
             stored=queue.stored,
             bytes_spooled=queue.bytes_spooled,
-            folded=None if outside is None else outside.folded,
+            folded=None if drain_status is None else drain_status.folded,
             drained=queue.is_drained,
             faults=emitter.faults,
             unawaited=emitter.unawaited,
             missing=emitter.missing.count,
-            samples_left_out=told.samples_left_out,
-            episodes_continued=told.continued_count,
+            samples_left_out=recorder.samples_left_out,
+            episodes_continued=recorder.continued_count,
             writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
             unadopted=dict(unadopted),
             spool_fault=queue.setback,

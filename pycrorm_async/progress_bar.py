@@ -1,4 +1,4 @@
-"""A bar on stderr for what takes long, with rate and time left; none where that is no terminal."""
+"""Show a progress bar on stderr, with rate and remaining time; nothing if stderr is not a terminal."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 __all__ = ["stderr", "watched", "ProgressCallback"]
 
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
-"""One for all that is said there: a bar that stands still while something else is printed above it."""
+"""The only console for stderr, because rich redraws a bar below other output only if both use one console."""
 
 
 class ProgressCallback(Protocol):
-    """How much is done, and of how much; and what is done with it, if that is something else now."""
+    """Reports the amount done and the total; `what` replaces the bar's description."""
 
     def __call__(self, done: int, total: int, what: str | None = None) -> None: ...
 
 
 @contextmanager
 def watched(what: str, *, unit: str = "events") -> Iterator[ProgressCallback]:
-    """The bar, while the context lasts."""
+    """Show a bar inside the context; yields the callback that updates it."""
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -37,9 +37,9 @@ def watched(what: str, *, unit: str = "events") -> Iterator[ProgressCallback]:
     with bar:
         task = bar.add_task(what, total=None, rate="")
 
-        def tell(done: int, total: int, what: str | None = None) -> None:
+        def report_progress(done: int, total: int, what: str | None = None) -> None:
             speed = bar.tasks[0].speed
             rate = f"{speed:,.0f}/s" if speed else ""
             bar.update(task, description=what, completed=done, total=total, rate=rate)
 
-        yield tell
+        yield report_progress

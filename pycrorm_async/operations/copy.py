@@ -1,8 +1,9 @@
-"""`pycrorm copy`: appends the episodes of one memory to another, of whatever kind, and makes their tables there.
+"""`pycrorm copy`: append the episodes of one memory to another memory of any kind, and fold them there.
 
-The keys are the events' own, so it can be done in any order, interrupted, and done again: what is there already is
-compared, and what follows it is appended. An episode that is being recorded is copied as far as it is; doing it again
-takes the rest. Nothing is written to the source. Numbers and row ids belong to a database and are given anew.
+An event's key is part of the event, so a copy may be interrupted and repeated, in any order: events that the target has
+are compared, and those after them are appended. An episode that is being recorded is copied up to its present head;
+repeating the copy appends the rest. Nothing is written to the source. Episode numbers and row ids belong to a database,
+so the target assigns its own.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ __all__ = ["copy_episodes", "CopySummary", "EpisodeCopy"]
 
 @dataclass(frozen=True)
 class EpisodeCopy:
-    """One episode.
+    """The copy of one episode.
 
     Attributes:
         id, number: its UUID, its number in the source.
-        were_there: how many of the source's events the target had before.
-        copied: how many more it has now.
-        head: the last event the target has now.
-        damage: why not all of it could be copied: the source contradicts itself, or the target holds something else.
-        stopped: why the target took or shows no more of it.
+        were_there: the number of the source's events that the target had before.
+        copied: the number of events appended.
+        head: the last event that the target has now.
+        damage: the reason of an incomplete copy: damage in the source, or other events in the target.
+        stopped: the reason why the target refuses or does not fold further events.
     """
 
     id: str
@@ -56,7 +57,7 @@ class EpisodeCopy:
 
 @dataclass(frozen=True)
 class CopySummary:
-    """What was copied from where to where; the URLs are without passwords."""
+    """The result of a copy; the URLs have no passwords."""
 
     source: str
     target: str
@@ -74,19 +75,19 @@ async def copy_episodes(
     settings: Settings | None = None,
     watch: Callable[[int, int], None] = _unwatched,
 ) -> CopySummary:
-    """Copy these episodes, by number in the source, id, first digits of it or `last`; without any, all of them.
+    """Copy episodes, given by number in the source, id, first digits of the id or `last`; by default all of them.
 
-    A target that does not exist is made. `watch` is told how many events are done, and of how many. Damage of one
-    episode does not keep the others from being copied. Raises `UnknownEpisode`, `CallerError` if both are the same
-    memory, and as `Memory.open` does; what was copied up to there stays.
+    Creates a missing target. Calls `watch` with the number of events done and their total. Damage to one episode does
+    not prevent copying the others. Raises `UnknownEpisode`, `CallerError` if both are the same memory, and as
+    `Memory.open` does; events copied until then stay.
     """
     source_address, target_address = shared_address(source), shared_address(target)
     log = await EventLog.open(source_address, create=False)
     try:
         chosen = {row.number: row for row in [await episode_named(log, each) for each in episodes]}
         rows = list(chosen.values()) if episodes else await log.episodes()
-        async with _made(target_address, log) as (there, destination):
-            copier = _Copier(log, there, destination, settings or Settings(), watch)
+        async with _open_target(target_address, log) as (target_log, destination):
+            copier = _Copier(log, target_log, destination, settings or Settings(), watch)
             done = await copier.copy(rows)
     finally:
         await log.close()
@@ -94,24 +95,23 @@ async def copy_episodes(
 
 
 @asynccontextmanager
-async def _made(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tuple[EventLog, LogAndTables]]:
-    """The target's log and tables, made if need be."""
+async def _open_target(address: DatabaseAddress, source: EventLog) -> AsyncIterator[tuple[EventLog, LogAndTables]]:
+    """Open the target's log and tables, creating them if they are missing."""
     log = await EventLog.open(address, create=True)
     try:
         if log.log_id == source.log_id:
             raise CallerError(
-                f"{source.address} and {address} are the same memory, or the files of one are a copy of the other's:"
-                " copy into a new one"
+                f"{source.address} and {address} are the same memory, or file copies of one memory: copy to a new URL"
             )
         projector = Projector(log)
-        await retry(projector.open, backoff=BRIEF)  # another copy may be making the tables
+        await retry(projector.open, backoff=BRIEF)  # another copy may be creating the tables
         yield log, LogAndTables(log, projector)
     finally:
         await log.close()
 
 
 class _Copier:
-    """Copies one episode after the other; appends and folds whenever there is enough for a batch."""
+    """Copies one episode after the other; appends and folds whenever a batch is full."""
 
     def __init__(
         self,
@@ -178,18 +178,18 @@ class _Copier:
                 return
 
     async def _compare(self, shared: EpisodeRow) -> None:
-        """Raises `LogDamaged` at the first event that is not the same in both, up to this head."""
-        there = await self._target.episode(parse_episode_id(shared.id))
-        assert there is not None, "its head is above zero"
-        theirs = self._target.pages(there._replace(head=shared.head))
+        """Compare the shared events of both logs. Raises `LogDamaged` at the first difference."""
+        target_row = await self._target.episode(parse_episode_id(shared.id))
+        assert target_row is not None, "its head is above zero"
+        target_pages = self._target.pages(target_row._replace(head=shared.head))
         async for page in self._source.pages(shared):
-            there_too = await anext(theirs)
-            for event, other in zip(page, there_too, strict=False):
+            target_page = await anext(target_pages)
+            for event, other in zip(page, target_page, strict=False):
                 if event[1:] != other[1:]:
-                    reason = f"{self._target.address} holds another event under this number than {self._source.address}"
+                    reason = f"{self._target.address} has another event with this sequence than {self._source.address}"
                     raise LogDamaged(shared.id, event.sequence, reason)
-            if len(there_too) < len(page):
-                await anext(theirs)  # says which one is missing
+            if len(target_page) < len(page):
+                await anext(target_pages)  # raises `LogDamaged` with the missing event
             self._progress(len(page))
 
     def _progress(self, count: int) -> None:
@@ -203,7 +203,7 @@ class _Copier:
         try:
             await self._append_at_once([*declarations, *chain.from_iterable(records.values())])
         except DamageError:
-            # Somebody else is appending one of them, with other events: nothing was stored.
+            # The target refused the whole batch, because another process appended other events to one of the episodes.
             for episode, events in records.items():
                 try:
                     await self._append_at_once([*declarations, *events])
@@ -212,7 +212,7 @@ class _Copier:
         await self._fold({episode_text(episode) for episode in batch})
 
     async def _fold(self, episodes: set[str]) -> None:
-        """Until the tables show these; where others append all the time there is always something else to fold."""
+        """Fold until these episodes are visible; others may stay behind while other processes append to them."""
         while episodes & (await self._destination.behind()).keys():
             await retry(self._destination.fold_next_batch, backoff=BRIEF)
 
@@ -221,11 +221,11 @@ class _Copier:
         self._refused |= {episode_text(episode): reason for episode, reason in refusals.items()}
 
     async def _declarations(self, events: Iterable[Sequence[StoredEvent]]) -> list[Record]:
-        """Those that these events name and the target may not have, in the order the source got them."""
+        """Return the declarations that these events name and that were not sent yet, in the source's order."""
         named = {_designator(each) for each in chain.from_iterable(events) if each.type == "NodeStarted"} - self._sent
         named.discard(None)
         if not named <= self._declared.keys():
-            # Read after the events that name them: they were stored before.
+            # Read after the events, because each declaration is stored before its first use.
             self._declared = {fingerprint(payload): payload for payload in await self._source.declarations()}
         sent = {name: payload for name, payload in self._declared.items() if name in named}
         self._sent |= sent.keys()
@@ -233,7 +233,7 @@ class _Copier:
 
 
 def _refuse_unreadable(episode: str, event: StoredEvent) -> None:
-    """Raises `LogDamaged` for what cannot be what was recorded; an event of another version need only be JSON."""
+    """Raise `LogDamaged` for a payload that does not decode; that of another version need only be JSON."""
     shape = EVENT_TYPES.get(event.type)
     try:
         if shape is not None and shape.version == event.version:
@@ -244,13 +244,13 @@ def _refuse_unreadable(episode: str, event: StoredEvent) -> None:
         raise LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
 
 
-class _Naming(msgspec.Struct):
+class _DesignatorOnly(msgspec.Struct):
     designator: str | None = None
 
 
 def _designator(event: StoredEvent) -> str | None:
-    """The fingerprint it names. One that another version writes elsewhere is not found, and its node will not fold."""
+    """Return the declaration's fingerprint; None where another version stores it, whose node the fold parks."""
     try:
-        return msgspec.json.decode(event.payload, type=_Naming).designator
+        return msgspec.json.decode(event.payload, type=_DesignatorOnly).designator
     except msgspec.ValidationError:
         return None

@@ -1,4 +1,17 @@
-"""`pycrorm writer`: wires the daemon between a spool and its database."""
+"""`pycrorm writer`: wire the daemon between a spool and its database.
+
+Theory of operation. The actors are the daemon process, its fold workers (`fold_workers`), and the recorders, which are
+other processes with a folder each in the spool. One daemon drains a spool: it takes the spool's `writer` lock file,
+whose note also publishes the states of the fold workers to `pycrorm status`. `_Folders` finds the folders and claims
+each by its `drain` lock. The folder of a living recorder (`_LivingSource`) is drained as far as it is synced, and
+released when the recorder ends; that of a dead one (`_DeadSource`) is read to its end, completed with LOST ends, and
+deleted once everything in it is stored. A folder that cannot be claimed is reported and does not delay the others.
+
+A recorder may die at any moment; its folder is then claimed again as that of a dead one, and records that were stored
+already are stored only once. A daemon may be killed at any moment: the kernel frees its locks, and nothing is removed
+from a folder before the database has confirmed it. If the SQLite file is replaced while the daemon has it open, the
+daemon stops, because it would go on writing to the old file, which no longer has a name.
+"""
 
 from __future__ import annotations
 
@@ -45,42 +58,42 @@ async def serve(
     fold_workers: int = 0,
     forked: Sequence[FoldProcess] = (),
 ) -> DaemonSummary:
-    """Drains every recorder of the spool and folds, until `leave` is set; `say` gets one line for each notable thing.
+    """Drain every recorder of the spool and fold, until `leave` is set. Calls `say` with one line for each report.
 
-    `projections` of one's own are kept up to date too, with those that are installed. `fold_workers` processes fold, of
-    which the first ones may be `forked` already; while there is none, this one does.
+    Folds custom `projections` and the installed ones too. `fold_workers` is the number of processes that fold, of which
+    the first may be `forked` already; while none is ready, this process folds.
 
-    Raises `SpoolTaken` when another daemon drains this spool, `DatabaseForeign` when a SQLite file is replaced by
-    another meanwhile, and as `Memory.open` does.
+    Raises `SpoolTaken` when another daemon drains this spool, `DatabaseForeign` when the SQLite file is replaced while
+    it is open, and as `Memory.open` does.
     """
     address = shared_address(url)
     settings = settings or Settings()
     place = Spool(spool or address.default_spool, settings.file_access)
-    if not place.path.exists():  # the database first: where it is refused, no spool is made beside it
+    if not place.path.exists():  # open the database first, so that a refused one gets no spool beside it
         await (await EventLog.open(address, create=True, file_access=place.access)).close()
     lock = place.take_writer()
     if lock is None:
         raise SpoolTaken(place.path, "another `pycrorm writer` drains it already")
     note = _Note(lock, say)
-    async with AsyncExitStack() as held:
-        held.callback(lock.release)
+    async with AsyncExitStack() as stack:
+        stack.callback(lock.release)
         projections = checked(projections)
-        destination = await held.enter_async_context(
+        destination = await stack.enter_async_context(
             open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections, settings=settings)
         )
         say(f"draining {place.path} into {address}")
         stored = StoredSegments(place.path, settings, wall_ns=SYSTEM_CLOCK.wall_ns)
-        look = _Folders(place, destination.log_id, address, stored)
+        folders = _Folders(place, destination.log_id, address, stored)
         assignment = Assignment(url, destination.log_id, projections)
-        workers = await held.enter_async_context(
+        workers = await stack.enter_async_context(
             FoldWorkers(fold_workers, assignment, settings=settings, say=say, note=note, forked=forked)
         )
-        shown: Tables = FoldWorkerTables(destination, workers) if fold_workers else destination
-        return await Daemon(shown, look, settings=settings, say=say).run(leave)
+        tables: Tables = FoldWorkerTables(destination, workers) if fold_workers else destination
+        return await Daemon(tables, folders, settings=settings, say=say).run(leave)
 
 
 class _Note:
-    """Writes the states of the fold workers into the daemon's lock, where `pycrorm status` reads them."""
+    """Writes the states of the fold workers into the daemon's lock file, where `pycrorm status` reads them."""
 
     def __init__(self, lock: FileLock, say: Callable[[str], None]) -> None:
         self._lock = lock
@@ -92,12 +105,12 @@ class _Note:
             self._lock.write_note(msgspec.json.encode(DaemonNote(os.getpid(), workers)))
         except OSError as error:
             if not self._failed:
-                self._say(f"the states of the fold workers cannot be written for `pycrorm status`: {error}")
+                self._say(f"`pycrorm status` cannot show the fold workers: their states cannot be written: {error}")
             self._failed = True
 
 
 class _Folders:
-    """Looks round in a spool, and takes hold of what can be drained. Implements the writer's `Look`."""
+    """Scans a spool and claims the folders that can be drained. Implements the writer's `SourceScanner`."""
 
     def __init__(
         self, spool: Spool, log_id: str, address: DatabaseAddress, stored: StoredSegments | None = None
@@ -110,31 +123,31 @@ class _Folders:
         self._taken: set[str] = set()
 
     def __call__(self, but: Collection[str]) -> ScanResult:
-        # A file that is only gone may be put back. Into another one this process, which has the old one open, would
-        # never write: the next one looks what it is.
-        if (now := _identity(self._file)) is not None and now != self._opened:
+        # A missing file may be put back, so it is no error here. With another file in its place, this process would
+        # keep writing to the old one; a new process opens the new file and checks it.
+        if (identity := _identity(self._file)) is not None and identity != self._opened:
             raise DatabaseForeign(f"{self._file} was replaced while it was open: start `pycrorm writer` again")
-        held: list[ClaimedSource] = []
+        claimed: list[ClaimedSource] = []
         failed: dict[str, Exception] = {}
         present = self._spool.recorders()
         self._taken &= {each.name for each in present}
         folders = [each for each in present if each.name not in but]
-        if folders:  # with a folder in it the spool cannot be bound to another log any more
+        if folders:  # a spool that contains a folder cannot be bound to another log any more
             self._spool.bind(self._log_id)
         for folder in folders:
             try:
-                taken = _take(folder, self._stored, again=folder.name in self._taken)
-            except Exception as error:  # noqa: BLE001 - said of this folder; the others are drained
+                source = _claim(folder, self._stored, again=folder.name in self._taken)
+            except Exception as error:  # noqa: BLE001 - reported for this folder; the others are drained
                 failed[folder.name] = folder_error(folder.path, error)
             else:
-                if taken is not None:
-                    held.append(taken)
+                if source is not None:
+                    claimed.append(source)
                     self._taken.add(folder.name)
-        return ScanResult(held, failed)
+        return ScanResult(claimed, failed)
 
 
 def _identity(file: Path | None) -> tuple[int, int] | None:
-    """Which file this is; None for none, and where there is no telling."""
+    """Return device and inode of a file; None if it is missing or cannot be examined."""
     try:
         status = file.stat() if file is not None else None
     except OSError:
@@ -142,23 +155,24 @@ def _identity(file: Path | None) -> tuple[int, int] | None:
     return None if status is None else (status.st_dev, status.st_ino)
 
 
-def _take(folder: RecorderFolder, stored: StoredSegments | None = None, *, again: bool) -> ClaimedSource | None:
+def _claim(folder: RecorderFolder, stored: StoredSegments | None = None, *, again: bool) -> ClaimedSource | None:
+    """Claim a folder as that of a living or a dead recorder; None if another process has it."""
     if folder.alive:
-        return _Living.take(folder.path)
+        return _LivingSource.take(folder.path)
     dead = open_dead(folder.path, stored=stored)
     if dead is None:
         return None
     try:
-        if again:  # it may be damaged further on, and what comes before that is not to be stored again and again
+        if again:  # check all of it first: damage further on would make the daemon store the start again each time
             dead.check()
     except BaseException:
         dead.release()
         raise
-    return _Dead(dead)
+    return _DeadSource(dead)
 
 
-class _Living(LiveQueue):
-    """A living recorder's folder, as the daemon holds it. Implements `ClaimedSource`."""
+class _LivingSource(LiveQueue):
+    """The claimed folder of a living recorder. Implements `ClaimedSource`."""
 
     def release_folder(self) -> ReleaseOutcome:
         is_alive, closed = self.is_alive, self.is_closed
@@ -167,8 +181,8 @@ class _Living(LiveQueue):
         return ReleaseOutcome(what, whole=self.stored == self.supplied or not is_alive)
 
 
-class _Dead(ClaimedSource):
-    """What a dead recorder left. Nobody waits there, so nobody is told anything."""
+class _DeadSource(ClaimedSource):
+    """The claimed folder of a dead recorder. No process waits for its records, so visibility is not reported to it."""
 
     is_alive = False
 
@@ -192,7 +206,7 @@ class _Dead(ClaimedSource):
         self._queue.fail(reason)
 
     def finish(self) -> None:
-        """All of it is there already."""
+        """Do nothing, because a dead recorder's queue is complete."""
 
     def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None: ...
 

@@ -1,8 +1,14 @@
-"""Starts the process of a fold worker, talks to it, and knows how it is and how it ended.
+"""Start the process of a fold worker, exchange messages with it, and report how it ended.
 
-The command forks its first workers before it opens anything, while it has one thread: they have all modules already and
-are ready at once, so that a full spool is folded by several processes from its first batch on. A process that takes the
-place of a dead one is spawned, because a fork of a daemon at work would have its locks and none of its threads.
+Theory of operation. There are two ways to start a process. The `pycrorm writer` command forks its first workers before
+it opens anything, while it has a single thread: they have imported all modules and are ready at once, so a full spool
+is folded by several processes from the first batch on. A replacement for a dead worker is spawned, because a fork of
+the running daemon would inherit locks whose owning threads do not exist in the child.
+
+Daemon and worker share one socket pair, and every request has exactly one answer. Signals could end a child before it
+installs its handlers, so SIGINT and SIGTERM are blocked around the start and unblocked by the child. The daemon is the
+parent of each process and reaps it only in `_Child.poll`, `wait` and `ended`; until then the kernel cannot reuse the
+pid, so `kill` always hits this process.
 """
 
 from __future__ import annotations
@@ -29,29 +35,30 @@ _CODE: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv[3]); from pycrorm_async.operations.fold_worker import main;"
     " main(int(sys.argv[1]), int(sys.argv[2]))"
 )
-"""Not `-m`: the worker imports from where the daemon does, projections of one's own included."""
+"""The program of a spawned worker. It sets `sys.path` first, which `-m` cannot, so that it imports custom projections
+from where the daemon does."""
 
 
 class _Child:
-    """A forked child, with the part of a `Popen` that is used here."""
+    """A forked child with the interface of `Popen` that `FoldProcess` uses."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
         self._code: int | None = None
 
     def poll(self) -> int | None:
-        return self._reaped(os.WNOHANG)
+        return self._reap(os.WNOHANG)
 
     def wait(self) -> int:
-        code = self._reaped(0)
+        code = self._reap(0)
         assert code is not None
         return code
 
     def kill(self) -> None:
-        if self.poll() is None:  # not reaped, so that no other process can have its number
+        if self.poll() is None:  # not reaped, so no other process can have its pid
             os.kill(self.pid, signal.SIGKILL)
 
-    def _reaped(self, options: int) -> int | None:
+    def _reap(self, options: int) -> int | None:
         if self._code is None:
             pid, status = os.waitpid(self.pid, options)
             if pid:
@@ -61,24 +68,24 @@ class _Child:
 
 @contextmanager
 def forked(count: int) -> Iterator[list[FoldProcess]]:
-    """Processes for the first workers of a daemon; gone when the context is left. For a process with one thread."""
-    with ExitStack() as held:
+    """Fork the first workers of a daemon, and end them with the context. The calling process must have one thread."""
+    with ExitStack() as stack:
         processes: list[FoldProcess] = []
         for _ in range(count):
             processes.append(FoldProcess.fork([each.connection for each in processes]))
-            held.callback(processes[-1].end)
+            stack.callback(processes[-1].end)
         yield processes
 
 
 class FoldProcess(NamedTuple):
-    """A process and the connection to it. The process is a child of this one until `ended` has returned."""
+    """A worker process and the connection to it. It stays a child of this process until `ended` returns."""
 
     process: subprocess.Popen[bytes] | _Child
     connection: Connection
 
     @classmethod
     def fork(cls, others: list[Connection]) -> FoldProcess:
-        """A copy of this process, without its connections to `others`."""
+        """Fork this process; the child closes its copies of the connections to `others`."""
         daemon = os.getpid()
         ours, theirs = socket.socketpair()
         before = signal.pthread_sigmask(signal.SIG_BLOCK, IGNORED)
@@ -89,7 +96,7 @@ class FoldProcess(NamedTuple):
                 for each in others:
                     each.close()
                 main(theirs.detach(), daemon)
-            except BaseException:  # noqa: BLE001 - it must not run on as a second daemon
+            except BaseException:  # noqa: BLE001 - the child must not return into the daemon's code
                 traceback.print_exc()
             finally:
                 os._exit(1)
@@ -99,8 +106,9 @@ class FoldProcess(NamedTuple):
 
     @classmethod
     def spawn(cls) -> FoldProcess:
+        """Start a new interpreter for a worker."""
         ours, theirs = socket.socketpair()
-        # Blocked from its first instruction on: a Ctrl-C in a terminal must not end it before it can ignore that.
+        # The child inherits the blocked signals, so that a Ctrl-C cannot end it before it ignores them.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, IGNORED)
         try:
             command = [sys.executable, "-c", _CODE, str(theirs.fileno()), str(os.getpid()), json.dumps(sys.path)]
@@ -113,12 +121,12 @@ class FoldProcess(NamedTuple):
         return cls(process, Connection(ours.detach()))
 
     def exchange(self, message: object) -> Any:
-        """Sends this and gives the answer. Blocks; raises `EOFError` or `OSError` when the process ends."""
+        """Send a message and return the answer. Blocks; raises `EOFError` or `OSError` when the process ends."""
         self.connection.send(message)
         return self.connection.recv()
 
     async def ended(self) -> str:
-        """How the process ended."""
+        """Wait for the end of the process; return its cause as text."""
         descriptor, ended = os.pidfd_open(self.process.pid), asyncio.Event()
         loop = asyncio.get_running_loop()
         loop.add_reader(descriptor, ended.set)
@@ -131,7 +139,7 @@ class FoldProcess(NamedTuple):
         return f"exited with signal {-code}" if code < 0 else f"exited with exit code {code}"
 
     def end(self) -> None:
-        """Kills the process if it has not ended. Nothing is lost: what it had not committed is folded again."""
+        """Kill the process if it is running. Nothing is lost: its uncommitted events are folded again."""
         if self.process.poll() is None:
             self.process.kill()
             self.process.wait()

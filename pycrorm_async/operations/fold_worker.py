@@ -1,12 +1,13 @@
-"""The process of one fold worker: answers the daemon's requests until their connection ends.
+"""Run one fold worker: answer the daemon's requests until the connection ends.
 
-`FoldWorker` in `fold_workers` starts it with a connection. It receives an `Assignment`, answers `READY`, and then gives
-one answer to each request: `Prepare` and `Write` fold a batch of events in two steps, `FoldRest` brings kept views and
-projections of one's own up to date. The process opens the database at the first request and has one transaction open
-at most, and none between requests. Whatever a request raises becomes a `Failure`; the process survives it.
+`FoldWorker` in `fold_workers` starts this process with a connection. The process receives an `Assignment`, answers
+`READY`, and then answers each request once: `Prepare` and `Write` fold a batch of events in two steps, `FoldRest`
+refreshes materialised views and folds custom projections. It opens the database at the first request, has at most one
+open transaction, and none between requests. An exception in a request becomes a `Failure`, and the process continues.
 
-It ignores SIGINT and SIGTERM, which a terminal or a service manager sends to every process: the daemon ends it. It ends
-when the connection does, and the kernel kills it when the daemon dies, so that not even a stopped worker outlives it.
+It ignores SIGINT and SIGTERM, which a terminal or a service manager sends to every process, because the daemon ends it.
+It ends with its connection, and the kernel kills it when the daemon dies, so that no worker outlives the daemon, not
+even a stopped one.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _PR_SET_PDEATHSIG: Final = 1
 
 
 class Assignment(NamedTuple):
-    """The database to fold, the id of its log, and projections of one's own."""
+    """The database to fold, the id of its log, and the custom projections to fold."""
 
     url: str
     log_id: str
@@ -64,7 +65,7 @@ class FoldRest(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """Why a request was not carried out. `unavailable`: the database does not answer, so it is worth asking again."""
+    """The reason of a failed request. `unavailable`: the database does not answer, so the daemon may try again."""
 
     reason: str
     unavailable: bool
@@ -75,32 +76,32 @@ Answer: TypeAlias = Outlook | int | bool | Failure
 
 
 def main(descriptor: int, daemon: int) -> None:
-    """Serves the connection of this file descriptor, for the daemon with this process id."""
+    """Serve the connection of this file descriptor, for the daemon with this process id."""
     for number in IGNORED:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, IGNORED)
     _end_with(daemon)
     collect_seldom()
-    # The daemon opens the same memory and reports what there is to report about it.
+    # The daemon opens the same memory and logs its warnings; repeating them in each worker would double them.
     logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)
     logging.getLogger("pycrorm_async.projections").setLevel(logging.WARNING)
     with Connection(descriptor) as connection, asyncio.Runner() as runner, suppress(EOFError, ConnectionError):
-        fold = _Fold(connection.recv())
+        handler = _RequestHandler(connection.recv())
         connection.send(READY)
         while True:
-            connection.send(runner.run(fold.answer(connection.recv())))
+            connection.send(runner.run(handler.answer(connection.recv())))
     os._exit(0)
 
 
 def _end_with(daemon: int) -> None:
-    """Has the kernel kill this process when the daemon dies, also while this process is stopped."""
+    """Make the kernel kill this process when the daemon dies, also while this process is stopped."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != daemon:  # it died before that
+    if os.getppid() != daemon:  # the daemon died before the call above
         os._exit(0)
 
 
-class _Fold:
-    """Carries requests out. At most one batch is prepared."""
+class _RequestHandler:
+    """Executes requests. At most one batch is prepared."""
 
     def __init__(self, assignment: Assignment) -> None:
         self._assignment = assignment
@@ -110,15 +111,15 @@ class _Fold:
 
     async def answer(self, request: Request) -> Answer:
         try:
-            return await self._carried_out(request, await self._opened())
+            return await self._execute(request, await self._open())
         except DatabaseUnavailable as error:
-            self._projector = None  # after a failover or a restore the tables may be of another shape
+            self._projector = None  # after a failover or a restore the tables may have another layout
             return Failure(str(error), unavailable=True)
-        except Exception as error:  # noqa: BLE001 - the daemon raises it
+        except Exception as error:  # noqa: BLE001 - sent to the daemon, which raises it
             self._projector = None
             return Failure(str(error) or repr(error), unavailable=False)
 
-    async def _carried_out(self, request: Request, projector: Projector) -> Answer:
+    async def _execute(self, request: Request, projector: Projector) -> Answer:
         match request:
             case Prepare(spans):
                 self._batch = None
@@ -130,23 +131,23 @@ class _Fold:
             case FoldRest(now):
                 return await projector.fold_rest(now=now)
 
-    async def _opened(self) -> Projector:
-        """Opened at the first request, and at the next one if that failed."""
+    async def _open(self) -> Projector:
+        """Open the log and the tables at the first request, and again after a failure."""
         if self._log is None:
-            self._log = await self._same_log()
+            self._log = await self._open_same_log()
         if self._projector is None:
-            ours = self._assignment.projections
-            projector = Projector(self._log, projections=ours, installed=installed_besides(ours))
+            projections = self._assignment.projections
+            projector = Projector(self._log, projections=projections, installed=installed_besides(projections))
             await projector.open()
             self._projector = projector
         return self._projector
 
-    async def _same_log(self) -> EventLog:
-        """The daemon's log; no other is made or written where the file of a daemon that is at work was replaced."""
+    async def _open_same_log(self) -> EventLog:
+        """Open the daemon's log. A SQLite file that replaced it is refused and not written."""
         address = DatabaseAddress.parse(self._assignment.url)
         await (await EventLog.open(address, create=False)).close()
         log = await EventLog.open(address, create=True)
         if log.log_id != self._assignment.log_id:
             await log.close()
-            raise DatabaseForeign(f"{address} was replaced while the daemon had it open")
+            raise DatabaseForeign(f"{address} was replaced while the daemon had it open: start `pycrorm writer` again")
         return log

@@ -1,23 +1,25 @@
-"""Processes that fold beside the daemon, which appends: started when they are needed, watched, restarted.
+"""Start, watch and restart the processes that fold for a daemon while the daemon appends.
 
     async with FoldWorkers(2, assignment, settings=settings, say=say, note=note) as workers:
         tables = FoldWorkerTables(destination, workers)
 
-Theory of operation. A worker is a spawned process (`fold_worker`) with one connection. The daemon sends it a request
-and waits for the answer; between requests a worker holds nothing, neither a lock nor a transaction. What a worker had
-not committed when it dies is folded again by another one, or by the daemon, because progress is in the tables. So the
-daemon may kill a worker at any moment, and does so when it leaves.
+Theory of operation. A worker is a process (`fold_worker`) with one connection to the daemon. The daemon sends a request
+and waits for the answer; between requests a worker has no lock and no transaction. Checkpoints are in the tables, so
+the events that a dead worker had not committed are folded again by another worker or by the daemon. Therefore the
+daemon may kill a worker at any moment, and does so when it exits.
 
-Each worker has one task, which starts the process, waits for its end and starts it again. The pause before that grows
-with each death and is short again after a worker has lived for a minute. While no worker is ready the daemon folds by
-itself, so a worker that cannot be started costs speed and nothing else.
+Each worker has one asyncio task, which starts the process, waits for its end and starts it again. The pause before a
+restart grows with each death, and is short again after a process has lived for `fold_worker_healthy_s`. While no worker
+is ready the daemon folds itself, so a worker that cannot be started costs speed and nothing else. A worker's state is
+`idle` (not needed yet), `starting`, `running`, `stopped` or `restarting`; only its task and the calls that wait for its
+answers change it, all in the daemon's event loop.
 
-A worker that is stopped (SIGSTOP, a debugger) in the middle of a transaction holds SQLite's one write lock, or locks of
-rows in PostgreSQL, and so keeps other processes from writing. Neither its processor time nor its open connection would
-show that, so the daemon looks at the state of the process while it waits for an answer: it reports a stopped worker
-after `fold_worker_report_s`, and kills it after `fold_worker_stopped_s`, upon which the database rolls its transaction
-back. A worker that is at work is given `fold_worker_answer_s`. Only processes that the daemon started itself, and has
-not reaped, are ever killed.
+A process that is stopped (SIGSTOP, a debugger) inside a transaction keeps SQLite's only write lock, or row locks in
+PostgreSQL, and so blocks other writers. Neither its CPU time nor its open connection shows that, so the daemon reads
+the state of the process while it waits for an answer. It reports a stopped worker after `fold_worker_report_s` and
+kills it after `fold_worker_stopped_s`; the database then rolls the transaction back. A worker that is not stopped has
+`fold_worker_answer_s` for an answer. The daemon kills only processes that it started and has not reaped, so a reused
+pid is never hit.
 """
 
 from __future__ import annotations
@@ -44,16 +46,17 @@ from pycrorm_async.writer.retry import Backoff
 __all__ = ["WORKERS", "DaemonNote", "FoldWorkers", "FoldWorkerTables", "FoldWorkerState", "FoldWorkerLost", "verdict"]
 
 WORKERS: Final = 2
-"""Processes that fold for one daemon: while one writes the other one prepares, and no database lets two write well."""
+"""The fold workers of one daemon: one writes while the other prepares. More would compete for the database's writes."""
 _RESTART_S_MAX: Final = 60.0
-_LOOK_S: Final = 0.25
-"""So often the daemon looks at the process that it waits for."""
+"""The longest pause before a restart."""
+_CHECK_S: Final = 0.25
+"""The interval at which the daemon reads the state of a process while it waits for its answer."""
 _NOTE_S: Final = 1.0
-"""The number of batches is noted at most so often; every change of a state at once."""
+"""The shortest interval between two notes of the number of batches; a change of state is noted at once."""
 
 
 class FoldWorkerLost(Exception):
-    """The worker ended before it answered; its batch is to be folded again."""
+    """The worker ended before it answered; its batch must be folded again."""
 
 
 class FoldWorkerState(msgspec.Struct, frozen=True):
@@ -62,12 +65,12 @@ class FoldWorkerState(msgspec.Struct, frozen=True):
     Attributes:
         number: from 1.
         state: `idle`: not needed yet; `stopped`: the process is stopped while the daemon waits for it.
-        since_wall_ns: of the state.
-        pid: of the process; None while there is none.
-        restarts: how often it was started again.
-        restart_wall_ns: when it is started again; None unless it is `restarting`.
+        since_wall_ns: the start of the state.
+        pid: of the process; None without one.
+        restarts: the number of restarts.
+        restart_wall_ns: the time of the next restart; None unless the state is `restarting`.
         reason: of the last death.
-        batches: folded, those of the processes before it included.
+        batches: the number of batches folded, by earlier processes of this worker too.
     """
 
     number: int
@@ -81,14 +84,14 @@ class FoldWorkerState(msgspec.Struct, frozen=True):
 
 
 class DaemonNote(msgspec.Struct, frozen=True):
-    """The daemon's note in its lock of the spool, for `pycrorm status`."""
+    """The note in the spool's lock file, which `pycrorm status` reads."""
 
     pid: int
     fold_workers: Sequence[FoldWorkerState] = ()
 
 
 def verdict(settings: Settings, *, unanswered_s: float, stopped_s: float) -> Literal["wait", "report", "replace"]:
-    """The treatment of a worker that owes an answer; `stopped_s` is 0 for a process that is not stopped.
+    """Decide about a worker that has not answered yet; `stopped_s` is 0 for a process that is not stopped.
 
     >>> verdict(Settings(), unanswered_s=299.0, stopped_s=0.0), verdict(Settings(), unanswered_s=11.0, stopped_s=10.5)
     ('wait', 'replace')
@@ -99,7 +102,7 @@ def verdict(settings: Settings, *, unanswered_s: float, stopped_s: float) -> Lit
 
 
 class FoldWorker:
-    """One worker, whatever process it has at the moment. Implements `Hand`."""
+    """One worker and its current process. Implements `Hand`."""
 
     def __init__(
         self,
@@ -123,30 +126,30 @@ class FoldWorker:
         self._note = note
         self._clock = clock
         self._forked = forked
-        self._link: FoldProcess | None = None
+        self._process: FoldProcess | None = None
         self._killed_because: str | None = None
 
-    # --- as a hand --------------------------------------------------------------------------------------------
+    # --- requests ---------------------------------------------------------------------------------------------
 
     async def prepare(self, spans: Sequence[Span]) -> Outlook:
-        answer = await self._answer(Prepare(spans), "prepares a batch")
+        answer = await self._request(Prepare(spans), "prepares a batch")
         assert isinstance(answer, Outlook)
         return answer
 
     async def write(self) -> int:
-        count = await self._answer(Write(), "writes a batch and holds locks of the database")
+        count = await self._request(Write(), "writes a batch and holds locks of the database")
         assert isinstance(count, int)
         self._change(batches=self.state.batches + (count > 0))
         return count
 
     async def fold_rest(self, *, now: bool) -> bool:
-        """One step of the kept views and of projections of one's own; False if nothing was behind."""
-        return bool(await self._answer(FoldRest(now), "folds views or projections and may hold locks of the database"))
+        """Refresh materialised views and fold custom projections by one step; return False if none was behind."""
+        return bool(await self._request(FoldRest(now), "folds views or projections and may hold locks of the database"))
 
-    async def _answer(self, request: Request, doing: str) -> object:
-        if self._link is None or not self.is_ready:
+    async def _request(self, request: Request, activity: str) -> object:
+        if self._process is None or not self.is_ready:
             raise FoldWorkerLost
-        answer = await self._watched(self._link, request, doing)
+        answer = await self._exchange(self._process, request, activity)
         if isinstance(answer, Failure):
             raise (DatabaseUnavailable if answer.unavailable else DatabaseError)(answer.reason)
         return answer
@@ -154,93 +157,97 @@ class FoldWorker:
     # --- the process ------------------------------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Keeps the process alive from when it is wanted until this is cancelled, which kills it."""
+        """Keep a process running from the moment `wanted` is set; cancelling this kills the process."""
         backoff = Backoff(first_s=self._settings.fold_worker_restart_s, longest_s=_RESTART_S_MAX)
         now_s = asyncio.get_running_loop().time
         await self.wanted.wait()
         deaths = 0
         while True:
             began_s = now_s()
-            who, reason = await self._live()
+            name, reason = await self._run_process()
             deaths = 1 if now_s() - began_s >= self._settings.fold_worker_healthy_s else deaths + 1
             pause_s = backoff.pause_s(deaths, 1.0)
             assert pause_s is not None, "there is no last attempt"
-            self._say(f"{who} {reason}; restarting it in {pause_s:g} s")
+            self._say(f"{name} {reason}; restarting it in {pause_s:g} s")
             restart_ns = self._clock.wall_ns() + int(pause_s * 1e9)
             self._change("restarting", pid=None, reason=reason, restart_wall_ns=restart_ns)
             await asyncio.sleep(pause_s)
             self._change("starting", restarts=self.state.restarts + 1, restart_wall_ns=None)
 
-    async def _live(self) -> tuple[str, str]:
-        """One process from its start to its end: its name, and how it ended."""
+    async def _run_process(self) -> tuple[str, str]:
+        """Run one process from its start to its end; return its name and the cause of its end."""
         name = f"fold worker {self.state.number}"
         try:
-            link, self._forked = self._forked or FoldProcess.spawn(), None
+            process, self._forked = self._forked or FoldProcess.spawn(), None
         except OSError as error:
             return name, f"cannot be started: {error}"
-        self._change("starting", pid=link.process.pid)
-        opening = asyncio.create_task(self._open(link), name=f"pycrorm {name} opens")
+        self._change("starting", pid=process.process.pid)
+        opening = asyncio.create_task(self._open(process), name=f"pycrorm {name} opens")
         try:
-            how = await link.ended()
+            cause = await process.ended()
         finally:
-            self.is_ready, self._link = False, None
-            link.process.kill()
+            self.is_ready, self._process = False, None
+            process.process.kill()
             opening.cancel()
             await asyncio.gather(opening, return_exceptions=True)
-            link.end()
-        reason, self._killed_because = self._killed_because or how, None
-        return f"{name} (pid {link.process.pid})", reason
+            process.end()
+        reason, self._killed_because = self._killed_because or cause, None
+        return f"{name} (pid {process.process.pid})", reason
 
-    async def _open(self, link: FoldProcess) -> None:
+    async def _open(self, process: FoldProcess) -> None:
         try:
-            await self._watched(link, self._assignment, "starts")
+            await self._exchange(process, self._assignment, "starts")
         except FoldWorkerLost:
             return
-        except Exception as error:  # noqa: BLE001 - a projection that cannot be pickled, say: reported with the restart
-            self._killed_because = f"cannot be given its work: {error}"
-            link.process.kill()
+        except Exception as error:  # noqa: BLE001 - such as a projection that cannot be pickled; reported at restart
+            self._killed_because = f"cannot receive its assignment: {error}"
+            process.process.kill()
             return
-        self._link, self.is_ready = link, True
+        self._process, self.is_ready = process, True
         self._change("running")
 
-    async def _watched(self, link: FoldProcess, message: object, doing: str) -> Any:
-        """The answer to this message. Raises `FoldWorkerLost`. Cancelled, it leaves no answer on its way: it kills."""
+    async def _exchange(self, process: FoldProcess, message: object, activity: str) -> Any:
+        """Send a message, watch the process, and return the answer. Raises `FoldWorkerLost`.
+
+        Cancelling it kills the process, because the late answer would be taken for that of the next request.
+        """
         now_s = asyncio.get_running_loop().time
-        exchange = asyncio.ensure_future(asyncio.to_thread(link.exchange, message))
-        asked_s = running_s = now_s()
+        exchange = asyncio.ensure_future(asyncio.to_thread(process.exchange, message))
+        sent_s = running_s = now_s()
         try:
-            while not (await asyncio.wait([exchange], timeout=_LOOK_S))[0]:
-                looked_s = now_s()
-                running_s = running_s if link.is_stopped() else looked_s
-                self._treat(link, doing, unanswered_s=looked_s - asked_s, stopped_s=looked_s - running_s)
+            while not (await asyncio.wait([exchange], timeout=_CHECK_S))[0]:
+                checked_s = now_s()
+                running_s = running_s if process.is_stopped() else checked_s
+                self._treat(process, activity, unanswered_s=checked_s - sent_s, stopped_s=checked_s - running_s)
             answer = exchange.result()
         except (EOFError, OSError):
             self.is_ready = False
-            link.process.kill()  # one that closed its connection is of no use
+            process.process.kill()  # without a connection it could only idle
             raise FoldWorkerLost from None
         except asyncio.CancelledError:
             self.is_ready = False
             exchange.add_done_callback(lambda done: done.cancelled() or done.exception())
-            link.process.kill()
+            process.process.kill()
             raise
         if self.state.state == "stopped":
             self._continue()
         return answer
 
-    def _treat(self, link: FoldProcess, doing: str, *, unanswered_s: float, stopped_s: float) -> None:
+    def _treat(self, process: FoldProcess, activity: str, *, unanswered_s: float, stopped_s: float) -> None:
+        """Report or kill the process according to `verdict`."""
         settings, is_reported = self._settings, self.state.state == "stopped"
         match verdict(settings, unanswered_s=unanswered_s, stopped_s=stopped_s):
             case "replace" if self._killed_because is None:
-                silent = (
+                cause = (
                     f"was stopped for {stopped_s:.1f} s" if stopped_s else f"gave no answer for {unanswered_s:.0f} s"
                 )
-                self._killed_because = f"{silent} while it {doing}, and was killed"
+                self._killed_because = f"{cause} while it {activity}, and was killed"
                 self.is_ready = False
-                link.process.kill()
+                process.process.kill()
             case "report" if not is_reported:
                 left_s = settings.fold_worker_stopped_s - stopped_s
                 self._say(
-                    f"fold worker {self.state.number} (pid {link.process.pid}) is stopped while it {doing};"
+                    f"fold worker {self.state.number} (pid {process.process.pid}) is stopped while it {activity};"
                     f" replacing it in {left_s:.1f} s unless it continues"
                 )
                 self._change("stopped")
@@ -259,12 +266,12 @@ class FoldWorker:
 
 
 class FoldWorkers:
-    """The workers of one daemon; all are gone when the context is left.
+    """The workers of one daemon. All of them are killed when the context ends.
 
     Args:
-        forked: their first processes, if they are there already; otherwise a worker is started when it is needed.
-        say: gets one line for each death, stop and return.
-        note: gets the states of all workers when one has changed.
+        forked: the first processes, if the command forked them; a worker without one is started when it is needed.
+        say: called with one line for each death, stop and continuation.
+        note: called with the states of all workers when one has changed.
     """
 
     def __init__(
@@ -302,16 +309,16 @@ class FoldWorkers:
 
     @property
     def ready(self) -> list[FoldWorker]:
-        """Those that can be asked now."""
+        """The workers that can take a request now."""
         return [each for each in self._workers if each.is_ready]
 
     @property
     def are_wanted(self) -> bool:
-        """Whether all are started, or are to be."""
+        """Whether every worker is started or will be."""
         return all(each.wanted.is_set() for each in self._workers)
 
     def want(self, events: int) -> None:
-        """Starts one worker if there are events to fold, and the others if there are many."""
+        """Start one worker if there are events to fold, and the others if there are many."""
         for worker in self._workers[: 0 if events == 0 else 1 if events < LOOKAHEAD_EVENTS_MIN else None]:
             worker.wanted.set()
 
@@ -325,7 +332,7 @@ class FoldWorkers:
 
 
 class FoldWorkerTables(Tables):
-    """A destination whose tables are folded by workers, and by this process while none of them is ready."""
+    """Folds a destination's tables with workers, or in this process while no worker is ready. Implements `Tables`."""
 
     def __init__(self, destination: LogAndTables, workers: FoldWorkers) -> None:
         self._destination = destination
@@ -343,7 +350,7 @@ class FoldWorkerTables(Tables):
         return await self._destination.fold()
 
     async def fold_next_batch(self) -> bool:
-        if not self._workers.are_wanted:  # a daemon with little to do has no process that it does not need
+        if not self._workers.are_wanted:  # start processes only when there are events, to keep an idle daemon small
             self._workers.want(await self._pipeline.size())
         hands = self._workers.ready
         if not hands:
@@ -354,7 +361,7 @@ class FoldWorkerTables(Tables):
             with self._destination.log.translated():
                 count = await self._pipeline.fold_next(hands)
             self._has_news = count is not None or await hands[0].fold_rest(now=self._has_news)
-        except FoldWorkerLost:  # said by its task; the next call asks the others
+        except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True
         return self._has_news
 

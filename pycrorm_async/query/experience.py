@@ -53,7 +53,7 @@ class PickUpExperience:
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
-        self.over = False
+        self.is_closed = False
         """True once the memory is closed."""
 
     async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
@@ -61,7 +61,7 @@ class PickUpExperience:
 
         Reads the latest `ATTEMPTS_MAX` attempts. Raises `CallerError` once the memory is closed.
         """
-        if self.over:
+        if self.is_closed:
             raise CallerError("the memory is closed, so its experience cannot be read: ask while it is open")
         async with self._reading.session() as session:
             connection = await session.connection()

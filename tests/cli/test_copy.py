@@ -112,7 +112,7 @@ async def test_two_memories_that_contradict_each_other_are_told_and_the_rest_is_
     done = pycrorm("copy", "--from", "sqlite:///a.db", "--to", "sqlite:///b.db", cwd=folder)
     assert done.returncode == 4
     assert one_line_of(done) == (
-        f"pycrorm: episode {ids(1)}, event 1: sqlite:///b.db holds another event under this number than sqlite:///a.db"
+        f"pycrorm: episode {ids(1)}, event 1: sqlite:///b.db has another event with this sequence than sqlite:///a.db"
     )
     assert [len(events) for events in logs_of(other).values()] == [1, 12]
     document = answer("copy", "--from", "sqlite:///a.db", "--to", "sqlite:///b.db", cwd=folder, code=4)

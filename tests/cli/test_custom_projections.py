@@ -196,7 +196,10 @@ def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_fol
         (["rebuild", "--projection", "lab:NoTables"], "it has no tables"),
         (["rebuild", "--projection", "lab:Weighed", "--projection", "lab:Picky"], "two projections have the name"),
         (["rebuild", "scales"], "unknown projection 'scales'; known: tables"),
-        (["run", "weighing.py", "--writer", "daemon", "--projection", "lab:Weighed"], "knows no projections"),
+        (
+            ["run", "weighing.py", "--writer", "daemon", "--projection", "lab:Weighed"],
+            "without the projections of this process",
+        ),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(lab: Path, arguments: list[str], said: str) -> None:

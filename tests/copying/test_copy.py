@@ -394,7 +394,7 @@ async def test_a_copy_of_the_files_of_a_memory_is_told_apart_from_a_new_one(new_
     source, target = new_file(), new_file()
     await notes(source, "a")
     shutil.copy(path_of(source), path_of(target))
-    with pytest.raises(CallerError, match=r"or the files of one are a copy of the other's: copy into a new one"):
+    with pytest.raises(CallerError, match=r"or file copies of one memory: copy to a new URL"):
         await copy_episodes(source, target)
 
 

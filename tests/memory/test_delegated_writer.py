@@ -23,7 +23,7 @@ from pycrorm_async.errors import (
     SpoolForeign,
     SpoolUnavailable,
 )
-from pycrorm_async.operations.daemon import _take, serve
+from pycrorm_async.operations.daemon import _claim, serve
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.files.spool import RecorderFolder
@@ -302,12 +302,12 @@ async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folder
     def take(folder: RecorderFolder, stored: StoredSegments, *, again: bool) -> ClaimedSource | None:
         looking.set()
         assert cancelled.wait(60)
-        return _take(folder, stored, again=again)
+        return _claim(folder, stored, again=again)
 
     async with memory_at(database_url, spool) as memory:
         await NoteActionPerformable("a").perform()
         with monkeypatch.context() as patch:
-            patch.setattr("pycrorm_async.operations.daemon._take", take)
+            patch.setattr("pycrorm_async.operations.daemon._claim", take)
             first = Daemon(database_url, spool)
             assert await asyncio.to_thread(looking.wait, 60)
             first.task.cancel()
@@ -361,7 +361,7 @@ async def test_a_damaged_folder_is_told_and_the_others_are_drained(
         (lambda: Memory.open("sqlite://", writer="daemon"), "sqlite:// is private to this process"),
         (
             lambda: Memory.open("sqlite:///x.db", writer="daemon", views=[UserView("v", select(ProcessMetaData.id))]),
-            "knows no views of this process",
+            "without the views of this process",
         ),
         (lambda: Memory.open("sqlite:///x.db", settings=Settings(writer="cron")), "use 'thread' or 'daemon'"),  # type: ignore[arg-type]
     ],

@@ -228,7 +228,7 @@ async def test_closing_logs_a_parked_episode_and_raises_nothing_over_a_plan_that
 
 async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
-        queue = memory._now.queue
+        queue = memory._open_parts.queue
         payload = b'{"kind":"action","dtype":"DreamAction","table":"dream_action","fields":[{"type":"dream"}]}'
         queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), payload)
         with pytest.raises(EpisodeParked, match="cannot read the declaration of its type"):
@@ -251,7 +251,7 @@ async def test_a_spool_that_nobody_will_empty_fails_a_start_instead_of_making_it
         other.execute("BEGIN IMMEDIATE")  # nothing can be stored, so nothing is freed
         with pytest.raises(SpoolStuck, match="the writer has stopped"):
             async with memory.episode(description="e"):
-                memory._now.queue.fail("the writer has stopped")
+                memory._open_parts.queue.fail("the writer has stopped")
                 while True:
                     await asyncio.wait_for(NoteActionPerformable("x" * 2_000).perform(), 30)
                     reached += 1

@@ -19,7 +19,7 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.fold_worker import Assignment, Failure, Write, _Fold
+from pycrorm_async.operations.fold_worker import Assignment, Failure, Write, _RequestHandler
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.queue.files.spool import Spool
@@ -187,7 +187,7 @@ async def test_a_worker_that_never_answers_is_replaced(tmp_path: Path, monkeypat
 
 
 async def test_a_worker_folds_no_other_database_than_its_daemon(tmp_path: Path) -> None:
-    fold = _Fold(Assignment(f"sqlite:///{tmp_path}/memory.db", "another log", []))
+    fold = _RequestHandler(Assignment(f"sqlite:///{tmp_path}/memory.db", "another log", []))
     missing = await fold.answer(Write())
     assert isinstance(missing, Failure)
     assert "does not exist" in missing.reason
