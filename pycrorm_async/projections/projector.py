@@ -75,7 +75,7 @@ class Projector:
         """
         with self._log.translated():
             async with self._log.engine.begin() as connection:
-                await dialect_of(connection).alone(connection)
+                await dialect_of(connection).lock_log_changes(connection)
                 current = await current_generation(connection, hold="change")
                 if current is None and (await connection.execute(_ANYTHING_FOLDED)).first() is not None:
                     raise DatabaseForeign(f"{self._log.address}: the tables are missing: run `pycrorm rebuild`")
@@ -150,7 +150,7 @@ class Projector:
         if not self._folding.generation.layout.kept:
             return False
         async with self._log.engine.begin() as connection:
-            await dialect_of(connection).alone(connection)
+            await dialect_of(connection).lock_log_changes(connection)
             generation = await _LiveTarget().generation(connection, "share")
             return await refresh_some(connection, generation.layout, generation.number)
 

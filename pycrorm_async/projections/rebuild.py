@@ -147,7 +147,7 @@ class Rebuild:
         with log.translated():
             payloads = await log.declarations()
             async with log.engine.begin() as connection:
-                await dialect_of(connection).alone(connection)
+                await dialect_of(connection).lock_log_changes(connection)
                 generations = await _generations(log, connection)
                 shown = generations.get(SHOWN)
                 # The switch checks this too; checking here reports a conflict before hours of work.
@@ -167,7 +167,7 @@ class Rebuild:
             while (grown := await _grow_slice(log, target, payloads)).layout != making.layout:
                 making = grown
             async with log.engine.begin() as connection:
-                await dialect_of(connection).alone(connection)
+                await dialect_of(connection).lock_log_changes(connection)
                 making = await target.generation(connection, "change")
                 layout = making.layout
                 if shown is not None:
@@ -240,7 +240,7 @@ class Rebuild:
     async def _show_if_complete(self) -> bool:
         """Switch, unless so many events are missing that all writers would wait for them; return whether it did."""
         async with self._log.engine.begin() as connection:
-            await dialect_of(connection).alone(connection)
+            await dialect_of(connection).lock_log_changes(connection)
             # Every fold shares this row's lock while it writes, so no fold writes to the old tables from here on.
             old = await noted(connection, self._key, hold="change")
             new = await self._making.generation(connection, "change")
@@ -294,7 +294,7 @@ class Rebuild:
 async def _grow_slice(log: EventLog, target: SideTarget, payloads: Sequence[bytes]) -> Generation:
     """Create one slice of the missing tables of these declarations; return the generation, unchanged if none was."""
     async with log.engine.begin() as connection:
-        await dialect_of(connection).alone(connection)
+        await dialect_of(connection).lock_log_changes(connection)
         return await grow(connection, target, await target.generation(connection, "change"), payloads)
 
 

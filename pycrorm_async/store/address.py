@@ -1,11 +1,11 @@
-"""Where a database is: an ordinary URL, read once, that never shows a password again.
+"""Parse a database's URL once, and never show its password again.
 
     sqlite:///memory.db                 a file, relative to the working directory at that moment
     sqlite:////data/memory.db           a file by its absolute path
-    sqlite://                           private to this process, in memory, gone when it is closed
+    sqlite://                           private to this process, in memory, deleted when it is closed
     postgresql://user@host/database     a server
 
-The program chooses the driver. A URL written for another one (`_SCHEMES`) means the same database.
+The program chooses the driver; a URL written for another driver (`_SCHEMES`) means the same database.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from pycrorm_async.store.temporary_database import private_folder, usual_place
 __all__ = ["DatabaseAddress", "BUSY_TIMEOUT_S"]
 
 BUSY_TIMEOUT_S = 5.0
-"""How long a statement waits for another writer before the database counts as away."""
+"""Bounds the wait of a statement for another writer; beyond it the database counts as unavailable."""
 
 _SCHEMES = {
     "sqlite": "sqlite",
@@ -37,20 +37,20 @@ _SCHEMES = {
     "postgresql+asyncpg": "postgresql",
     "postgresql+psycopg": "postgresql",
 }
-"""The database of each scheme that hosting services, libpq and SQLAlchemy write."""
+"""The database by URL scheme, as hosting services, libpq and SQLAlchemy write it."""
 
 _HARMLESS = frozenset({"host", "port", "user", *postgresql.TLS})
-"""Parts of a query that lead to a server and are no secret."""
+"""Query parameters that locate a server and are not secret."""
 
-_WHAT_WORKS = (
-    "what works: sqlite:///memory.db (a file here), sqlite:////data/memory.db (a file by its absolute path),"
+_VALID_URLS = (
+    "valid URLs: sqlite:///memory.db (a file here), sqlite:////data/memory.db (a file by its absolute path),"
     " sqlite:// (private, gone when closed), postgresql://user@host/database (a server)"
 )
 
 
 @dataclass(frozen=True, repr=False)
 class DatabaseAddress:
-    """A database's address. Its text is the URL without its password.
+    """A database's address; `str` gives the URL without its password.
 
     >>> str(DatabaseAddress.parse("postgresql://robot:secret@lab/memory"))
     'postgresql://robot:***@lab/memory'
@@ -61,19 +61,19 @@ class DatabaseAddress:
 
     @classmethod
     def parse(cls, url: str) -> DatabaseAddress:
-        """Reads a URL. Raises `UnknownUrl`, with what works, for a scheme or a form that is not ours."""
+        """Parse a URL. Raises `UnknownUrl`, with the valid forms, for any other scheme or form."""
         try:
             parsed = make_url(url)
         except (ArgumentError, ValueError):  # neither message repeats the URL, which may hold a password
-            raise UnknownUrl(f"this is not a database URL; {_WHAT_WORKS}") from None
+            raise UnknownUrl(f"this is not a database URL; {_VALID_URLS}") from None
         database = _SCHEMES.get(parsed.drivername)
         if database is None:
-            raise UnknownUrl(f"{parsed.drivername}:// is not a database we know; {_WHAT_WORKS}")
+            raise UnknownUrl(f"{parsed.drivername}:// is not a supported database; {_VALID_URLS}")
         parsed = parsed.set(drivername=database)
         if database == "sqlite":
             return cls(parsed, _sqlite_path(parsed))
         if reason := postgresql.refusal(parsed):
-            raise UnknownUrl(f"{reason}; {_WHAT_WORKS}")
+            raise UnknownUrl(f"{reason}; {_VALID_URLS}")
         return cls(parsed, None)
 
     @property
@@ -87,20 +87,20 @@ class DatabaseAddress:
 
     @property
     def path(self) -> Path:
-        """The absolute path of a SQLite file; a private one has it inside `located()`."""
+        """The absolute path of a SQLite file; a private database has one only inside `located()`."""
         assert self._path is not None, f"{self} has no path"
         return self._path
 
     @property
     def default_spool(self) -> Path:
-        """Where the queue's files go if nobody says otherwise: `x.db.spool` beside `x.db`, `database.spool` here."""
+        """The default spool: `x.db.spool` beside `x.db`; `database.spool` in the working directory for a server."""
         if self.is_sqlite:
             return self.path.with_name(f"{self.path.name}.spool")
         return Path(f"{self._url.database}.spool").absolute()
 
     @contextmanager
     def located(self) -> Iterator[DatabaseAddress]:
-        """This address with a path, while the context lasts: a private database's folder is made here and removed.
+        """Give a private database a path for the duration of the context: create its folder, and remove it at the end.
 
         >>> with DatabaseAddress.parse("sqlite://").located() as address:
         ...     address.path.name
@@ -113,10 +113,10 @@ class DatabaseAddress:
             yield replace(self, _path=folder / "memory.db")
 
     def engine(self, *, read_only: bool = False, busy_timeout_s: float = BUSY_TIMEOUT_S) -> AsyncEngine:
-        """An engine with the right driver and settings, to be used and disposed of in one loop.
+        """Create an engine with the right driver and settings, for use in one loop.
 
-        It never makes a file that is missing. A transaction takes the write lock at its start; of a `read_only` engine
-        it is a snapshot. Raises `DatabaseUnavailable` for what this version cannot open.
+        It never creates a missing file. A transaction takes the write lock at its start; in a `read_only` engine it is
+        a snapshot. Raises `DatabaseUnavailable` for settings of the URL that cannot be used.
         """
         if not self.is_sqlite:
             return postgresql.make_engine(self._url, read_only=read_only, busy_timeout_s=busy_timeout_s)
@@ -124,7 +124,7 @@ class DatabaseAddress:
 
     @property
     def to_type(self) -> str:
-        """The URL without its password, to be used in a command: where a driver may find a password is left out too.
+        """The URL for a command line, without its password and without parameters that lead to one.
 
         >>> DatabaseAddress.parse("postgresql://robot:secret@lab/memory?host=/tmp&passfile=x").to_type
         'postgresql://robot@lab/memory?host=/tmp'
@@ -136,9 +136,9 @@ class DatabaseAddress:
         return url.render_as_string()
 
     def __str__(self) -> str:
-        # Without most of the query: drivers take passwords there.
-        shown = {name: value for name, value in self._url.query.items() if name in postgresql.WHERE}
-        return self._url.set(query=shown).render_as_string(hide_password=True).replace("%2F", "/")
+        # Most query parameters are left out, because drivers accept passwords there.
+        public_query = {name: value for name, value in self._url.query.items() if name in postgresql.WHERE}
+        return self._url.set(query=public_query).render_as_string(hide_password=True).replace("%2F", "/")
 
     def __repr__(self) -> str:
         return f"DatabaseAddress({str(self)!r})"
@@ -146,9 +146,9 @@ class DatabaseAddress:
 
 def _sqlite_path(url: URL) -> Path | None:
     if url.host or url.username or url.query:
-        raise UnknownUrl(f"a SQLite URL has three slashes, a path and nothing else; {_WHAT_WORKS}")
+        raise UnknownUrl(f"a SQLite URL has three slashes, a path and nothing else; {_VALID_URLS}")
     if url.database is None:
         return None
     if url.database in ("", ":memory:") or url.database.startswith("file:"):
-        raise UnknownUrl(f"{url.database!r} is not a path; {_WHAT_WORKS}")
+        raise UnknownUrl(f"{url.database!r} is not a path; {_VALID_URLS}")
     return Path(url.database).absolute()

@@ -1,11 +1,12 @@
-"""What becomes of a batch: which records are new, which are here already, which are refused and why. Pure.
+"""Decide about each record of a batch: new, repeated or refused, and why. Pure.
 
-An episode's events are stored without a gap: the next one taken is always `head + 1`. One at or below that is a repeat,
-to be compared with what is stored. At the first record that cannot be taken the episode stops, for this batch, and the
-reason is kept; what came before it is stored, and other episodes are not touched.
+An episode's events are stored without a gap: the next accepted sequence is always `head + 1`. A record at or below the
+head is a repeat, to be compared with the stored event. The first record that cannot be accepted stops the episode for
+this batch: the records before it are stored, the reason is kept, and other episodes are not affected.
 
-An end that recovery computed is no repeat: a folder that was damaged, or put back from a backup, may know less than was
-stored. It follows what the log has, and is left out if the log knows the end or waits for missing events.
+An end that recovery computed is not a repeat, because a folder that was damaged or restored from a backup may lack
+events that the log holds. Such an end follows the log's last event; it is left out if the log holds an end already or
+waits for missing events.
 """
 
 from __future__ import annotations
@@ -18,42 +19,42 @@ from pycrorm_async.events.envelope import Record, is_computed_end
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
-__all__ = ["Sorted", "Step", "NoNumber", "sort", "step", "new_episode", "differing"]
+__all__ = ["SortedBatch", "EpisodeStep", "NumbersExhausted", "sort", "step", "new_episode", "differing"]
 
 
 @dataclass(frozen=True, slots=True)
-class Sorted:
-    """A batch by what its records belong to, each in the order of arrival."""
+class SortedBatch:
+    """A batch split into declarations and episodes, each in the order of arrival."""
 
     declarations: list[bytes]
     episodes: dict[EpisodeId, list[Record]]
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """What one batch does to one episode: the row as it will be, the records to insert, those to compare.
+class EpisodeStep:
+    """The effect of a batch on one episode: the row afterwards, the records to insert, and the repeats to compare.
 
-    `known_better` counts the computed ends that are left out.
+    `skipped_ends` counts the computed ends that are left out.
     """
 
     after: EpisodeRow
     fresh: list[Record]
     again: list[Record] = field(default_factory=list)
-    known_better: int = 0
+    skipped_ends: int = 0
 
 
-class NoNumber(ValueError):
-    """Every episode number is taken."""
+class NumbersExhausted(ValueError):
+    """All episode numbers are used."""
 
     def __init__(self) -> None:
         super().__init__(
             f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used:"
-            " `pycrorm spool rebind` gives its spool to another"
+            " move its spool to a new memory with `pycrorm spool rebind`"
         )
 
 
-def sort(records: Iterable[Record]) -> Sorted:
-    """Tells episodes apart. Raises `DamageError` for a record of the recorder itself that is not a declaration."""
+def sort(records: Iterable[Record]) -> SortedBatch:
+    """Split a batch by episode. Raises `DamageError` for a record without an episode that is not a declaration."""
     declarations: list[bytes] = []
     episodes: dict[EpisodeId, list[Record]] = {}
     for record in records:
@@ -64,26 +65,26 @@ def sort(records: Iterable[Record]) -> Sorted:
             episodes[episode].append(record)
         else:
             episodes[episode] = [record]
-    return Sorted(declarations, episodes)
+    return SortedBatch(declarations, episodes)
 
 
-def step(records: Sequence[Record], known: EpisodeRow) -> Step:
-    """What these records, all of one episode, do to it."""
+def step(records: Sequence[Record], known: EpisodeRow) -> EpisodeStep:
+    """Compute the effect of these records, all of one episode, on its row."""
     first = records[0].sequence
     if first == known.head + 1 and _consecutive(records) and _sound(records):
-        return Step(_advanced(known, records, refused=None), list(records))
+        return EpisodeStep(_advanced(known, records, refused=None), list(records))
     return _careful_step(records, known)
 
 
 def new_episode(episode: EpisodeId, first: Record, number: int) -> EpisodeRow:
-    """The row of an episode of which nothing is stored. Raises `NoNumber`."""
+    """Create the row of an episode without stored events. Raises `NumbersExhausted`."""
     if number > EPISODE_NUMBER_MAX:
-        raise NoNumber
+        raise NumbersExhausted
     return EpisodeRow(number, episode_text(episode), head=0, folded=0, started_wall_ns=first.wall_ns)
 
 
 def differing(again: Iterable[Record], stored: Mapping[int, StoredEvent]) -> int | None:
-    """The first sequence that is stored as something else than these records; None if all are the same."""
+    """Return the first sequence whose stored event differs from the record; None if all are equal."""
     return min((each.sequence for each in again if not _same(each, stored.get(each.sequence))), default=None)
 
 
@@ -92,11 +93,11 @@ def _same(record: Record, stored: StoredEvent | None) -> bool:
     return stored is not None and tuple(record[3:]) == tuple(stored[2:])
 
 
-def _careful_step(records: Sequence[Record], known: EpisodeRow) -> Step:
+def _careful_step(records: Sequence[Record], known: EpisodeRow) -> EpisodeStep:
     fresh: list[Record] = []
     again: list[Record] = []
     refused: str | None = None
-    known_better = 0
+    skipped_ends = 0
     expected = known.head + 1
     for record in records:
         if record.sequence < expected:
@@ -104,7 +105,7 @@ def _careful_step(records: Sequence[Record], known: EpisodeRow) -> Step:
                 again.append(record)
                 continue
             if known.ended_wall_ns is not None or known.refused is not None:
-                known_better += 1
+                skipped_ends += 1
                 continue
             record = record._replace(sequence=expected)
         refused = _refusal(record, expected)
@@ -112,7 +113,7 @@ def _careful_step(records: Sequence[Record], known: EpisodeRow) -> Step:
             break
         fresh.append(record)
         expected += 1
-    return Step(_advanced(known, fresh, refused=refused), fresh, again, known_better)
+    return EpisodeStep(_advanced(known, fresh, refused=refused), fresh, again, skipped_ends)
 
 
 def _refusal(record: Record, expected: int) -> str | None:
@@ -129,7 +130,7 @@ def _refusal(record: Record, expected: int) -> str | None:
 
 
 def _advanced(known: EpisodeRow, fresh: Sequence[Record], *, refused: str | None) -> EpisodeRow:
-    if not fresh:  # a repeat says nothing new about why the episode stopped before
+    if not fresh:  # repeats alone do not end an earlier refusal
         return known._replace(refused=known.refused or refused)
     last = fresh[-1]
     ended = last.wall_ns if last.type == "EpisodeEnded" else known.ended_wall_ns

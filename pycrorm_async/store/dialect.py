@@ -1,4 +1,4 @@
-"""What the log asks of a kind of database: `store.sqlite` and `store.postgresql` answer, nothing else of it differs."""
+"""Define the operations that differ between databases; `store.sqlite` and `store.postgresql` implement them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = [
     "Dialect",
     "Birth",
     "Expected",
-    "Found",
+    "LogIdentity",
     "Insertion",
     "Migrations",
     "Progress",
@@ -25,46 +25,46 @@ __all__ = [
 ]
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
-"""Numbered steps; format N is what the first N of them make."""
+"""Numbered steps; the first N of them create format N."""
 
 RowsByTable: TypeAlias = Mapping[tuple[str, tuple[str, ...]], Sequence[tuple[Any, ...]]]
 """Rows to insert, by table and its columns."""
 
 Insertion: TypeAlias = Any
-"""Rows to insert as the driver takes them: known to the dialect alone."""
+"""Rows to insert, prepared for the driver; only the dialect knows the type."""
 
 Progress: TypeAlias = tuple[int, int, int]
-"""An episode's number, how far it was folded, how far it is now."""
+"""An episode's number, its folded sequence before, and its folded sequence now."""
 
 
 class Birth(NamedTuple):
-    """What a log gets when it is made: its id, a UUID as text, and the time."""
+    """The identity of a new log: its id, a UUID as text, and its creation time."""
 
     log_id: str
     created_wall_ns: int
 
 
-class Found(NamedTuple):
-    """The log that is in a database already."""
+class LogIdentity(NamedTuple):
+    """The identity and format of the log in a database."""
 
     log_id: str
     format: int
 
 
 class StoredOn(NamedTuple):
-    """On how many machines a committed event is; the `standbys` that confirm each COMMIT, as far as they are known."""
+    """The number of machines that hold a committed event, and the known standbys that confirm each COMMIT."""
 
     machines: int
     standbys: tuple[str, ...] = ()
 
 
 class RowRefused(ValueError):
-    """A row that the database cannot hold: a key that is taken, a value that does not fit its column."""
+    """The database cannot store a row: its key exists already, or a value does not fit its column."""
 
 
 class Expected(NamedTuple):
-    """How many rows of a table are expected, and by index how many of them have a value in common: that of its first
-    column, those of its first two."""
+    """The expected number of rows of a table, and per index the rows that share a value of its first column, of its
+    first two, and so on."""
 
     table: str
     rows: int
@@ -72,95 +72,96 @@ class Expected(NamedTuple):
 
 
 class Dialect(Protocol):
-    """Everything that is given a connection happens within the caller's transaction, in one statement a table."""
+    """One kind of database. Methods with a connection run in the caller's transaction, with one statement per table."""
 
-    # --- is there a log, and making one -------------------------------------------------------------------------
+    # --- finding and creating a log -------------------------------------------------------------------------
 
     migrations: Migrations
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
-        """What must be done outside a transaction before a log is made or grown in a database that is ours or empty."""
+        """Prepare a database, outside a transaction, for creating or migrating a log. Refuses foreign databases."""
         ...
 
-    async def alone(self, connection: AsyncConnection) -> None:
-        """Until the transaction ends nobody else makes or grows a log here."""
+    async def lock_log_changes(self, connection: AsyncConnection) -> None:
+        """Lock out other creations and migrations of a log here until the transaction ends."""
         ...
 
-    async def look(self, connection: AsyncConnection, name: str) -> Found | None:
-        """The log in this database, None if it is empty. Raises `DatabaseForeign`, `DatabaseUnavailable`."""
+    async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
+        """Find the log in this database; None if it is empty. Raises `DatabaseForeign` and `DatabaseUnavailable`."""
         ...
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
-        """Without parameters and answers, one after the other; over a slow line as fast as one of them."""
+        """Execute statements without parameters or results, in order; in one round trip if possible."""
         ...
 
-    async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None: ...
+    async def insert_log(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None: ...
 
-    async def note_format(self, connection: AsyncConnection, format_now: int) -> None: ...
+    async def set_format(self, connection: AsyncConnection, format_now: int) -> None: ...
 
     # --- appending ----------------------------------------------------------------------------------------------
 
     async def insert_declarations(self, connection: AsyncConnection, named: Sequence[tuple[str, str]]) -> None:
-        """(fingerprint, payload) of each; those that are there already stay as they are."""
+        """Insert (fingerprint, payload) pairs; existing ones stay unchanged."""
         ...
 
     async def episodes_by_id(
         self, connection: AsyncConnection, ids: Sequence[str], *, witness: str | None = None
     ) -> list[EpisodeRow]:
-        """Those of them that are there; nobody else changes them before the transaction ends. And the witness, which
-        others may change, perhaps twice."""
+        """Read and lock these episodes' rows until the transaction ends, and read the witness's row without a lock.
+
+        If the witness is one of the episodes, its row may appear twice.
+        """
         ...
 
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
-        """Numbers that no episode has or will have had; if some up to `above` are not given yet, with a reserve left
-        free behind it (`numbers_reserved`)."""
+        """Return numbers that no episode has or had. Skips the numbers up to `above` and a reserve behind it
+        (`numbers_reserved`), unless they are above already."""
         ...
 
     async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
-        """From now on no transaction gets a new number up to `above` and the reserve behind it, if it gives them out
-        by itself; else `new_numbers` sees to it."""
+        """Skip the numbers up to `above` and the reserve behind it in a database that assigns numbers itself."""
         ...
 
     async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:
-        """Those of these numbers that an episode has."""
+        """Return those of these numbers that an episode has."""
         ...
 
     async def heads(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
-        """As `episodes_by_id`, and nobody waits for anybody."""
+        """Read these episodes' rows without locks."""
         ...
 
     async def note_incarnation(self, connection: AsyncConnection, incarnation: Incarnation) -> None:
-        """Notes that the log went back, in a table that is made if need be."""
+        """Record that the log went back, in a table that is created if missing."""
         ...
 
     async def incarnations(self, connection: AsyncConnection) -> list[Incarnation]:
-        """How often the log went back, the oldest first; none where there is no table of it."""
+        """Read each time the log went back, the oldest first; none if the table is missing."""
         ...
 
     async def stored_on(self, connection: AsyncConnection) -> StoredOn:
-        """On how many machines an event is when its COMMIT returned."""
+        """Return the number of machines that hold an event when its COMMIT returns."""
         ...
 
     async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
-        """What inserts these events, as `insertion`. Each row is a `StoredEvent`'s fields, but the payload is text."""
+        """Prepare the insertion of these events. A row has the fields of a `StoredEvent`, with the payload as text."""
         ...
 
     async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None: ...
 
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
-        """`folded` and `parked` stay as they are."""
+        """Insert or update these rows, without `folded` and `parked`."""
         ...
 
-    async def note_again(self, connection: AsyncConnection) -> None:
-        """Makes COMMIT of a transaction that changes nothing as durable as that of one that does."""
+    async def force_durable_commit(self, connection: AsyncConnection) -> None:
+        """Make the COMMIT of a transaction without changes as durable as that of one with changes."""
         ...
 
     async def commit(self, connection: AsyncConnection) -> None:
-        """Commits. Raises `DatabaseUnavailable` where it is not certain that what was committed is durable."""
+        """Commit. Raises `DatabaseUnavailable` if the commit may not be durable."""
         ...
 
-    async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
-        """The events under these (episode number, sequence), as far as they are there."""
+    async def events_by_key(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
+        """Read the stored events under these keys (episode number, sequence)."""
         ...
 
     # --- reading ------------------------------------------------------------------------------------------------
@@ -170,17 +171,17 @@ class Dialect(Protocol):
     async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
 
     async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
-        """By number, those that follow number `after`."""
+        """Read the episodes with unfolded events whose number is above `after`, by number, without parked ones."""
         ...
 
     async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
 
     async def last_number(self, connection: AsyncConnection) -> int:
-        """The highest episode number; 0 without episodes."""
+        """Return the highest episode number; 0 without episodes."""
         ...
 
     async def long_episodes(self, connection: AsyncConnection, events_min: int) -> list[EpisodeRow]:
-        """The episodes that have not ended and hold at least so many events."""
+        """Read the episodes that have not ended and hold at least this many events."""
         ...
 
     async def events(
@@ -188,32 +189,31 @@ class Dialect(Protocol):
     ) -> list[StoredEvent]: ...
 
     async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
-        """The events of each span, in the order of the spans."""
+        """Read the events of each span, in the order of the spans."""
         ...
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]: ...
 
-    async def hold_still(self, connection: AsyncConnection) -> None:
-        """Whatever is read in the transaction that begins now is of one moment."""
+    async def begin_snapshot(self, connection: AsyncConnection) -> None:
+        """Make the transaction that begins now a snapshot."""
         ...
 
     async def in_order(self, connection: AsyncConnection) -> None:
-        """What is asked for in an order in this transaction is read in it where that can be done, not sorted: for the
-        first few of many."""
+        """Let ordered queries of this transaction read an index in order instead of sorting, for the first few rows."""
         ...
 
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
-        """Until the transaction ends, none of these tables is dropped; False, and the transaction over, if one is."""
+        """Protect these tables from being dropped until the transaction ends; False, ending it, if one is missing."""
         ...
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
-        """What the database finds wrong with its own pages, if it can be asked."""
+        """Return the errors that the database finds in its own pages, if it can check them."""
         ...
 
     # --- what a projector adds ----------------------------------------------------------------------------------
 
     async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:
-        """How many of the episodes were where they are said to have been."""
+        """Advance `folded`; return the number of episodes that were at the given sequence before."""
         ...
 
     async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None: ...
@@ -221,82 +221,81 @@ class Dialect(Protocol):
     # --- tables and views made from the log ---------------------------------------------------------------------
 
     async def make_place(self, connection: AsyncConnection) -> None:
-        """Where tables and views go is there afterwards."""
+        """Create the schema for tables and views, if the database has schemas."""
         ...
 
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
-        """Whether there is a table of that name among them."""
+        """Return whether a derived table of this name exists."""
         ...
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
-        """Of empty tables: how they will be. Which of them a question is best begun with depends on it."""
+        """Give the query planner statistics of tables that are still empty."""
         ...
 
     def stored_column(self, name: str) -> str:
-        """The column of a table that holds a column of the view before it: another name if the database has its own
-        use for this one."""
+        """Return the table's column for a view's column: another name if the database reserves this one."""
         ...
 
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
-        """Gives up soon where a reader is in the way, so that nobody waits behind the two for long."""
+        """Add a column; fail soon if a reader holds a lock, because later readers queue behind this statement."""
         ...
 
     async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
-        """Raises `DatabaseError` if beside these views stands what `replace_views` would not leave as it is."""
+        """Raise `DatabaseError` if the views' schema contains other objects, which `replace_views` would drop."""
         ...
 
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
-        """Name and SQL of each. A view may stand on those before it in `after`. Who reads the old ones goes on."""
+        """Replace views, by name and SQL, without affecting running queries. A view may use earlier ones of `after`."""
         ...
 
     async def sweep(self, connection: AsyncConnection) -> None:
-        """Takes away the views that were replaced, unless somebody reads them or stands on them. Waits for nobody."""
+        """Drop replaced views that no query reads and no other view uses. Does not wait for locks."""
         ...
 
     async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:
-        """Deletes rows of a table that is to be dropped; False if dropping it takes no longer now than it must."""
+        """Delete some rows of a table before it is dropped; False when dropping it is fast enough now."""
         ...
 
     async def drop(self, connection: AsyncConnection, table: str) -> None:
-        """Gives up soon where somebody is in the way; refuses where a view of somebody else stands on it."""
+        """Drop a table. Fails soon if a lock is held, and if a foreign view uses the table."""
         ...
 
     def claim(self, engine: AsyncEngine) -> AbstractAsyncContextManager[bool]:
-        """Whether nobody else makes tables anew here; then nobody can until the context is left or the process dies."""
+        """Claim the right to rebuild tables until the context ends or the process dies; yields False if it is taken."""
         ...
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
-        """For this connection alone, until it is closed, these views stand before those of the same names.
+        """Create views that hide those of the same names, for this connection only, until it is closed.
 
-        Nothing may have happened in the transaction before. A view may stand on those before it.
+        Must be first in the transaction. A view may use those before it.
         """
         ...
 
     async def insertion(self, rows: RowsByTable) -> Insertion:
-        """What inserts these rows: made before the transaction, so that nobody waits for it. Gives way to others."""
+        """Prepare the insertion of these rows, before the transaction, so that it is short. Yields to other tasks."""
         ...
 
     async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
-        """Raises `RowRefused`."""
+        """Insert the prepared rows. Raises `RowRefused`."""
         ...
 
     async def update_rows(
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
     ) -> None:
-        """`columns` maps names to SQL types; the first is the id. Raises `RowRefused`."""
+        """Update rows by id. `columns` maps names to SQL types; the first is the id. Raises `RowRefused`."""
         ...
 
     # --- faults -------------------------------------------------------------------------------------------------
 
     faults: tuple[type[Exception], ...]
-    """What its driver raises, and SQLAlchemy in its name."""
+    """The exceptions of the driver, and those SQLAlchemy raises for it."""
 
     def refusal(self, error: Exception) -> str | None:
-        """Why the database never makes a table or view as it was asked to; None if it only did not do so now."""
+        """Return why the database can never create a table or view of this definition; None for a temporary error."""
         ...
 
-    def ours(self, error: Exception, name: str) -> PycrormError:
-        """The error of ours to raise in its place."""
+    def translate_error(self, error: Exception, name: str) -> PycrormError:
+        """Return the error of this package to raise instead."""
         ...

@@ -1,4 +1,4 @@
-"""The kinds of database there are."""
+"""Find the dialect of a connection or an engine."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ __all__ = ["dialect_of"]
 
 
 def dialect_of(place: AsyncConnection | AsyncEngine) -> Dialect:
-    """That of a connection or an engine."""
+    """Return the dialect of a connection or an engine."""
     return _dialect(place.dialect.name)
 
 
 @cache
 def _dialect(name: str) -> Dialect:
-    # Loaded when it is needed: the driver of a server takes a tenth of a second.
+    # Imported on demand: the server's driver takes a tenth of a second to import.
     match name:
         case "sqlite":
             from pycrorm_async.store.sqlite.dialect import SQLite

@@ -1,5 +1,7 @@
-"""Which episode people mean: by its number here, its id, or the first digits of that; `last` is the newest that really
-happened. Asked of the log alone, so that it also works where there are no tables yet."""
+"""Find an episode by its number, its id, the first digits of its id, or `last`.
+
+`last` is the newest episode that is not a simulation. The lookup reads only the log, so it works without tables.
+"""
 
 from __future__ import annotations
 
@@ -15,27 +17,28 @@ __all__ = ["number_named", "episode_named"]
 
 
 def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
-    """The number of the episode, among these ids by number; `listed` is how many of them `pycrorm episodes` shows.
+    """Return the number of the named episode among these ids by number.
 
-    Raises `UnknownEpisode`, also when several ids begin like that.
+    `listed` is the number of episodes that `pycrorm episodes` lists. Raises `UnknownEpisode`, also if several ids
+    match.
     """
-    # A short one is a number; a long one may be the beginning of an id that happens to have no letter.
-    found = [number for number in ids if str(number) == name] or [
+    # Four digits may be a number, or the beginning of an id without a letter: the number wins.
+    numbers = [number for number in ids if str(number) == name] or [
         number for number, identity in ids.items() if len(name) >= 4 and identity.startswith(name.lower())
     ]
-    if len(found) > 1:
-        raise UnknownEpisode(f"{len(found)} episodes have an id that begins with {name!r}: give more of it")
-    if not found:
+    if len(numbers) > 1:
+        raise UnknownEpisode(f"{len(numbers)} episodes have an id that begins with {name!r}: give more of it")
+    if not numbers:
         raise UnknownEpisode(f"there is no episode {name!r} (`pycrorm episodes` lists the {listed} there are)")
-    return found[0]
+    return numbers[0]
 
 
 async def episode_named(log: EventLog, name: str) -> EpisodeRow:
-    """The episode of that name. Raises `UnknownEpisode`."""
+    """Find the named episode. Raises `UnknownEpisode`."""
     rows = {row.number: row for row in await log.episodes()}
     if name == "last":
         for row in reversed(rows.values()):
-            if not await _is_thought(log, row):
+            if not await _is_simulated(log, row):
                 return row
     return rows[number_named(name, {number: row.id for number, row in rows.items()}, listed=len(rows))]
 
@@ -44,9 +47,9 @@ class _Started(msgspec.Struct):
     simulated: bool = False
 
 
-async def _is_thought(log: EventLog, row: EpisodeRow) -> bool:
+async def _is_simulated(log: EventLog, row: EpisodeRow) -> bool:
     first = await log.events(row.number, limit=1)
     try:
         return bool(first) and msgspec.json.decode(first[0].payload, type=_Started).simulated
-    except msgspec.DecodeError:  # damaged; whoever reads it will say so
+    except msgspec.DecodeError:  # damaged; reading the episode reports it
         return False

@@ -1,8 +1,8 @@
-"""Warnings before an episode, or a memory, has used up its numbers.
+"""Warn before an episode or a memory has used up its numbers.
 
-Row ids have 53 bits: 22 for the episode's number, 26 for the event's sequence. Both limits are far away (a thousand
-episodes a day for eleven years, a week of a hundred events a second), so that a user who comes near one has time to
-act: from nine tenths on `status` warns, and the process that stores the events writes one line to its log.
+Row ids have 53 bits: 22 for the episode's number, 26 for the event's sequence. Both limits are distant (a thousand
+episodes a day for eleven years, a week of a hundred events a second). From nine tenths of a limit on, `status` warns
+and the process that stores the events logs one line, so that a user has time to act.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from pycrorm_async.store.stored import EpisodeRow
 __all__ = ["EPISODES_MANY", "EVENTS_MANY", "number_warning", "events_warning", "warnings_of"]
 
 EPISODES_MANY = EPISODE_NUMBER_MAX * 9 // 10 + 1
-"""From this episode number on a memory is nearly full: 3,774,873."""
+"""Episode number from which a memory counts as nearly full: 3,774,873, nine tenths of the limit."""
 
 EVENTS_MANY = SEQUENCE_MAX * 9 // 10 + 1
-"""From this sequence on an episode is nearly full: 60,397,977."""
+"""Sequence from which an episode counts as nearly full: 60,397,977, nine tenths of the limit."""
 
 
 def number_warning(number: int) -> str | None:
-    """Why the latest episode number of a memory is worth a warning; None if it is not.
+    """Return the warning for a memory's latest episode number; None below nine tenths.
 
     >>> number_warning(4_000_000)
     '4,000,000 of 4,194,303 episode numbers are used (95 %): record into a new database before none is left'
@@ -42,7 +42,7 @@ def number_warning(number: int) -> str | None:
 
 
 def events_warning(episode: EpisodeRow) -> str | None:
-    """Why an episode that has not ended is worth a warning; None if it is not."""
+    """Return the warning for an episode that has not ended; None below nine tenths."""
     if episode.head < EVENTS_MANY or episode.ended_wall_ns is not None:
         return None
     share = episode.head * 100 // SEQUENCE_MAX
@@ -53,7 +53,7 @@ def events_warning(episode: EpisodeRow) -> str | None:
 
 
 def warnings_of(episodes: Sequence[EpisodeRow]) -> dict[str, str]:
-    """The warnings that these rows are worth, by what they limit: "numbers", or the id of an episode."""
+    """Return the warnings for these rows, by "numbers" or an episode's id."""
     last = max((each.number for each in episodes), default=0)
-    found = {"numbers": number_warning(last)} | {each.id: events_warning(each) for each in episodes}
-    return {what: warning for what, warning in found.items() if warning is not None}
+    warnings = {"numbers": number_warning(last)} | {each.id: events_warning(each) for each in episodes}
+    return {subject: warning for subject, warning in warnings.items() if warning is not None}

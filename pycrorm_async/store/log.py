@@ -1,4 +1,4 @@
-"""The event log of one database: append to it, read it.
+"""Append to the event log of one database, and read it.
 
 log = await EventLog.open(DatabaseAddress.parse("sqlite:///memory.db"), create=True)
 await log.append(records)
@@ -47,28 +47,31 @@ __all__ = ["EventLog", "advance_folded", "park"]
 
 _log = logging.getLogger("pycrorm_async")
 _MANY_EVENTS = 1_000
-"""So many are worth a look before the transaction that stores them."""
+"""Batch size from which preparing the append before its transaction pays off."""
 _PAGE_EVENTS = 250
-"""Few enough for a page to be small in memory also when each of them is as large as an event can be."""
+"""Bounds the events of a page, so that its memory stays small even if each has the maximal size."""
 
 
 class EventLog:
-    """An open log; it belongs to the loop it was opened in. Every method raises `DatabaseUnavailable` when the database
-    is away, after waiting `busy_timeout_s` for another writer, and may then be called again."""
+    """An open log; it belongs to the loop it was opened in.
+
+    Every method raises `DatabaseUnavailable` if the database does not answer, or after waiting `busy_timeout_s` for
+    another writer; the call may then be repeated.
+    """
 
     def __init__(self, *, address: DatabaseAddress, engine: AsyncEngine, log_id: str, writable: bool) -> None:
         self.address = address
         self.writes = 0
-        """How many transactions that write were committed."""
+        """Number of committed writing transactions."""
         self.advice = "put it back, or open the memory again"
-        """What the user can do about a SQLite file that is gone."""
+        """Advice to the user about a missing SQLite file."""
         self.engine = engine
         self.log_id = log_id
         self._process = os.getpid()
         self._reads = engine.execution_options(**{BEGIN: "BEGIN"})
         self._dialect = dialect_of(engine)
         self._file = _identity(address.path) if address.is_sqlite and writable else None
-        self._turn = asyncio.Lock() if address.is_sqlite else None
+        self._write_turn = asyncio.Lock() if address.is_sqlite else None
         self._warned: set[str] = set()
 
     @classmethod
@@ -82,14 +85,14 @@ class EventLog:
         file_access: FileAccess = "owner",
         belongs_to: str | None = None,
     ) -> EventLog:
-        """Opens the log at a located address.
+        """Open the log at a located address.
 
-        With `create` it can be appended to, and is made or brought up to date if need be; but an empty database is not
-        made one where the log of the id `belongs_to` should be, which may be restored at this moment. Without `create`
-        it can only be read and nothing is written. `file_access` is that of a SQLite file that is made.
+        With `create` the log is writable, and is created or migrated if necessary. With `belongs_to`, the id of the
+        log that should be there, no log is created in an empty database, because a restore may be running. Without
+        `create` the log is read-only and nothing is written. `file_access` applies to a new SQLite file.
 
-        Raises `DatabaseUnavailable` (no such database, no way to it) or `DatabaseForeign`
-        (another program's, a newer version's).
+        Raises `DatabaseUnavailable` (no such database, or no connection to it) or `DatabaseForeign` (another program's
+        or a newer version's).
         """
         engine = address.engine(read_only=not create, busy_timeout_s=busy_timeout_s)
         name = str(address)
@@ -112,33 +115,33 @@ class EventLog:
 
     @contextmanager
     def translated(self) -> Iterator[None]:
-        """Inside, a fault of the database is raised as the error of ours it is: for what others do with `engine`."""
+        """Translate driver errors raised inside to errors of this package; for code that uses `engine` directly."""
         with _translated(self._dialect, str(self.address)):
             yield
 
     async def close(self) -> None:
-        """Closes every connection. In a forked child it does nothing: connections and threads are the parent's."""
+        """Close every connection. Does nothing in a forked child, because the connections belong to the parent."""
         if os.getpid() == self._process:
             await self.engine.dispose()
 
     # --- append -----------------------------------------------------------------------------------------------
 
     async def append(self, records: Sequence[Record]) -> dict[EpisodeId, str]:
-        """Stores a batch, whole or not at all, durable when it returns. Gives why episodes refused records.
+        """Store a batch in one transaction, durable on return; return the reasons of refusals by episode.
 
-        What is stored already with the same bytes is stored once. Of an episode with a gap, or a record no database can
-        hold, what comes before that is stored; the rest must be kept elsewhere and given again. Raises `LogDamaged`,
-        and stores nothing, when a record's key holds another event.
+        Records stored before with the same bytes are stored once. Of an episode with a gap, or with a record that no
+        database can hold, the records before it are stored; the caller must keep the rest and append it later. Raises
+        `LogDamaged`, and stores nothing, if another event is stored under a record's key.
         """
         return dict((await self.store(records)).refusals)
 
     async def store(self, records: Sequence[Record], basis: Basis = NOTHING_KNOWN) -> Stored:
-        """As `append`, but for a log that holds less than the basis says: raises `LogWentBack` and stores nothing."""
+        """As `append`, but raises `LogWentBack`, and stores nothing, if the log holds less than the basis says."""
         if not records:
             return Stored({}, {})
         with self.translated():
             appending = Appending(self._dialect, records, basis)
-            if self._turn is not None and len(records) >= _MANY_EVENTS:
+            if self._write_turn is not None and len(records) >= _MANY_EVENTS:
                 async with self.reading() as connection:
                     await appending.prepare(connection)
             async with self.writing() as connection:
@@ -150,38 +153,38 @@ class EventLog:
         return stored
 
     async def heads(self, episodes: Sequence[EpisodeId]) -> dict[EpisodeId, EpisodeRow]:
-        """How far each of these episodes is; without those of which nothing is stored."""
+        """Read the rows of these episodes, without those that have no stored event."""
         names = {episode_text(each): each for each in episodes}
         async with self.reading() as connection:
             return {names[row.id]: row for row in await self._dialect.heads(connection, list(names))}
 
     async def skip_numbers(self, above: int) -> None:
-        """No new episode gets a number up to `above`, nor one of the reserve behind it."""
+        """Never assign the numbers up to `above`, nor the reserve behind it, to new episodes."""
         with self.translated():
             async with self.writing() as connection:
                 await self._dialect.skip_numbers(connection, above)
 
     async def note_incarnation(self, noticed_wall_ns: int, noticed_by: str, reason: str) -> None:
-        """Notes that the log went back. Raises `DatabaseError` also where this role may not."""
+        """Record that the log went back. Raises `DatabaseError` also if this role lacks the privilege."""
         with self.translated():
             async with self.writing() as connection:
                 await self._dialect.note_incarnation(connection, Incarnation(noticed_wall_ns, noticed_by, reason))
 
     async def incarnations(self) -> list[Incarnation]:
-        """Each time that the log was found to have gone back, the oldest first."""
+        """Read each time the log went back, the oldest first."""
         async with self.reading() as connection:
             return await self._dialect.incarnations(connection)
 
     async def stored_on(self) -> StoredOn:
-        """On how many machines an event is when it is stored."""
+        """Return the number of machines that hold a stored event."""
         async with self.reading() as connection:
             return await self._dialect.stored_on(connection)
 
     @property
     def loss(self) -> str | None:
-        """Why nothing may be written: the SQLite file was removed or replaced. None while it is there, and of a server.
+        """The reason not to write: the SQLite file was removed or replaced. None if it is in place, and for a server.
 
-        SQLite itself goes on writing into such a file, where nobody will find it.
+        SQLite itself would keep writing into the removed file, and the events would be lost.
         """
         if self._file is None or _identity(self.address.path) == self._file:
             return None
@@ -190,27 +193,27 @@ class EventLog:
     # --- read -------------------------------------------------------------------------------------------------
 
     async def episodes(self) -> list[EpisodeRow]:
-        """Every episode, by number."""
+        """Read every episode, by number."""
         async with self.reading() as connection:
             return await self._dialect.episodes(connection)
 
     async def episode(self, episode: EpisodeId) -> EpisodeRow | None:
-        """How far an episode is here; None if nothing of it is stored."""
+        """Read an episode's row; None if no event of it is stored."""
         async with self.reading() as connection:
             return await self._dialect.episode(connection, episode_text(episode))
 
     async def episode_number(self, episode: EpisodeId) -> int | None:
-        """The number of an episode here; None if nothing of it is stored."""
-        found = await self.episode(episode)
-        return found.number if found is not None else None
+        """Return an episode's number; None if no event of it is stored."""
+        row = await self.episode(episode)
+        return row.number if row is not None else None
 
     async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[StoredEvent]:
-        """The events of an episode that follow sequence `after`, at most `limit`."""
+        """Read at most `limit` events of an episode, behind sequence `after`."""
         async with self.reading() as connection:
             return await self._dialect.events(connection, number, after=after, limit=limit)
 
     async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[list[StoredEvent]]:
-        """The same up to the episode's head, a few at a time. Raises `LogDamaged` at the first that is missing."""
+        """Yield the events up to the episode's head in pages. Raises `LogDamaged` at the first missing event."""
         while after < episode.head:
             limit = min(_PAGE_EVENTS, episode.head - after)
             page = await self.events(episode.number, after=after, limit=limit)
@@ -222,17 +225,17 @@ class EventLog:
                 raise LogDamaged(episode.id, after + 1, f"is missing in {self.address}")
 
     async def spans(self, spans: Sequence[Span]) -> list[StoredEvent]:
-        """The events of each span, in the order of the spans."""
+        """Read the events of each span, in the order of the spans."""
         async with self.reading() as connection:
             return await self._dialect.spans(connection, spans)
 
     async def unfolded(
         self, limit: int = 10_000, *, after: int = 0, reached: Mapping[int, int] = MappingProxyType({})
     ) -> list[Span]:
-        """What the tables do not show yet, at most `limit` events, some of each episode; nothing of parked episodes.
+        """Return spans of unfolded events, at most `limit` in total, some of each episode; without parked episodes.
 
-        Begins with the episodes that follow number `after`, and with the first one when there are none. `reached` is
-        how far episodes are, by number, once what is being folded is in the tables.
+        Begins with the episodes whose number is above `after`, or with the first if there are none. `reached` is the
+        last sequence, by number, of a fold that is running.
         """
         async with self.reading() as connection:
             behind = beyond(await self._dialect.behind(connection, after=after, limit=limit), reached)
@@ -241,33 +244,35 @@ class EventLog:
             return share_out(behind, limit)
 
     async def behind(self) -> list[EpisodeRow]:
-        """The episodes of which the tables do not show all; without the parked ones."""
+        """Read the episodes with unfolded events, without parked ones."""
         async with self.reading() as connection:
             return await self._dialect.behind(connection, after=0, limit=EPISODE_NUMBER_MAX)
 
     async def stopped(self) -> list[EpisodeRow]:
-        """The episodes that the log refused something of, or that are parked; the rows say why."""
+        """Read the refused and parked episodes; the rows hold the reasons."""
         async with self.reading() as connection:
             return await self._dialect.stopped(connection)
 
     async def limits_near(self) -> list[str]:
-        """A sentence for each limit of numbers that the memory, or an episode that has not ended, comes near."""
+        """Return a warning for each limit of numbers that the memory, or an episode that has not ended, comes near."""
         async with self.reading() as connection:
             last = await self._dialect.last_number(connection)
             episodes = await self._dialect.long_episodes(connection, EVENTS_MANY)
         return [each for each in (number_warning(last), *map(events_warning, episodes)) if each is not None]
 
     async def declarations(self) -> list[bytes]:
-        """The payloads of all DesignatorTypeDeclared, in the order of their first arrival."""
+        """Read the payloads of all DesignatorTypeDeclared, in the order of first arrival."""
         async with self.reading() as connection:
             return await self._dialect.declarations(connection)
 
     @asynccontextmanager
     async def writing(self) -> AsyncIterator[AsyncConnection]:
-        """A transaction that writes, committed at the end. Those of this log wait for each other here if the database
-        has one writer at a time: whoever waits there sleeps and looks again, and looks too late."""
-        async with self._turn or nullcontext():
-            self._check_file()  # a new connection would write into the file that is there now
+        """Open a writing transaction, committed at the end.
+
+        On SQLite the transactions of this log take turns here, because SQLite's own wait for the write lock polls.
+        """
+        async with self._write_turn or nullcontext():
+            self._check_file()  # a new connection would write into the file of this name
             async with self.engine.begin() as connection:
                 yield connection
                 await self._dialect.commit(connection)
@@ -280,14 +285,14 @@ class EventLog:
 
     @asynccontextmanager
     async def snapshot(self) -> AsyncIterator[AsyncConnection]:
-        """A connection whose transaction sees everything as it is at one moment."""
+        """Open a connection whose transaction is a snapshot."""
         async with self.reading() as connection:
-            await self._dialect.hold_still(connection)
+            await self._dialect.begin_snapshot(connection)
             yield connection
 
     @asynccontextmanager
     async def reading(self) -> AsyncIterator[AsyncConnection]:
-        """A connection for reading, which waits for nobody who writes and for which nobody waits."""
+        """Open a connection for reading, which neither waits for writers nor delays them."""
         self._check_file()
         with self.translated():
             async with self._reads.connect() as connection:
@@ -309,17 +314,17 @@ def _translated(dialect: Dialect, name: str) -> Iterator[None]:
     except PycrormError:
         raise
     except dialect.faults as error:
-        raise dialect.ours(error, name) from error
+        raise dialect.translate_error(error, name) from error
 
 
 async def advance_folded(connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
-    """Notes (episode number, folded before, folded now) of each episode.
+    """Advance `folded` of each episode from the sequence before to the sequence now.
 
-    False if one of them is not where the caller believed: someone else folded it, and the caller must roll back.
+    Returns False if another process has folded one of them meanwhile; the caller must then roll back.
     """
     return await dialect_of(connection).advance_folded(connection, steps) == len(steps)
 
 
 async def park(connection: AsyncConnection, number: int, reason: str | None) -> None:
-    """Stops folding an episode, with the reason; None releases it. The log goes on taking its events."""
+    """Stop folding an episode, with the reason; None releases it. The log still accepts its events."""
     await dialect_of(connection).park(connection, number, reason)

@@ -1,7 +1,7 @@
-"""Is there a log, is it ours, is it of this version: looked at before anything is changed.
+"""Recognise, create and migrate the log in a database, without changing a foreign one.
 
-Opened for writing, an empty database becomes a log and an older format is brought up to date, in one transaction.
-Opened for reading, nothing is written whatever is found.
+Opening for writing creates a log in an empty database and migrates an older format, in one transaction. Opening for
+reading never writes.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.settings import FILE_MODES, FileAccess
-from pycrorm_async.store.dialect import Birth, Dialect, Found, Migrations
+from pycrorm_async.store.dialect import Birth, Dialect, LogIdentity, Migrations
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.sqlite.leftovers import move_leftovers
 
 __all__ = ["Birth", "make_or_migrate", "recognise", "make_file", "must_exist"]
 
-_HOW_TO_MAKE_ONE = "record one with `pycrorm run` or `pycrorm demo`"
+_HOW_TO_CREATE = "record one with `pycrorm run` or `pycrorm demo`"
 
 
 async def recognise(connection: AsyncConnection, name: str, migrations: Migrations | None = None) -> str:
-    """The id of the log in this database. Raises `DatabaseUnavailable` without one, `DatabaseForeign` if not ours."""
+    """Return the id of the log in this database. Raises `DatabaseUnavailable` without one, and `DatabaseForeign`."""
     dialect = dialect_of(connection)
     migrations = dialect.migrations if migrations is None else migrations
-    found = await _look(dialect, connection, name, len(migrations))
-    if found is None:
-        raise DatabaseUnavailable(f"{name} holds no memory yet: {_HOW_TO_MAKE_ONE}")
-    if found.format < len(migrations):
+    identity = await _find_log(dialect, connection, name, len(migrations))
+    if identity is None:
+        raise DatabaseUnavailable(f"{name} holds no memory yet: {_HOW_TO_CREATE}")
+    if identity.format < len(migrations):
         raise DatabaseUnavailable(f"{name} was made by an older version: `pycrorm writer --once` brings it up to date")
-    return found.log_id
+    return identity.log_id
 
 
 async def make_or_migrate(
@@ -44,47 +44,47 @@ async def make_or_migrate(
     migrations: Migrations | None = None,
     belongs_to: str | None = None,
 ) -> str:
-    """The id of the log in this database, which is made or brought up to date if need be.
+    """Create or migrate the log in this database if necessary; return its id.
 
-    Raises `DatabaseUnavailable` instead of making one where the log `belongs_to` should be.
+    With `belongs_to`, the id of the log that should be here, raises `DatabaseUnavailable` instead of creating another.
     """
     dialect = dialect_of(engine)
     migrations = dialect.migrations if migrations is None else migrations
     await dialect.prepare(engine, name)
     async with engine.begin() as connection:
-        await dialect.alone(connection)
-        found = await _look(dialect, connection, name, len(migrations))
-        if found is None and belongs_to is not None:
-            raise DatabaseUnavailable(f"{name} {_gone(belongs_to)}")
-        for statements in migrations[found.format if found else 0 :]:
+        await dialect.lock_log_changes(connection)
+        identity = await _find_log(dialect, connection, name, len(migrations))
+        if identity is None and belongs_to is not None:
+            raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
+        for statements in migrations[identity.format if identity else 0 :]:
             await dialect.execute_all(connection, statements)
-        if found is None:
-            await dialect.note_birth(connection, birth, len(migrations))
+        if identity is None:
+            await dialect.insert_log(connection, birth, len(migrations))
             return birth.log_id
-        if found.format < len(migrations):
-            await dialect.note_format(connection, len(migrations))
-        return found.log_id
+        if identity.format < len(migrations):
+            await dialect.set_format(connection, len(migrations))
+        return identity.log_id
 
 
 def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | None = None) -> None:
-    """Makes an empty file if there is none, which SQLite takes for an empty database.
+    """Create an empty file, an empty database for SQLite, unless it exists.
 
-    SQLite gives the files that it makes beside it the same mode. An existing file keeps its own. Raises
-    `DatabaseUnavailable` instead of making one where the file of the log `belongs_to` should be.
+    SQLite creates its side files with the same mode. An existing file keeps its mode. Raises `DatabaseUnavailable`;
+    with `belongs_to`, the id of the log whose file should be here, also instead of creating another.
 
-    Without opening it: whoever closes a file takes from his whole process the locks that SQLite has on it, and then
-    another process that closes the database deletes the write-ahead log that this one goes on writing into.
+    Creates the file without opening it, because closing a descriptor drops all POSIX locks of the process on that file,
+    SQLite's included; another process that closes the database could then delete the write-ahead log in use.
     """
     if sqlite3.sqlite_version_info < (3, 38):
         raise DatabaseUnavailable(f"SQLite 3.38 or newer is needed, this is {sqlite3.sqlite_version}")
     if belongs_to is not None and not path.exists():
-        raise DatabaseUnavailable(f"{name} {_gone(belongs_to)}")
+        raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
     try:
         real = Path(os.path.realpath(path))
         if not real.exists():
             move_leftovers(real)
         os.mknod(real, 0o600 | stat.S_IFREG)
-        real.chmod(FILE_MODES[access])  # whatever the umask took off
+        real.chmod(FILE_MODES[access])  # independent of the umask
     except FileExistsError:
         if path.is_dir():
             raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
@@ -93,22 +93,22 @@ def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | No
 
 
 def must_exist(path: Path, name: str) -> None:
-    """Says how to make a database where there is none."""
+    """Raise `DatabaseUnavailable` for a missing file, with the command that creates one."""
     if not path.is_file():
-        raise DatabaseUnavailable(f"{name} does not exist: {_HOW_TO_MAKE_ONE}")
+        raise DatabaseUnavailable(f"{name} does not exist: {_HOW_TO_CREATE}")
 
 
-def _gone(log_id: str) -> str:
+def _missing_log(log_id: str) -> str:
     return (
         f"holds no memory, and the spool belongs to log {log_id}: restore that log, choose another spool, or"
-        " store what it holds in a new one with `pycrorm spool rebind`"
+        " move the spool's records to a new log with `pycrorm spool rebind`"
     )
 
 
-async def _look(dialect: Dialect, connection: AsyncConnection, name: str, format_known: int) -> Found | None:
-    found = await dialect.look(connection, name)
-    if found is not None and found.format > format_known:
+async def _find_log(dialect: Dialect, connection: AsyncConnection, name: str, format_max: int) -> LogIdentity | None:
+    identity = await dialect.find_log(connection, name)
+    if identity is not None and identity.format > format_max:
         raise DatabaseForeign(
-            f"{name} was made by a newer version: its format is {found.format}, this version knows {format_known}"
+            f"{name} was made by a newer version: its format is {identity.format}, this version reads {format_max}"
         )
-    return found
+    return identity

@@ -1,4 +1,4 @@
-"""What the log gives back: an event as it is stored, and the state of an episode; and what is asked for at once."""
+"""Define the values that the log returns: stored events, the state of episodes, and spans of events to read."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
 
 
 class StoredEvent(NamedTuple):
-    """One event of the log. `payload` holds the bytes that were appended."""
+    """One event of the log. `payload` is the appended bytes, unchanged."""
 
     number: int
     sequence: int
@@ -34,17 +34,17 @@ class StoredEvent(NamedTuple):
 
 
 class EpisodeRow(NamedTuple):
-    """How far an episode is.
+    """The state of an episode.
 
     Attributes:
         number: in this database.
         id: the UUID as text.
-        head: last sequence stored; 1 to `head` are all there.
-        folded: last sequence the tables show.
-        started_wall_ns: of the first event that arrived.
-        ended_wall_ns: of EpisodeEnded; None while that is not stored.
-        refused: why the log took no more of it, or None.
-        parked: why the tables take no more of it, or None.
+        head: last stored sequence; events 1 to `head` are all stored.
+        folded: last sequence visible in the tables.
+        started_wall_ns: wall time of the first stored event.
+        ended_wall_ns: wall time of EpisodeEnded; None until it is stored.
+        refused: why the log refused events of the episode, or None.
+        parked: why folding the episode stopped, or None.
     """
 
     number: int
@@ -58,12 +58,12 @@ class EpisodeRow(NamedTuple):
 
 
 class Basis(NamedTuple):
-    """What an append builds on: what this log had confirmed before.
+    """Facts that this log confirmed before an append.
 
     Attributes:
-        witness: the episode that was stored last, and how far. A log that holds less of it takes nothing.
-        number_of: the number that an episode was given before; it gets it back where it is free.
-        above: the highest number that is known to be given; new episodes get higher ones.
+        witness: the episode stored last, and its head. A log with a lower head went back and refuses the append.
+        number_of: returns an episode's former number, which it gets again if the number is free.
+        above: the highest number known to be assigned; new episodes get higher ones.
     """
 
     witness: tuple[EpisodeId, int] | None
@@ -72,17 +72,18 @@ class Basis(NamedTuple):
 
 
 NOTHING_KNOWN = Basis(None, lambda _: None, 0)
+"""The basis of an append without confirmed facts."""
 
 
 class Stored(NamedTuple):
-    """What became of a batch: why episodes refused records, and every episode as it is now."""
+    """The result of an append: reasons of refusals by episode, and the current row of each episode in the batch."""
 
     refusals: Mapping[EpisodeId, str]
     rows: Mapping[EpisodeId, EpisodeRow]
 
 
 class Incarnation(NamedTuple):
-    """Once that the log was found to have gone back: when, from which spool, and what could be done."""
+    """One time the log went back: when and from which spool that was noticed, and the outcome."""
 
     noticed_wall_ns: int
     noticed_by: str
@@ -90,12 +91,12 @@ class Incarnation(NamedTuple):
 
 
 _RESERVE_MAX = 4_096
-"""Left free behind the highest number known when a log went back, for what other spools had stored in it: as many
-episodes as a hundred robots begin in an hour. A thousand failovers would use up all numbers, so it shrinks then."""
+"""Bounds the numbers left free behind the highest known one when a log went back, for episodes that other spools had
+stored: as many as a hundred robots begin in an hour. Shrinks as numbers run out, so that failovers never exhaust them."""
 
 
 def numbers_reserved(above: int) -> int:
-    """How many numbers are left free behind this one.
+    """Return how many numbers to leave free behind this one.
 
     >>> numbers_reserved(1_000), numbers_reserved(EPISODE_NUMBER_MAX - 640)
     (4096, 10)
@@ -104,7 +105,7 @@ def numbers_reserved(above: int) -> int:
 
 
 class Span(NamedTuple):
-    """The events of an episode from the one that follows sequence `after` to sequence `last`."""
+    """The events of an episode behind sequence `after`, up to sequence `last`."""
 
     number: int
     after: int
@@ -112,7 +113,7 @@ class Span(NamedTuple):
 
 
 def beyond(behind: Sequence[EpisodeRow], reached: Mapping[int, int]) -> list[EpisodeRow]:
-    """Those that are behind still once what somebody folds now is in the tables: by number, up to where that is.
+    """Return the episodes that will still be behind after a running fold; `reached` is its last sequence by number.
 
     >>> beyond([EpisodeRow(1, "", head=9, folded=0, started_wall_ns=0)], {1: 7})[0].folded
     7
@@ -125,11 +126,11 @@ def beyond(behind: Sequence[EpisodeRow], reached: Mapping[int, int]) -> list[Epi
 
 
 _SHARE_MIN = 1_000
-"""So much of an episode is read at once even if many wait: rows that lie together are read and written together."""
+"""Smallest share of an episode, in events, because adjacent rows are read and written together."""
 
 
 def share_out(behind: Sequence[EpisodeRow], limit: int) -> list[Span]:
-    """What of these episodes is read next, at most `limit` events: something of each, so that none waits for long.
+    """Divide the next `limit` events among these episodes, so that none waits for long.
 
     >>> share_out([EpisodeRow(1, "", head=90_000, folded=0, started_wall_ns=0)], 100)
     [Span(number=1, after=0, last=100)]

@@ -109,7 +109,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "code", "line"),
     [
-        (["run", "plans.py", "--url", "mongodb://lab/memory"], 2, "mongodb:// is not a database we know"),
+        (["run", "plans.py", "--url", "mongodb://lab/memory"], 2, "mongodb:// is not a supported database"),
         (["episodes", "--url", "sqlite"], 2, "this is not a database URL"),
         (["run", "plans.py", "--url", "sqlite:////no/such/folder/x.db"], 3, "/no/such/folder"),
         (["episodes", "--url", "sqlite:///none.db"], 3, "none.db does not exist"),

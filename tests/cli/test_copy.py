@@ -83,7 +83,7 @@ def test_the_memory_to_copy_can_be_said_by_the_environment(folder: Path) -> None
     [
         (["--to", "sqlite:///a.db"], 2, "sqlite:///a.db and sqlite:///a.db are the same memory"),
         (["--to", "sqlite://"], 2, "sqlite:// exists only in its own process"),
-        (["--to", "mysql://lab/b"], 2, "mysql:// is not a database we know"),
+        (["--to", "mysql://lab/b"], 2, "mysql:// is not a supported database"),
         (["--to", "sqlite:///b.db", "--episode", "3"], 2, "there is no episode '3'"),
         (["--to", "sqlite:///b.db", "--from", "sqlite:///none.db"], 3, "sqlite:///none.db does not exist"),
         (["--to", "sqlite:///none/b.db"], 3, "cannot be opened: No such file or directory"),

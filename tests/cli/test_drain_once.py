@@ -16,8 +16,8 @@ from tests.databases import ask, ask_to_change
 
 RECORDER, EPISODE = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
 FULL = (
-    f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used: `pycrorm spool rebind` gives its spool to"
-    " another"
+    f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used: move its spool to a new memory with"
+    " `pycrorm spool rebind`"
 )
 
 

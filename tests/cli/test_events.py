@@ -106,7 +106,7 @@ async def test_of_a_damaged_log_what_comes_before_the_damage_is_printed(tmp_path
         (["1", "--type", "nodestarted"], 2, "unknown event type 'nodestarted'; known types: DesignatorTypeDeclared, "),
         (["1", "--url", "sqlite:///none.db"], 3, "does not exist"),
         (["1", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
-        (["1", "--url", "oracle://lab/memory"], 2, "oracle:// is not a database we know"),
+        (["1", "--url", "oracle://lab/memory"], 2, "oracle:// is not a supported database"),
         (["1", "--url", "postgresql://ada:s3cr@127.0.0.1:1/memory"], 3, "cannot be reached: Connection refused"),
     ],
 )

@@ -55,9 +55,9 @@ def test_a_scheme_of_another_program_means_the_same_database(scheme: str) -> Non
 @pytest.mark.parametrize(
     ("url", "reason"),
     [
-        ("mysql://u:s3cret@h/db", "mysql:// is not a database we know"),
-        ("sqlite+pysqlcipher:///x.db", "sqlite+pysqlcipher:// is not a database we know"),
-        ("postgresql+pg8000://u:s3cret@h/db", "postgresql+pg8000:// is not a database we know"),
+        ("mysql://u:s3cret@h/db", "mysql:// is not a supported database"),
+        ("sqlite+pysqlcipher:///x.db", "sqlite+pysqlcipher:// is not a supported database"),
+        ("postgresql+pg8000://u:s3cret@h/db", "postgresql+pg8000:// is not a supported database"),
         ("memory.db", "this is not a database URL"),
         ("", "this is not a database URL"),
         ("postgresql://u:s3cret@h:port/db", "this is not a database URL"),
@@ -81,7 +81,7 @@ def test_another_url_is_refused_with_what_works_and_without_its_password(url: st
         DatabaseAddress.parse(url)
     message = str(caught.value)
     assert message.startswith(reason)
-    assert "; what works: sqlite:///memory.db" in message
+    assert "; valid URLs: sqlite:///memory.db" in message
     assert "s3cret" not in message
 
 

@@ -225,7 +225,7 @@ class Folding:
         """
         growing = types.layout != self.generation.layout
         if growing:
-            await dialect_of(connection).alone(connection)
+            await dialect_of(connection).lock_log_changes(connection)
         generation = await self._target.generation(connection, "change" if growing else "share")
         if (generation.number, generation.revision) != (done.number, types.revision):
             self.generation = generation

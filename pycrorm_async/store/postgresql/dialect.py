@@ -14,8 +14,8 @@ from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavail
 from pycrorm_async.store.dialect import (
     Birth,
     Expected,
-    Found,
     Insertion,
+    LogIdentity,
     Migrations,
     Progress,
     RowRefused,
@@ -45,10 +45,10 @@ class PostgreSQL:
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
         """Nothing has to be done outside a transaction."""
 
-    async def alone(self, connection: AsyncConnection) -> None:
+    async def lock_log_changes(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql(tables.ALONE)
 
-    async def look(self, connection: AsyncConnection, name: str) -> Found | None:
+    async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
         version = (await connection.exec_driver_sql(tables.SERVER_VERSION)).scalar_one()
         if version < _SERVER_MIN:
             raise DatabaseUnavailable(f"{name}: PostgreSQL 14 or newer is needed, this is {version // 10_000}")
@@ -62,16 +62,16 @@ class PostgreSQL:
         found = (await connection.exec_driver_sql(tables.READ_LOG)).one_or_none()
         if found is None:
             raise DatabaseUnavailable(f"{name}: the table pycrorm_log is empty: {_RESTORING}")
-        return Found._make(found)
+        return LogIdentity._make(found)
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
         # In one message, past SQLAlchemy: within the transaction that a statement through it has begun before.
         await (await _driver(connection)).execute("; ".join(statements))
 
-    async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
+    async def insert_log(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
         await connection.exec_driver_sql(tables.INSERT_LOG, (birth.log_id, format_now, birth.created_wall_ns))
 
-    async def note_format(self, connection: AsyncConnection, format_now: int) -> None:
+    async def set_format(self, connection: AsyncConnection, format_now: int) -> None:
         await connection.exec_driver_sql(tables.SET_FORMAT, (format_now,))
 
     # --- appending ----------------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class PostgreSQL:
     async def note_incarnation(self, connection: AsyncConnection, incarnation: Incarnation) -> None:
         # Who appends as one role of many may not make tables: then the owner has (`roles.GRANTS`).
         if not await self._has_incarnations(connection):
-            await self.alone(connection)
+            await self.lock_log_changes(connection)
             await connection.exec_driver_sql(tables.INCARNATION)
         await connection.exec_driver_sql(sql.INSERT_INCARNATION, tuple(incarnation))
 
@@ -146,7 +146,7 @@ class PostgreSQL:
         ]
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, _arrays(rows, 6))
 
-    async def note_again(self, connection: AsyncConnection) -> None:
+    async def force_durable_commit(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql(sql.WRITE_AHEAD)
 
     async def commit(self, connection: AsyncConnection) -> None:
@@ -157,7 +157,7 @@ class PostgreSQL:
         if WARNING in connected:
             raise errors.CommitInDoubt(connected[WARNING])
 
-    async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
+    async def events_by_key(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_STORED_AGAIN, *_arrays(keys, 2))
 
     # --- reading ------------------------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ class PostgreSQL:
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
 
-    async def hold_still(self, connection: AsyncConnection) -> None:
+    async def begin_snapshot(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
 
     async def in_order(self, connection: AsyncConnection) -> None:
@@ -333,8 +333,8 @@ class PostgreSQL:
     def refusal(self, error: Exception) -> str | None:
         return errors.refusal(error)
 
-    def ours(self, error: Exception, name: str) -> PycrormError:
-        return errors.ours(error, name)
+    def translate_error(self, error: Exception, name: str) -> PycrormError:
+        return errors.translate_error(error, name)
 
 
 def _confirming(configured: str) -> int:

@@ -11,7 +11,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError
 
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
 
-__all__ = ["FAULTS", "ROW_FAULTS", "CommitInDoubt", "ours", "refusal", "is_missing_table"]
+__all__ = ["FAULTS", "ROW_FAULTS", "CommitInDoubt", "translate_error", "refusal", "is_missing_table"]
 
 FAULTS: tuple[type[Exception], ...] = (
     DBAPIError,
@@ -61,7 +61,7 @@ class CommitInDoubt(ConnectionError):
     """The server committed, and warns that the machine it should have waited for may not have the commit."""
 
 
-def ours(error: Exception, database: str) -> PycrormError:
+def translate_error(error: Exception, database: str) -> PycrormError:
     """The error to raise in its place. No text of it repeats the URL, which may hold a password."""
     fault = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
     code = _code(fault)

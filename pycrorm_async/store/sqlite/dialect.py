@@ -19,8 +19,8 @@ from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailab
 from pycrorm_async.store.dialect import (
     Birth,
     Expected,
-    Found,
     Insertion,
+    LogIdentity,
     Migrations,
     Progress,
     RowRefused,
@@ -49,30 +49,30 @@ class SQLite:
         async with engine.connect() as connection:
             # Not before the database is known to be ours or empty: the journal mode is a lasting change of the file.
             await connection.execution_options(**{BEGIN: None})
-            await self.look(connection, name)
+            await self.find_log(connection, name)
             mode = (await connection.exec_driver_sql(USE_WAL)).scalar_one()
             if mode != "wal":
                 raise DatabaseUnavailable(f"{name}: SQLite cannot keep a write-ahead log there (a network folder?)")
 
-    async def alone(self, connection: AsyncConnection) -> None:
+    async def lock_log_changes(self, connection: AsyncConnection) -> None:
         """A writing transaction holds the write lock from its beginning."""
 
-    async def look(self, connection: AsyncConnection, name: str) -> Found | None:
+    async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
         names = set((await connection.exec_driver_sql(tables.TABLE_NAMES)).scalars())
         if not names:
             return None
         if "pycrorm_log" not in names:
             raise DatabaseForeign(f"{name} is a database of another program: it has tables but no pycrorm_log")
-        return Found._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
+        return LogIdentity._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
         for statement in statements:
             await connection.exec_driver_sql(statement)
 
-    async def note_birth(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
+    async def insert_log(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
         await connection.exec_driver_sql(tables.INSERT_LOG, (birth.log_id, format_now, birth.created_wall_ns))
 
-    async def note_format(self, connection: AsyncConnection, format_now: int) -> None:
+    async def set_format(self, connection: AsyncConnection, format_now: int) -> None:
         await connection.exec_driver_sql(tables.SET_FORMAT, (format_now,))
 
     # --- appending ----------------------------------------------------------------------------------------------
@@ -121,13 +121,13 @@ class SQLite:
     async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(each) for each in episodes]),))
 
-    async def note_again(self, connection: AsyncConnection) -> None:
+    async def force_durable_commit(self, connection: AsyncConnection) -> None:
         """Nothing has to be done: what another transaction committed is on the disk before this one sees it."""
 
     async def commit(self, connection: AsyncConnection) -> None:
         await connection.commit()
 
-    async def stored_again(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
+    async def events_by_key(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, sql.SELECT_STORED_AGAIN, _json(keys))
 
     # --- reading ------------------------------------------------------------------------------------------------
@@ -166,7 +166,7 @@ class SQLite:
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
 
-    async def hold_still(self, connection: AsyncConnection) -> None:
+    async def begin_snapshot(self, connection: AsyncConnection) -> None:
         """A transaction is a snapshot."""
 
     async def in_order(self, connection: AsyncConnection) -> None:
@@ -276,8 +276,8 @@ class SQLite:
     def refusal(self, error: Exception) -> str | None:
         return errors.refusal(error.orig if isinstance(error, DBAPIError) else error)
 
-    def ours(self, error: Exception, name: str) -> PycrormError:
-        return errors.ours(error.orig if isinstance(error, DBAPIError) else error, name)
+    def translate_error(self, error: Exception, name: str) -> PycrormError:
+        return errors.translate_error(error.orig if isinstance(error, DBAPIError) else error, name)
 
 
 _quote = make_dialect().identifier_preparer.quote

@@ -12,7 +12,7 @@ from pycrorm_async.errors import (
     PycrormError,
 )
 
-__all__ = ["ours", "refusal"]
+__all__ = ["translate_error", "refusal"]
 
 _AWAY = {
     sqlite3.SQLITE_PERM,
@@ -29,7 +29,7 @@ _AWAY = {
 }
 
 
-def ours(fault: BaseException | None, database: str) -> PycrormError:
+def translate_error(fault: BaseException | None, database: str) -> PycrormError:
     """The error to raise in place of the driver's."""
     code = getattr(fault, "sqlite_errorcode", None)
     if isinstance(fault, UnicodeDecodeError) or (code is None and str(fault).startswith("Could not decode to UTF-8")):
