@@ -92,7 +92,7 @@ class Incarnation(NamedTuple):
 
 _RESERVE_MAX = 4_096
 """Bounds the numbers left free behind the highest known one when a log went back, for episodes that other spools had
-stored: as many as a hundred robots begin in an hour. Shrinks as numbers run out, so that failovers never exhaust them."""
+stored: as many as a hundred robots begin in an hour. Shrinks as numbers run out: failovers never exhaust them."""
 
 
 def numbers_reserved(above: int) -> int:

@@ -215,7 +215,7 @@ async def test_who_has_the_log_open_goes_on_when_a_newer_program_brings_it_up_to
     await older.close()
     assert ask(database_url, "SELECT count(*) FROM event") == [(8,)]
     for create in (True, False):
-        with pytest.raises(DatabaseForeign, match=r"its format is 2, this version knows 1$"):
+        with pytest.raises(DatabaseForeign, match=r"its format is 2, this version reads 1$"):
             await EventLog.open(address, create=create)
 
 

@@ -106,7 +106,7 @@ async def test_a_log_of_a_newer_version_is_refused(address: DatabaseAddress, cre
     newer.execute("UPDATE pycrorm_log SET format = 2")
     newer.commit()
     newer.close()
-    with pytest.raises(DatabaseForeign, match=r"its format is 2, this version knows 1$"):
+    with pytest.raises(DatabaseForeign, match=r"its format is 2, this version reads 1$"):
         await EventLog.open(address, create=create)
 
 
