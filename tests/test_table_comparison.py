@@ -27,6 +27,8 @@ from tests.projections.event_script import NAVIGATE, SAYING, Script, declaration
 from tests.projections.sql_queries import stored_and_folded
 from tests.table_comparison import declarations_of, differences, logs_of, tables_of, united
 
+pytestmark = pytest.mark.slow
+
 COUNTING = declared("CountingAction", "counting_action", field("robot_id", "integer", 2), field("milk", "object", 3))
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 BUT = {"busy", "faults", "hook", "__main__", "rebuild_beside"}
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)

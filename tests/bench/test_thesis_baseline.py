@@ -71,6 +71,7 @@ def test_one_navigation_is_eleven_inserts_over_eight_tables(file: str, engine: E
     assert statements.sent == ROOT_ROWS + 11
 
 
+@pytest.mark.slow
 def test_rows_with_a_key_of_their_own_take_a_statement_each_on_sqlite(file: str, engine: Engine) -> None:
     made = tree(1_000, seed=1)
     statements = Statements(engine)
@@ -83,6 +84,7 @@ def test_rows_with_a_key_of_their_own_take_a_statement_each_on_sqlite(file: str,
     assert (sum(own.values()) + sum(found.values())) / made.nodes == pytest.approx(9.05, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.soak
 def test_fifty_thousand_rollouts_have_the_number_of_nodes_of_the_thesis() -> None:
     assert tree(THESIS_NODES, seed=69).nodes == 488_043

@@ -11,6 +11,8 @@ import pytest
 
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 
+pytestmark = pytest.mark.slow
+
 PLANS = '''
 import asyncio, math, os, sys
 from dataclasses import dataclass

@@ -19,7 +19,7 @@ from tests.table_comparison import logs_of
 from tests.test_table_comparison import episode as hand_written
 from tests.test_table_comparison import fill
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 PLAN = """

@@ -14,6 +14,8 @@ from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
 
+pytestmark = pytest.mark.slow
+
 RECORDER, EPISODE = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
 FULL = (
     f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used: move its spool to a new memory with"

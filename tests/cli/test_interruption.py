@@ -10,6 +10,8 @@ import sys
 import time
 from pathlib import Path
 
+import pytest
+
 from tests.commands import answer, pycrorm
 
 LOADING = """
@@ -70,6 +72,7 @@ def _appears(path: Path) -> bool:
     return path.exists()
 
 
+@pytest.mark.slow
 def test_a_plan_whose_database_is_away_at_its_end_is_left_with_ctrl_c_and_stored_later(tmp_path: Path) -> None:
     (tmp_path / "waits.py").write_text(PLAN)
     running = subprocess.Popen(

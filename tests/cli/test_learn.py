@@ -15,6 +15,8 @@ from pycrorm_async.learning import load_policy, name_of
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask, await_events
 
+pytestmark = pytest.mark.slow
+
 SMALL = ("learn", "--rollouts", "400", "--evaluate", "150", "--held-out", "150")
 
 

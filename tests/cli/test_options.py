@@ -21,6 +21,7 @@ def test_every_verb_that_opens_a_database_takes_its_spool_too() -> None:
     assert {"verify", "rebuild", "episodes"} <= {name for name, known in options.items() if "--url" in known}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["verify", "rebuild"])
 def test_verify_and_rebuild_name_the_events_that_wait_in_the_spool(tmp_path: Path, verb: str) -> None:
     (tmp_path / "notes.py").write_text(NOTES_PLAN)

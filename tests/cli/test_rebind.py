@@ -9,6 +9,8 @@ import pytest
 from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, one_line_of, pycrorm
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:

@@ -21,6 +21,8 @@ from tests.databases import ask
 from tests.projections.rebuild_cases import TYPES, parking, picking, store, str_of, traces
 from tests.table_comparison import differences, tables_of
 
+pytestmark = pytest.mark.slow
+
 PLAN = '''
 from dataclasses import dataclass
 from pycrorm_async.plan import ActionAbstract

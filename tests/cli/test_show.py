@@ -8,6 +8,8 @@ import pytest
 
 from tests.commands import answer, one_line_of, pycrorm
 
+pytestmark = pytest.mark.slow
+
 PLANS = '''
 import os, signal
 from dataclasses import dataclass

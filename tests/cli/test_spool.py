@@ -13,6 +13,8 @@ from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.queue.factories import overwrite
 
+pytestmark = pytest.mark.slow
+
 PLAN = '''
 import itertools, os
 from dataclasses import dataclass

@@ -17,7 +17,7 @@ from tests.databases import Server, ask, ask_to_change
 from tests.projections.verify_cases import fold_in_batches, full, opened, shown
 from tests.store.factories import declaration
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 ID = "00000000-0000-7000-8000-00000000000{}"

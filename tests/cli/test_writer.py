@@ -14,6 +14,8 @@ from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask_to_change
 
+pytestmark = pytest.mark.slow
+
 PLAN = f"""
 import asyncio, os
 {NOTES_PLAN}

@@ -16,6 +16,8 @@ from tests.table_comparison import declarations_of, differences, tables_of
 from tests.test_table_comparison import episode as hand_written
 from tests.test_table_comparison import fill
 
+pytestmark = pytest.mark.slow
+
 New = Callable[[], str]
 
 

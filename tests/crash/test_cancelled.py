@@ -34,7 +34,7 @@ from tests.projections.event_script import SAYING, Script, declarations, name_of
 from tests.queue.factories import make
 from tests.writer.fakes import KeptSource
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 SETTINGS = Settings(batch_events_max=10, idle_ms=1, batch_age_ms=1)

@@ -29,6 +29,8 @@ from tests.databases import ask
 from tests.queue.factories import RECORDER, SMALL, STILL, Author, ended, episode, node, started
 from tests.writer.fakes import CountingFold
 
+pytestmark = pytest.mark.slow
+
 LIVE = replace(SMALL, sync_interval_ms=1, spool_bytes_max=64 * SMALL.segment_bytes)
 STEPS = {
     os: ("open", "fsync", "fdatasync", "posix_fallocate", "truncate", "ftruncate"),

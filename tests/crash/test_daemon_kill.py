@@ -12,6 +12,8 @@ import pytest
 from tests.crash.robot_processes import Lab
 from tests.databases import Server, server_in
 
+pytestmark = pytest.mark.slow
+
 
 def kill_again_and_again(lab: Lab, *, robots: int, kills: int) -> None:
     for robot in [lab.start_robot() for _ in range(robots)]:

@@ -18,6 +18,8 @@ from tests.crash.forked_processes import Forked
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts
 
+pytestmark = pytest.mark.slow
+
 SMALL = Settings(
     sync_interval_ms=5,
     segment_bytes=2**14,

@@ -11,6 +11,8 @@ import pytest
 
 from tests.commands import COMMAND, answer, environment, pycrorm
 
+pytestmark = pytest.mark.slow
+
 PLAN = '''
 import itertools, os
 from dataclasses import dataclass

@@ -28,6 +28,8 @@ from tests.crash.forked_processes import Forked
 from tests.crash.robot_processes import HANGS_S, Lab
 from tests.databases import Server, ask
 
+pytestmark = pytest.mark.slow
+
 ROBOTS_A_MACHINE = 8
 
 

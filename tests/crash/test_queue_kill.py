@@ -14,6 +14,8 @@ from pycrorm_async.queue import Spool, open_dead
 from tests.crash.forked_processes import Forked
 from tests.crash.recorder_process import record
 
+pytestmark = pytest.mark.slow
+
 TOGETHER = 4
 """How many recorders live at the same time; each has a spool of its own."""
 LIFE_S_MAX = 0.015

@@ -25,6 +25,8 @@ from pycrorm_async.queue.live.sync_thread import SyncThread
 from pycrorm_async.queue.live.syncable_appender import Span, SyncableAppender
 from tests.queue.factories import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
 
+pytestmark = pytest.mark.slow
+
 SECTOR = 512
 ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
 

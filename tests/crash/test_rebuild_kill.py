@@ -16,7 +16,7 @@ from tests.databases import ask
 from tests.projections.rebuild_cases import TYPES, folded_elsewhere, picking, store, traces
 from tests.table_comparison import differences, tables_of
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 EPISODES = 30

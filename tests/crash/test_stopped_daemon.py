@@ -13,10 +13,14 @@ import time
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import pytest
+
 from pycrorm_async.testing.postgresql_proxy import proxy_before
 from tests.commands import one_line_of, pycrorm
 from tests.crash.robot_processes import Lab
 from tests.databases import Server, ask
+
+pytestmark = pytest.mark.slow
 
 
 def stop_in_its_tracks(lab: Lab) -> None:

@@ -176,6 +176,7 @@ def started(events: list[tuple[int, Happening]]) -> NodeStarted:
     return next(event for _, event in events if isinstance(event, NodeStarted) and event.kind == "action")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bytes_max", [2**20, 3_000])
 @given(described=VALUES, fails=st.none() | FAILURES)
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))

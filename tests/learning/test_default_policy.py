@@ -62,6 +62,7 @@ def test_samples_are_spread_as_the_density_says() -> None:
         assert np.mean([choice.grasp is grasp for choice in choices]) == pytest.approx(1 / 4, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_conditioned_policy_draws_what_is_left_when_all_else_is_thrown_away() -> None:
     evidence = Evidence(
         arms=frozenset({Arms.RIGHT}),

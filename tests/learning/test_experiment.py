@@ -28,6 +28,8 @@ from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import MoveAndPickUpAction
 from tests.databases import ask, await_events
 
+pytestmark = pytest.mark.slow
+
 SMALL = Experiment(rollouts=700, evaluate=200, held_out=200, workers=2)
 LONGER = Experiment(rollouts=1_500, evaluate=50, held_out=50, workers=2)
 """At its first news most of it is still to be done, also when the machine is busy and news are looked at late."""

@@ -32,6 +32,7 @@ def learned(choices: list[PickUpChoice]) -> Policy:
     return learn(frame_of(choices).assign(height=heights), min_samples_leaf=2)
 
 
+@pytest.mark.slow
 def test_a_tree_has_more_leaves_than_python_nests_calls(learned: Policy, choices: list[PickUpChoice]) -> None:
     assert len(learned.leaves) > sys.getrecursionlimit()
     assert learned.coverage(choices) == 1.0

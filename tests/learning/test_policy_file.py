@@ -46,6 +46,7 @@ print(policy.likelihood(choices).tolist())
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", [default_policy(), LEARNED], ids=["default", "learned"])
 def test_a_policy_is_the_same_in_another_process_without_what_learning_needs(policy: Policy, tmp_path: Path) -> None:
     path = tmp_path / "policy.json"

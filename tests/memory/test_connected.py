@@ -23,6 +23,8 @@ from pycrorm_async.world.errors import NoWorld, WorldClosed
 from tests.commands import pycrorm
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
+pytestmark = pytest.mark.slow
+
 HERE = Path(__file__).parent
 
 

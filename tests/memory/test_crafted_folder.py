@@ -77,6 +77,7 @@ async def test_a_plan_that_starts_beside_them_adopts_the_next_folder(
     assert len([each for each in caplog.records if each.levelno >= logging.WARNING]) == 1
 
 
+@pytest.mark.slow
 def test_every_verb_says_it_in_one_line(tmp_path: Path, spool: Path, crafted: Author, whole: Author) -> None:
     (spool / os.fsdecode(b"\xff")).touch()
     crafted_folder, url = crafted.folder, f"sqlite:///{tmp_path / 'memory.db'}"
@@ -100,6 +101,7 @@ def test_every_verb_says_it_in_one_line(tmp_path: Path, spool: Path, crafted: Au
     assert ask(url, STORED) == [(2,)]
 
 
+@pytest.mark.slow
 async def test_an_episode_of_nonsense_is_stopped_and_the_one_beside_it_is_in_the_tables(
     database_url: str, spool: Path
 ) -> None:

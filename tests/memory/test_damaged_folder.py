@@ -21,6 +21,8 @@ from tests.memory.note_actions import NoteActionPerformable
 from tests.queue.factories import WALL_NS, Author, episode, overwrite, started
 from tests.writer.writer_threads import until
 
+pytestmark = pytest.mark.slow
+
 STORED = "SELECT max(sequence), count(*) FROM event"
 MISSING = "position 13 is missing"
 

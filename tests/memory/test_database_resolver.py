@@ -30,6 +30,8 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Po
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.note_actions import url_of
 
+pytestmark = pytest.mark.slow
+
 STAND = Pose([0.6, 0.9, 0.0])
 TORSO = 0.3
 

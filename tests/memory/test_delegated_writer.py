@@ -34,6 +34,8 @@ from tests.databases import ask, ask_to_change
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def spool(tmp_path: Path) -> Path:

@@ -17,6 +17,8 @@ from tests.databases import ask
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
 
+pytestmark = pytest.mark.slow
+
 GONE = "was deleted or replaced"
 
 

@@ -20,6 +20,8 @@ from tests.databases import ask, ask_to_change
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.store.factories import episode, run_of
 
+pytestmark = pytest.mark.slow
+
 
 def take_numbers_up_to(url: str, last: int) -> None:
     """The database has given this episode number."""

@@ -21,6 +21,8 @@ from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.memory.test_database_resolver import STAND, TORSO, scene
 
+pytestmark = pytest.mark.slow
+
 
 async def pick_up(stand: Pose = STAND, *, torso: float = TORSO) -> None:
     with scene(kitchen=True) as here:

@@ -24,6 +24,8 @@ from tests.commands import answer, pycrorm
 from tests.memory.note_actions import NoteActionPerformable
 from tests.table_comparison import differences, tables_of
 
+pytestmark = pytest.mark.slow
+
 SMALL = Settings(episode_events_max=1_000)
 NOTES = 1_000
 

@@ -35,6 +35,8 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Object, ObjectType, Pose
 from tests.memory.note_actions import url_of
 
+pytestmark = pytest.mark.slow
+
 HANDLE, JOINT = "sink_area_drawer_handle", "sink_area_drawer_joint"
 LEFT_TOOL = "l_gripper_tool_frame"
 

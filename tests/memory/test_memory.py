@@ -30,6 +30,7 @@ async def test_a_private_memory_answers_and_leaves_nothing_behind() -> None:
     assert {path.name for path in place.glob("pycrorm-*/")} <= before
 
 
+@pytest.mark.slow
 async def test_what_is_flushed_is_in_the_tables_and_in_the_database_file(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode(description="e"):

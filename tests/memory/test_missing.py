@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory
 from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
 from tests.memory.note_actions import NoteActionPerformable
+
+pytestmark = pytest.mark.slow
 
 
 @dataclass

@@ -35,6 +35,8 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Object, 
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.note_actions import url_of
 
+pytestmark = pytest.mark.slow
+
 BELIEVED = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.2, 0.4, 0.9], yaw_quaternion(0.5)))
 VALUES: dict[Any, Any] = {Arms: Arms.LEFT, Grasp: Grasp.FRONT, GripperState: GripperState.OPEN, Pose: Pose([0.5, 0, 0])}
 

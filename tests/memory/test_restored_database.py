@@ -24,6 +24,8 @@ from tests.databases import Server, ask
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
 
+pytestmark = pytest.mark.slow
+
 SMALL = replace(QUICK, segment_bytes=128 * 1024, spool_reserve_bytes=64 * 1024, record_bytes_max=16 * 1024)
 TakeBackup = Callable[[], Backup]
 ALL = "SELECT id, number, head, folded, refused, parked FROM episode ORDER BY id"

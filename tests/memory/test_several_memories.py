@@ -20,6 +20,8 @@ from pycrorm_async.world.observers import watcher
 from tests.commands import environment
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
+pytestmark = pytest.mark.slow
+
 
 async def test_a_memory_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
     for text in ("one", "two", "three"):

@@ -10,6 +10,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
@@ -39,6 +40,8 @@ from pycrorm_async.world import Object as WorldObject
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.commands import answer, environment, pycrorm
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
+
+pytestmark = pytest.mark.slow
 
 TOO_FAR = Pose([-2, 0, 0])
 NEAR = Pose([0.6, 0.9, 0], yaw_quaternion(-0.27))

@@ -6,6 +6,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 from sqlalchemy import ForeignKey, func, select
 from sqlalchemy.orm import Mapped, mapped_column, undefer
 
@@ -16,6 +17,8 @@ from pycrorm_async.plan.object_designators import BelieveObject
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from tests.commands import environment
 from tests.memory.note_actions import NoteActionPerformable, url_of
+
+pytestmark = pytest.mark.slow
 
 
 @dataclass

@@ -14,6 +14,8 @@ import pytest
 from pycrorm_async import Memory
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
+pytestmark = pytest.mark.slow
+
 SENTENCE = "NoteAction.perform() was called and never awaited, so it did not run: write `await`"
 FAULT = "NoteAction.perform() was called and never awaited"
 

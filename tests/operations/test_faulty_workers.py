@@ -28,6 +28,8 @@ from pycrorm_async.store.log import EventLog
 from tests.databases import ask
 from tests.operations.faults import TRAP, Trapped, arm
 
+pytestmark = pytest.mark.slow
+
 PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1, fold_worker_report_s=0.1)
 IMPATIENT = replace(PATIENT, fold_worker_stopped_s=0.6)
 HURRIED = replace(PATIENT, fold_worker_answer_s=10.0)

@@ -15,6 +15,8 @@ from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import COMMAND, answer, environment, pycrorm
 from tests.databases import ask, ask_to_change
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:

@@ -230,6 +230,7 @@ async def test_two_memories_with_types_of_one_name_do_not_meet(log: EventLog, tm
         await other.close()
 
 
+@pytest.mark.slow
 async def test_disposed_classes_leave_nothing_behind(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     identities = dict(Designator.__mapper__.polymorphic_map)
@@ -310,6 +311,7 @@ configure_mappers()
 """
 
 
+@pytest.mark.slow
 def test_a_class_that_is_gone_before_anything_was_asked_is_in_nobodys_way() -> None:
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", IN_A_NEW_PROCESS]

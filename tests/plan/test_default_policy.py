@@ -6,9 +6,13 @@ import math
 import random
 from collections import Counter
 
+import pytest
+
 from pycrorm_async.plan import IKError, MoveAndPickUpPerformable
 from pycrorm_async.world import Arms, Grasp, Pose
 from tests.plan.conftest import Scene
+
+pytestmark = pytest.mark.slow
 
 ROLLOUTS = 2_000
 

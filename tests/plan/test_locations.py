@@ -47,6 +47,7 @@ LEFT_TOOL = "l_gripper_tool_frame"
 OUT_OF_REACH = Pose([1.3, 1, 3])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw", [0.0, 1.0, math.pi])
 async def test_from_every_stand_that_is_offered_the_object_can_be_picked_up(scene: Scene, yaw: float) -> None:
     await MoveTorsoActionPerformable(0.2).perform()
@@ -62,6 +63,7 @@ async def test_from_every_stand_that_is_offered_the_object_can_be_picked_up(scen
             scene.world.restore_state(before)
 
 
+@pytest.mark.slow
 async def test_from_every_stand_that_is_offered_the_held_object_can_be_placed(scene: Scene) -> None:
     await MoveTorsoActionPerformable(0.2).perform()
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
@@ -78,6 +80,7 @@ async def test_from_every_stand_that_is_offered_the_held_object_can_be_placed(sc
         scene.world.restore_state(before)
 
 
+@pytest.mark.slow
 def test_stands_are_on_the_floor_face_the_target_and_are_clear_of_furniture(scene: Scene) -> None:
     boxes = [box for link in scene.kitchen.links if (box := scene.kitchen.bounding_box(link)).size != (0, 0, 0)]
     stands = list(CostmapLocation(scene.cereal, reachable_for=scene.robot))
@@ -93,6 +96,7 @@ def test_stands_are_on_the_floor_face_the_target_and_are_clear_of_furniture(scen
     assert distances == pytest.approx(sorted(distances))
 
 
+@pytest.mark.slow
 def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
     def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
         found = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=arm)
@@ -104,6 +108,7 @@ def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
     assert {(Arms.RIGHT,), (Arms.LEFT, Arms.RIGHT)} <= reaching(None)
 
 
+@pytest.mark.slow
 async def test_from_where_it_is_to_be_seen_it_is_seen(scene: Scene) -> None:
     Object("wall", ObjectType.GENERIC_OBJECT, box_urdf("wall", x=(-0.02, 0.02), y=(-0.3, 0.3), z=(0, 2)),
            Pose([1.0, 0.9, 0]))  # fmt: skip

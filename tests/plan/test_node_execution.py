@@ -339,6 +339,7 @@ async def test_a_failed_perform_leaves_nothing_for_the_garbage_collector() -> No
         gc.enable()
 
 
+@pytest.mark.slow
 async def test_a_plan_of_a_hundred_thousand_performs_keeps_memory_flat() -> None:
     class Many(ActionAbstract):
         async def perform(self) -> None:

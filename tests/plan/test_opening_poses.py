@@ -29,6 +29,8 @@ from pycrorm_async.world.errors import UnknownLink
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 
+pytestmark = pytest.mark.slow
+
 DRAWERS = [
     "kitchen_counter_upper_drawer",
     "kitchen_counter_lower_drawer",

@@ -36,6 +36,8 @@ from tests.projections.event_script import SAYING, T0_NS, Script, declarations, 
 from tests.projections.sql_queries import ask, stored_and_folded
 from tests.projections.verify_cases import rebuilt
 
+pytestmark = pytest.mark.slow
+
 LONG = "Ä" * 35 + "_field"
 
 

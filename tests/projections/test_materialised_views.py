@@ -15,6 +15,8 @@ from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import SAYING, Script, declarations, mixed, name_of
 from tests.projections.sql_queries import ask, names
 
+pytestmark = pytest.mark.slow
+
 MEANING = select(TaskTreeNode.id, TaskTreeNode.dtype, TaskTreeNode.status, TaskTreeNode.process_metadata_id).where(
     TaskTreeNode.dtype == "SayingAction", TaskTreeNode.reason.is_(None), TaskTreeNode.dtype != "a:b % c"
 )

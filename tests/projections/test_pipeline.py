@@ -27,6 +27,8 @@ from pycrorm_async.store.stored import Span
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, mixed, name_of, row
 from tests.projections.sql_queries import ask
 
+pytestmark = pytest.mark.slow
+
 
 class InLoop:
     """A hand in this loop. `wrote` is how many events each of its batches had."""

@@ -44,6 +44,8 @@ from tests.projections.event_script import (
 )
 from tests.projections.sql_queries import all_rows, ask, names, stored_and_folded
 
+pytestmark = pytest.mark.slow
+
 VIA = declared("ViaAction", "via_action", field("via", "list", 2, item="pose"))
 
 

@@ -35,6 +35,8 @@ from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import ask, names, stored_and_folded
 
+pytestmark = pytest.mark.slow
+
 
 def two_pick_ups() -> Script:
     """The milk stands at (1, 2) and is picked up from (0.25, 2.5); then it is moved to (5, 5)."""

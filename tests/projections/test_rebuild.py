@@ -44,6 +44,8 @@ from tests.projections.rebuild_cases import (
 from tests.promises.test_random_plans import play
 from tests.table_comparison import differences, tables_of
 
+pytestmark = pytest.mark.slow
+
 PATIENT = Settings(connect_timeout_s=120, flush_timeout_s=300)
 STOPPED = "SELECT number, folded, parked FROM episode ORDER BY number"
 OUR_VIEW = UserView("Failed", select(TaskTreeNode.id, TaskTreeNode.reason).where(TaskTreeNode.reason.is_not(None)))

@@ -47,7 +47,7 @@ from tests.projections.verify_cases import (
 )
 from tests.promises.test_random_plans import play
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 

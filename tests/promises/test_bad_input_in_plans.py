@@ -38,6 +38,8 @@ from pycrorm_async.world.robots.robot_description import PR2
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.lab import Lab, asked, lab, nodes_of, remembered, statuses, url_of, written
 
+pytestmark = pytest.mark.slow
+
 FAR = Pose([9, 9, 1], time_ns=1)
 
 

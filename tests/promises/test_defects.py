@@ -6,6 +6,10 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 HERE = Path(__file__).parent
 ROWS = re.findall(
     r"^\| (\w+) \| ([^|]+) \| ([^|]+) \| `(test_\w+)` \|$", (HERE.parent / "README.md").read_text(), re.MULTILINE

@@ -79,6 +79,8 @@ from tests.promises.lab import (
     written,
 )
 
+pytestmark = pytest.mark.slow
+
 DEFECTS = {
     "1": "test_an_object_is_stored_where_it_was_when_the_action_started",
     "4": "test_an_action_on_a_believed_object_is_stored_with_where_it_was_believed",

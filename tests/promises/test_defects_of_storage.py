@@ -57,6 +57,8 @@ from tests.promises.lab import (
     url_of,
 )
 
+pytestmark = pytest.mark.slow
+
 DEFECTS = {
     "2": "test_what_is_handed_over_twice_is_stored_once",
     "3": "test_an_episode_without_a_description_is_stored",

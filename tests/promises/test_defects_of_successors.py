@@ -190,6 +190,7 @@ def play(world: BulletWorld, row: Any) -> None:
         world.object(row.name).set_pose(Pose(at(row.pose), turned(row.pose)))
 
 
+@pytest.mark.slow
 async def test_every_stored_node_can_be_read_back_as_what_it_was(tmp_path: Path) -> None:
     performed: list[Any] = [
         ParkArmsActionPerformable(Arms.BOTH),
@@ -279,6 +280,7 @@ async def test_expressions_have_times(tmp_path: Path) -> None:
         assert expression.start_time <= inside[0].start_time
 
 
+@pytest.mark.slow
 def test_what_is_imported_is_declared_and_nothing_is_generated() -> None:
     root = Path(pycrorm_async.__file__).parent
     project = tomllib.loads((root.parent / "pyproject.toml").read_text())["project"]

@@ -9,6 +9,8 @@ import pytest
 
 from tests.commands import environment
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = """
 import asyncio, json, re, sys
 from dataclasses import dataclass

@@ -34,6 +34,8 @@ from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import Chronicle, assert_same, told_by_memory
 from tests.promises.lab import WITHIN_REACH, Lab, at, every, lab, remembered, url_of
 
+pytestmark = pytest.mark.slow
+
 ARM = "l_gripper_tool_frame"
 
 

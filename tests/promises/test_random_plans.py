@@ -16,6 +16,8 @@ from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
 from tests.promises.random_plans import AT_ONCE, Entry, Generator, Journal, Thing, built
 
+pytestmark = pytest.mark.slow
+
 PLANS = 1_000
 PARTS = 4
 """A part holds plans of every kind, so one of them runs by default and the others in turns."""

@@ -16,6 +16,8 @@ from pycrorm_async.cli.main import app
 from pycrorm_async.learning import load_policy
 from tests.commands import answer, pycrorm
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 PAGES = {
     str(path.relative_to(ROOT)): path.read_text()

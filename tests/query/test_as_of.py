@@ -47,6 +47,8 @@ from tests.databases import in_a_loop_of_its_own
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, T0_NS, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
+pytestmark = pytest.mark.slow
+
 TYPES = (NAVIGATE, PICK_UP, MOVE)
 ID = "00000000-0000-7000-8000-000000000001"
 PR2, MILK, OUTER, INNER, AGAIN = 3, 4, 5, 9, 18

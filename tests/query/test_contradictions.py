@@ -16,7 +16,7 @@ from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, name_of
 from tests.projections.sql_queries import stored_and_folded
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 WAVE = declared("Wave", "wave", field("times", "integer", 2))

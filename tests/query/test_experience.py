@@ -31,6 +31,8 @@ from tests.databases import Server
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, name_of
 from tests.projections.sql_queries import stored_and_folded
 
+pytestmark = pytest.mark.slow
+
 
 def tried(
     x: float, y: float, *, succeeded: bool, arm: Arms = Arms.LEFT, z: float = -0.9, torso: float | None = 0.3

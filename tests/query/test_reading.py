@@ -103,6 +103,7 @@ async def test_an_episode_is_found_by_number_by_id_or_as_the_last(reading: Readi
     assert (await reading.episode(name)).number == number
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -123,6 +124,7 @@ async def test_the_number_of_an_episode_is_known_by_its_id(reading: Reading) -> 
         await reading.number_of("00000000-0000-7000-8000-000000000009")
 
 
+@pytest.mark.slow
 async def test_a_task_tree_is_told_parents_first_with_depths_and_durations(reading: Reading) -> None:
     tree = await reading.tree(1)
     assert [(each.depth, each.id, each.parent_id, each.dtype, each.status, each.duration_ns) for each in tree] == [

@@ -53,7 +53,7 @@ from tests.projections.event_script import (
 )
 from tests.projections.sql_queries import ask, names
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 CAREFUL = declared(

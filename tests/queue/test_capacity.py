@@ -34,6 +34,7 @@ def test_a_frame_that_does_not_fit_here_needs_a_whole_segment_of_its_own() -> No
     assert not SMALL.admits(801, offset=800, spare=1, episodes=0, reserved=True)
 
 
+@pytest.mark.slow
 @given(st.integers(1, 2000), st.integers(56, 856), st.integers(0, 5), st.integers(0, 10), st.integers(1, 100))
 def test_what_is_admitted_ordinarily_is_admitted_reserved_and_with_more_room(
     frame_bytes: int, offset: int, spare: int, episodes: int, more: int

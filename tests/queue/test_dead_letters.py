@@ -95,6 +95,7 @@ async def test_what_is_put_again_by_the_next_process_is_kept_once(own: Path) -> 
     assert await recover(kept_in(own)) == placed([*some(5, 9), end(10)])
 
 
+@pytest.mark.slow
 async def test_a_put_that_was_cut_anywhere_is_put_again_and_nothing_is_damaged(own: Path, tmp_path: Path) -> None:
     put(own, some(5, 6))
     segment = kept_in(own) / "00000001.segment"

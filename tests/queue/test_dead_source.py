@@ -199,6 +199,7 @@ async def test_a_record_of_another_file_left_on_the_same_blocks_does_not_come_ba
 # --- damaged ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_any_one_bit_flipped_is_damage_where_it_was_safe_and_never_costs_a_synced_record(author: Author) -> None:
     author.put(started())
     author.put(node(), b"ab")

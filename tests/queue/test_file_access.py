@@ -68,6 +68,7 @@ async def test_every_file_has_the_mode_that_was_chosen(
             assert not segment.exists()
 
 
+@pytest.mark.slow
 async def test_an_older_spool_works_on_and_what_is_new_in_it_is_for_its_owner(tmp_path: Path) -> None:
     spool = tmp_path / "memory.db.spool"
     spool.mkdir()

@@ -38,6 +38,7 @@ def btrfs(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     yield disk
 
 
+@pytest.mark.slow
 async def test_a_spool_on_btrfs_is_refused_in_one_line_that_says_where_it_may_lie(btrfs: Path, tmp_path: Path) -> None:
     url = f"sqlite:///{btrfs / 'memory.db'}"
     for spool in (btrfs / "spool", btrfs / "not" / "there"):

@@ -71,6 +71,7 @@ def leave_garbage(queue: RecorderQueue, count: int, *, payload: bytes = b"from a
     assert [[] for _ in range(10)]  # something the collector counts
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("busy_collector")
 async def test_a_plan_that_is_collected_while_a_record_is_written_is_recorded_after_it(tmp_path: Path) -> None:
     hooked = Hooked()
@@ -92,6 +93,7 @@ async def test_a_plan_that_is_collected_while_a_record_is_written_is_recorded_af
     queue.release()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("busy_collector")
 async def test_a_plan_that_is_collected_in_the_sync_thread_does_not_stop_it(tmp_path: Path) -> None:
     hooked = Hooked()
@@ -158,6 +160,7 @@ def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
     assert waits
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rounds", [50, pytest.param(500, marks=pytest.mark.soak)])
 def test_of_many_who_ring_at_once_each_waiter_is_woken_once(rounds: int) -> None:
     bell = Notifier()

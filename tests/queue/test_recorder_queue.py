@@ -393,6 +393,7 @@ def test_a_spool_that_cannot_be_made_is_one_clear_line(tmp_path: Path, deep: boo
 INTERRUPTS = 2_000
 
 
+@pytest.mark.slow
 async def test_an_interrupt_in_the_middle_of_putting_leaves_a_whole_queue(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12), clock=SYSTEM_CLOCK)
     queue.put_nowait(started(), b"{}")

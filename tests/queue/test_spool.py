@@ -30,6 +30,7 @@ def test_a_recorder_lives_until_it_is_let_go(spool: Path) -> None:
     assert dead.path == living.path == queue.folder
 
 
+@pytest.mark.slow
 def test_looking_does_not_keep_a_dead_folder_from_being_opened(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")

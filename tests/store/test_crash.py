@@ -20,6 +20,8 @@ from tests.crash.recorder_process import say
 from tests.databases import ask
 from tests.store.factories import episode, run_of
 
+pytestmark = pytest.mark.slow
+
 PER_BATCH = 300
 
 

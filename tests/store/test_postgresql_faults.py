@@ -30,6 +30,8 @@ from tests.databases import Server, ask, server_in
 from tests.store.factories import declaration, episode, run_of
 from tests.writer.fakes import CountingFold, KeptSource
 
+pytestmark = pytest.mark.slow
+
 SETTINGS = Settings(batch_events_max=250)
 QUICKLY = Backoff(first_s=0.005, longest_s=0.05)
 EVENTS = (

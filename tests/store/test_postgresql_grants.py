@@ -18,6 +18,8 @@ from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.databases import Server, ask, server_in
 from tests.store.factories import episode, run_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def new_server() -> Iterator[Server]:

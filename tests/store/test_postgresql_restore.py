@@ -24,6 +24,8 @@ from tests.databases import Server, ask
 from tests.store.factories import declaration, episode, run_of
 from tests.writer.fakes import CountingFold, KeptSource
 
+pytestmark = pytest.mark.slow
+
 QUICKLY = Backoff(first_s=0.005, longest_s=0.02)
 DROP = "DROP SCHEMA IF EXISTS pycrorm, memory_tables, memory CASCADE"
 

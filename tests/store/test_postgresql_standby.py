@@ -15,6 +15,8 @@ from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask
 from tests.store.factories import declaration, episode, run_of
 
+pytestmark = pytest.mark.slow
+
 _WAITING = "SELECT pid FROM pg_stat_activity WHERE wait_event = 'SyncRep' AND datname = current_database()"
 _PROBE = "SELECT pg_logical_emit_message(true, 'test', '')"
 

@@ -168,6 +168,7 @@ async def test_reading_does_not_bring_an_older_log_up_to_date(address: DatabaseA
     await engine.dispose()
 
 
+@pytest.mark.slow
 def test_many_processes_that_open_a_new_log_at_once_agree_on_one(tmp_path: Path) -> None:
     script = """
 import asyncio, sys
@@ -209,6 +210,7 @@ async def test_whoever_opens_a_new_log_waits_for_another_who_does(address: Datab
     assert ask(address.path, "PRAGMA journal_mode") == [("wal",)]
 
 
+@pytest.mark.slow
 async def test_logs_that_four_open_at_once_are_there_for_all_of_them(tmp_path: Path) -> None:
     for number in range(100):
         address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/{number}.db")

@@ -14,6 +14,8 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from tests.databases import Server, ask
 
+pytestmark = pytest.mark.slow
+
 MADE = """
     SELECT count(*) FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
     WHERE nspname IN ('pycrorm', 'memory_tables', 'memory') AND relkind IN ('r', 'i', 'v')

@@ -5,11 +5,15 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
+import pytest
+
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask
 from tests.replicas import STANDBY, replicas_in
+
+pytestmark = pytest.mark.slow
 
 
 async def stored_on(url: str) -> StoredOn:

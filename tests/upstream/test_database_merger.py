@@ -20,6 +20,8 @@ from tests.promises.lab import url_of
 from tests.table_comparison import Tables, differences, logs_of, tables_of, united
 from tests.upstream.conftest import common_plan
 
+pytestmark = pytest.mark.slow
+
 RUNS = 3
 
 

@@ -16,6 +16,8 @@ from tests.plan.conftest import Scene, kitchen
 from tests.promises.lab import statuses, url_of
 from tests.upstream.conftest import Remembered
 
+pytestmark = pytest.mark.slow
+
 
 async def test_retry_with_success(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():

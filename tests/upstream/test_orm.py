@@ -60,6 +60,8 @@ from tests.plan.conftest import kitchen
 from tests.promises.lab import at, url_of
 from tests.upstream.conftest import DESCRIPTION, Remembered, common_plan
 
+pytestmark = pytest.mark.slow
+
 
 async def test_schema_creation(tmp_path: Path) -> None:
     """All tables are there before anything was performed, under their lower-case names."""

@@ -19,6 +19,8 @@ from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.robots.kinematics import Unreachable, solve_from
 from pycrorm_async.world.robots.robot_description import PR2
 
+pytestmark = pytest.mark.slow
+
 ROLLOUTS = 400
 RESTARTS = 60
 MILK = Pose((1.3, 1.0, 0.9))

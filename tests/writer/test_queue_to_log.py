@@ -98,6 +98,7 @@ async def put_when_there_is_room(queue: RecorderQueue, heading: Heading, content
                 await queue.room()
 
 
+@pytest.mark.slow
 async def test_a_refused_episode_is_set_aside_and_the_others_are_never_out_of_room(
     tmp_path: Path, address: DatabaseAddress
 ) -> None:

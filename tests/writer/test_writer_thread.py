@@ -55,6 +55,7 @@ async def test_what_was_put_before_a_flush_is_stored_and_folded_after_it(address
     assert writers_alive() == []
 
 
+@pytest.mark.slow
 async def test_events_are_stored_beside_a_plan_that_never_suspends(address: DatabaseAddress) -> None:
     source = KeptSource()
     writer = writer_for(source, address)
@@ -217,6 +218,7 @@ async def test_damage_is_told_once_and_raised_at_every_flush_and_at_close_while_
     ]
 
 
+@pytest.mark.slow
 async def test_a_flush_that_takes_too_long_says_why_and_loses_nothing(address: DatabaseAddress) -> None:
     source = KeptSource()
     settings = Settings(idle_ms=10**9, flush_timeout_s=1.0)
@@ -261,6 +263,7 @@ async def test_a_log_that_cannot_say_what_is_stopped_is_told_at_once_at_flush_an
     assert writers_alive() == []
 
 
+@pytest.mark.slow
 async def test_flushes_that_meet_the_closing_end_with_it(address: DatabaseAddress) -> None:
     for _ in range(15):
         source = KeptSource(run_of(episode(1), 1, 5))
