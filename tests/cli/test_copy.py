@@ -124,7 +124,7 @@ async def test_an_episode_that_cannot_be_shown_is_copied_and_told(folder: Path) 
     done = pycrorm("copy", "--from", "sqlite:///c.db", "--to", "sqlite:///b.db", cwd=folder)
     assert done.returncode == 1
     name = "00000000-0000-0000-0000-000000000009"
-    reason = "event 1: HandShaken is not an event this version reads"
+    reason = "event 1: HandShaken is not an event this version knows"
     assert one_line_of(done) == f"pycrorm: episode {name} is stopped: {reason}"
     assert len(logs_of(f"sqlite:///{folder}/b.db")[name]) == 1
 

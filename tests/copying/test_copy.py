@@ -354,7 +354,7 @@ async def test_what_a_newer_version_recorded_is_copied_as_it_is(new_url: New, ne
     await append(source, script.records)
     (done,) = (await copy_episodes(source, target)).episodes
     assert done.damage is None
-    assert done.stopped == "event 1: HandShaken is not an event this version reads"
+    assert done.stopped == "event 1: HandShaken is not an event this version knows"
     assert logs_of(target) == logs_of(source)
 
 

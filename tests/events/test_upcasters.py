@@ -72,7 +72,7 @@ def test_one_of_the_present_version_takes_no_step(version: int | None) -> None:
 
 @pytest.mark.parametrize("version", [4, 0, -1])
 def test_a_version_that_is_not_known_is_told_with_the_one_that_is(version: int) -> None:
-    with pytest.raises(UnknownShape, match=rf"^ObjectAdded has version {version}, this version reads 3$"):
+    with pytest.raises(UnknownShape, match=rf"^ObjectAdded has version {version}, this version knows 3$"):
         LATER.decode("ObjectAdded", MILK, version)
 
 
@@ -130,7 +130,7 @@ def test_a_declaration_of_a_newer_version_is_refused_by_its_own_name_and_no_othe
     assert list(united.accepted) == [fingerprint(SAYING)]
     assert united.refused == {
         fingerprint(newer): "this version cannot read the declaration of its type:"
-        " DesignatorTypeDeclared has version 2, this version reads 1"
+        " DesignatorTypeDeclared has version 2, this version knows 1"
     }
 
 

@@ -140,8 +140,8 @@ async def test_nothing_behind_is_nothing_to_do(log: EventLog) -> None:
     [
         ("undeclared", "event 3: the designator type 00000000000000000000000000000000 was never declared"),
         ("undecodable", "event 3: NodeEnded cannot be decoded: JSON is malformed: invalid character (byte 0)"),
-        ("unknown", "event 3: RobotDanced is not an event this version reads"),
-        ("newer", "event 3: NodeEnded has version 2, this version reads 1"),
+        ("unknown", "event 3: RobotDanced is not an event this version knows"),
+        ("newer", "event 3: NodeEnded has version 2, this version knows 1"),
         (
             "contradicting",
             (

@@ -419,9 +419,9 @@ async def test_what_is_no_moment_is_refused(reading: Reading, when: dict[str, An
             b"{}",
             2,
             DatabaseForeign,
-            "event 16: NodeEnded has version 2, this version reads 1: use a newer",
+            "event 16: NodeEnded has version 2, this version knows 1: use a newer",
         ),
-        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event this version reads: use a newer"),
+        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event this version knows: use a newer"),
     ],
 )
 async def test_what_came_before_an_event_that_cannot_be_understood_is_told(
