@@ -15,21 +15,16 @@ import logging
 import os
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import (
-    AbstractAsyncContextManager,
     AbstractContextManager,
     AsyncExitStack,
     asynccontextmanager,
     suppress,
 )
 from dataclasses import replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
-
-from sqlalchemy import Select
-from sqlalchemy.ext.asyncio import AsyncSession
+from typing import Self
 
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
@@ -38,8 +33,10 @@ from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, Table
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
+from pycrorm_async.hooks.event_feed import BUFFER_EVENTS, EventStream, Observation, RecordedEvent
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.memory_parts import Parts
+from pycrorm_async.memory_reading import ReadableMemory
 from pycrorm_async.memory_status import MemoryStatus
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
@@ -47,10 +44,8 @@ from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.projections.custom.discovery import checked
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.schema.user_views import UserView
-from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
@@ -60,15 +55,12 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.delegated_writer import DelegatedWriter
 from pycrorm_async.writer.writer_thread import WriterThread
 
-if TYPE_CHECKING:
-    from pandas import DataFrame
-
 __all__ = ["Memory", "MemoryStatus"]
 
 _log = logging.getLogger("pycrorm_async")
 
 
-class Memory:
+class Memory(ReadableMemory):
     """The memory of one process in one database. Use `Memory.open` as an async context manager.
 
     While it is open, it records every plan performed in its context: in the open episode, or in one of the plan's own.
@@ -231,6 +223,7 @@ class Memory:
             recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
         self._parts.emitter.is_closed = self._parts.experience.is_closed = True
         recorder.close()
+        await self._parts.emitter.feed.close()
         await self._stack.__aexit__(kind, error, traceback)
 
     async def _drain(
@@ -334,6 +327,24 @@ class Memory:
         if parts.reading.is_open:
             await parts.reading.refresh()
 
+    # --- observing --------------------------------------------------------------------------------------------
+
+    def observe(self, callback: Callable[[RecordedEvent], object], *, buffer: int = BUFFER_EVENTS) -> Observation:
+        """Call `callback` with each event from now on, in a thread of its own, until closed or the memory is closed.
+
+        Use the result as a context manager, or call its `close()`. The plan never waits: an event that finds more than
+        `buffer` others waiting is left out, and `left_out` counts it. Exceptions of the callback are counted in
+        `failed`, and the first is logged.
+        """
+        return self._open_parts.emitter.feed.observe(callback, buffer=buffer)
+
+    def events(self, *, buffer: int = BUFFER_EVENTS) -> EventStream:
+        """Return each event from now on as an asynchronous iterator in this loop, which ends when the memory is closed.
+
+        A plan that never suspends lets no other task of its loop run: observe it from a thread, or after the plan.
+        """
+        return self._open_parts.emitter.feed.stream(buffer=buffer)
+
     @property
     def status(self) -> MemoryStatus:
         """The present state of the memory."""
@@ -353,47 +364,3 @@ class Memory:
     def is_open(self) -> bool:
         """Whether the memory is open."""
         return self._parts is not None
-
-    # --- reading ----------------------------------------------------------------------------------------------
-
-    @property
-    def reading(self) -> Reading:
-        """The reading side of this memory: named queries, sessions, data frames."""
-        return self._open_parts.reading
-
-    def session(self, *, simulated: bool = False) -> AbstractAsyncContextManager[AsyncSession]:
-        """Return an ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager.
-
-        With `simulated` it also sees simulations (`SimulatedTaskTree`).
-        """
-        return self._open_parts.reading.session(simulated=simulated)
-
-    async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> DataFrame:
-        """Return the rows as a pandas DataFrame (extra `learning`); with `simulated`, those of simulations too."""
-        return await self._open_parts.reading.dataframe(statement, simulated=simulated)
-
-    def mapped(self, designator: str | type) -> Any:
-        """Return the mapped class of a designator type, by its dtype or its class, after one of it was flushed.
-
-        With a daemon it needs an earlier query, because until then this memory has no connection.
-        """
-        reading = self._open_parts.reading
-        if not reading.is_open:
-            raise CallerError("this memory has not read its types yet: open a session first")
-        return reading.mapped(designator)
-
-    async def as_of(
-        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
-    ) -> Moment:
-        """Return the task tree and the world at any moment of an episode, up to the last flush; see `Reading.as_of`."""
-        return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence)
-
-    async def number_of(self, episode: Episode) -> int:
-        """Return the number that this database gave to the episode, after `flush`."""
-        return await self._open_parts.reading.number_of(str(episode))
-
-    @property
-    def _open_parts(self) -> Parts:
-        if self._parts is None:
-            raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
-        return self._parts

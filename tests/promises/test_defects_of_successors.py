@@ -9,7 +9,6 @@ import ast
 import asyncio
 import sys
 import tomllib
-from collections.abc import Awaitable
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +18,8 @@ import pytest
 from sqlalchemy import select
 
 import pycrorm_async
+from pycrorm_async.events.types import NodeEnded, NodeStarted
+from pycrorm_async.hooks.event_feed import RecordedEvent
 from pycrorm_async.orm import Attachment, Designator, JointChange, NavigateAction, PickUpAction, PlaceAction
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.plan import (
@@ -33,8 +34,6 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan import MoveTorsoAction as MoveTorso
 from pycrorm_async.plan import NavigateAction as Navigate
-from pycrorm_async.plan.execution.observer import PlanObserver, recorder
-from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, Pose
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import joints_of_bullet, numbers
@@ -106,44 +105,29 @@ async def test_the_state_after_an_action_is_not_the_state_before_it(tmp_path: Pa
     assert at(before.pose) != at(after.pose)
 
 
-class Listener:
-    """Stands before the memory, and hears what it is told."""
-
-    def __init__(self, behind: PlanObserver) -> None:
-        self.behind = behind
-        self.heard: list[str] = []
-
-    def admit(self) -> Awaitable[None] | None:
-        return self.behind.admit()
-
-    def node_started(self, node: Node) -> None:
-        self.heard.append(f"{type(node.designator).dtype if node.designator else None} {node.status.name}")
-        self.behind.node_started(node)
-
-    def node_ended(self, node: Node) -> None:
-        self.heard.append(f"{type(node.designator).dtype if node.designator else None} {node.status.name}")
-        self.behind.node_ended(node)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.behind, name)
-
-
 async def test_whoever_listens_to_a_plan_is_told_of_every_start_and_end(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
-        behind = recorder.get()
-        assert behind is not None
-        listener = Listener(behind)
-        token = recorder.set(listener)
-        with lab():
+    seen: list[RecordedEvent] = []
+    async with remembered(tmp_path) as memory:
+        with memory.observe(seen.append), lab():
             await (Navigate([Pose([1, 0, 0])]) - NoteActionPerformable("not needed")).perform()
-        recorder.reset(token)
-    assert listener.heard == [
+            with pytest.raises(PlanFailure):
+                await FailingActionPerformable(PlanFailure("no")).perform()
+    dtypes = {(each.episode, each.sequence): each.dtype for each in seen if isinstance(each.happening, NodeStarted)}
+    assert [  # the root began before
+        f"{each.dtype} RUNNING"
+        if isinstance(each.happening, NodeStarted)
+        else f"{dtypes[each.episode, each.happening.node]} {each.happening.status}"
+        for each in seen
+        if isinstance(each.happening, NodeStarted | NodeEnded)
+    ] == [
         "TryInOrder RUNNING",
         "NavigateAction RUNNING",
         "MoveMotion RUNNING",
         "MoveMotion SUCCEEDED",
         "NavigateAction SUCCEEDED",
         "TryInOrder SUCCEEDED",
+        "FailingAction RUNNING",
+        "FailingAction FAILED",
     ]
 
 
