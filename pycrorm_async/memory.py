@@ -41,7 +41,7 @@ from pycrorm_async.memory_status import MemoryStatus
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
 from pycrorm_async.plan.execution.unawaited_performs import called_performs
-from pycrorm_async.projections.custom.discovery import checked
+from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.query.experience import PickUpExperience
@@ -132,7 +132,7 @@ class Memory(ReadableMemory):
             address,
             spool=Path(spool) if spool is not None else None,
             views=views,
-            projections=checked(projections),
+            projections=validate_projections(projections),
             settings=settings,
             clock=clock,
         )
@@ -362,5 +362,5 @@ class Memory(ReadableMemory):
 
     @property
     def is_open(self) -> bool:
-        """Whether the memory is open."""
+        """True while the memory is open."""
         return self._parts is not None

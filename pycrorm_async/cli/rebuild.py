@@ -15,7 +15,7 @@ from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import watched
-from pycrorm_async.projections.custom.discovery import installed_besides, named
+from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
 from pycrorm_async.projections.custom.projection import Projection
 
 __all__ = ["rebuild"]
@@ -50,8 +50,8 @@ def rebuild(
     contain at least as many events. Run it again to continue an interrupted rebuild. It needs no code of a plan, only
     that of the projections; a projection whose code is not available is skipped.
     """
-    given_projections = named(projection or ())
-    projections = {each.name: each for each in (*given_projections, *installed_besides(given_projections))}
+    given_projections = load_projections(projection or ())
+    projections = {each.name: each for each in (*given_projections, *installed_projections(given_projections))}
     collect_seldom()
     chosen = asyncio.run(_choose(url, names or [], projections))
     summaries = {name: asyncio.run(_rebuild(url, workers, projections.get(name))) for name in chosen}

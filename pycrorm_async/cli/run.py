@@ -29,7 +29,7 @@ from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
 from pycrorm_async.errors import EpisodeParked
 from pycrorm_async.hooks.values.texts import message_of
 from pycrorm_async.memory import Memory
-from pycrorm_async.projections.custom.discovery import named
+from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.settings import Settings
 
@@ -69,7 +69,7 @@ def run(
     """
     loaded = load_plan(plan)
     settings = Settings(writer=writer, file_access=file_access)
-    memory = Memory.open(url, spool=spool, settings=settings, projections=named(projection or ()))
+    memory = Memory.open(url, spool=spool, settings=settings, projections=load_projections(projection or ()))
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         try:

@@ -24,7 +24,7 @@ from pycrorm_async.cli.writer import store_once
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import recovery
 from pycrorm_async.operations.recovery import Rebinding
-from pycrorm_async.projections.custom.discovery import named
+from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.queue.files.names import REFUSED
 from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.maintenance.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
@@ -113,7 +113,7 @@ def rebind(
     Exit code 3 while a process records into the spool or drains it. Other exit codes are those of `pycrorm writer
     --once`.
     """
-    projections, settings = named(projection or ()), Settings(file_access=file_access)
+    projections, settings = load_projections(projection or ()), Settings(file_access=file_access)
     done = asyncio.run(recovery.rebind(url, spool=spool, settings=settings, say=_print_rebinding))
     extra = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
     return store_once(url, spool, projections, settings, as_json=as_json, extra=extra)

@@ -17,7 +17,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
-from pycrorm_async.projections.custom.discovery import installed_besides
+from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
 from pycrorm_async.projections.schema.unmade_types import unmade_types
 from pycrorm_async.queue.files.drain_status import Progress
@@ -269,7 +269,7 @@ async def _query(
             episode_states.append(
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
             )
-        projections = await states(log, installed_besides(()))
+        projections = await states(log, installed_projections(()))
         return episode_states, projections, await log.limits_near(), await unmade_types(log), await durability(log)
     finally:
         await log.close()

@@ -14,9 +14,9 @@ from pycrorm_async.cli.output import note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import watched
-from pycrorm_async.projections.custom.discovery import installed_besides, named
+from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.verify.verify import Verified
+from pycrorm_async.projections.verify.verify import VerifyResult
 from pycrorm_async.projections.verify.verify import verify as verify_log
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
@@ -42,8 +42,8 @@ def verify(
     the log or are of an older version (`pycrorm rebuild` replaces them), if an episode is parked or refused, or if a
     designator type has no tables; 4 if the log is damaged.
     """
-    given_projections = named(projection or ())
-    projections = [*given_projections, *installed_besides(given_projections)]
+    given_projections = load_projections(projection or ())
+    projections = [*given_projections, *installed_projections(given_projections)]
     collect_seldom()
     result, ids = asyncio.run(_verify(url, episode, projections))
     note_pending_events(url, spool)
@@ -58,7 +58,9 @@ def verify(
     return 1 if result.drift or result.stopped or result.unmade or result.outdated else 0
 
 
-async def _verify(url: str, episode: str | None, projections: Sequence[Projection]) -> tuple[Verified, dict[int, str]]:
+async def _verify(
+    url: str, episode: str | None, projections: Sequence[Projection]
+) -> tuple[VerifyResult, dict[int, str]]:
     log = await EventLog.open(shared_address(url), create=False)
     try:
         only = None if episode is None else await episode_named(log, episode)
@@ -69,7 +71,7 @@ async def _verify(url: str, episode: str | None, projections: Sequence[Projectio
         await log.close()
 
 
-def _print(result: Verified) -> None:
+def _print(result: VerifyResult) -> None:
     for damage in result.damages[:_FINDINGS_MAX]:
         stdout.print(f"damage: {damage}", markup=False)
     for each in result.differences[:_FINDINGS_MAX]:
@@ -104,7 +106,7 @@ def _print(result: Verified) -> None:
         stdout.print(f"{checked}no problem")
 
 
-def _document(result: Verified, ids: dict[int, str]) -> dict[str, Any]:
+def _document(result: VerifyResult, ids: dict[int, str]) -> dict[str, Any]:
     def id_of(number: int | None) -> str | None:
         return None if number is None else ids.get(number)
 

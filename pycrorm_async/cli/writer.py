@@ -29,7 +29,7 @@ from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.fold_process import FoldProcess, forked
 from pycrorm_async.operations.fold_workers import WORKERS
 from pycrorm_async.operations.recovery import RecoveryReport, recover
-from pycrorm_async.projections.custom.discovery import named
+from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.daemon import LEAVE_S, DaemonSummary
@@ -60,7 +60,7 @@ def writer(
     episode, now or earlier, or they do not fit the tables; 3 if a recorder's folder cannot be read or written; 4 if
     files are damaged. Refused events are kept in the spool, in the folder that the message names.
     """
-    projections, settings = named(projection or ()), Settings(file_access=file_access)
+    projections, settings = load_projections(projection or ()), Settings(file_access=file_access)
     collect_seldom()
     if once:
         return store_once(url, spool, projections, settings, as_json=as_json)

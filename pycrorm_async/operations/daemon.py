@@ -10,7 +10,7 @@ deleted once everything in it is stored. A folder that cannot be claimed is repo
 A recorder may die at any moment; its folder is then claimed again as that of a dead one, and records that were stored
 already are stored only once. A daemon may be killed at any moment: the kernel frees its locks, and nothing is removed
 from a folder before the database has confirmed it. If the SQLite file is replaced while the daemon has it open, the
-daemon stops, because it would go on writing to the old file, which no longer has a name.
+daemon stops, because it would keep writing to the old file, which no longer has a name.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pycrorm_async.operations.destination import open_destination, shared_addres
 from pycrorm_async.operations.fold_process import FoldProcess
 from pycrorm_async.operations.fold_worker import Assignment
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldWorkerState, FoldWorkerTables
-from pycrorm_async.projections.custom.discovery import checked
+from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.recorder_folder import folder_error
@@ -77,7 +77,7 @@ async def serve(
     note = _Note(lock, say)
     async with AsyncExitStack() as stack:
         stack.callback(lock.release)
-        projections = checked(projections)
+        projections = validate_projections(projections)
         destination = await stack.enter_async_context(
             open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections, settings=settings)
         )

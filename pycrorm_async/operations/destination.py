@@ -13,7 +13,7 @@ from pycrorm_async.errors import CallerError, DatabaseError, TablesForeign
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.operations.healed_log import HealedLog
-from pycrorm_async.projections.custom.discovery import installed_besides
+from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.user_views import UserView
@@ -137,13 +137,13 @@ async def open_destination(
     log = await EventLog.open(address, create=True, clock=clock, file_access=spool.access, belongs_to=expected)
     if address.is_sqlite:
         log.advice = (
-            "put it back, or end this process and store what it recorded in a new database with:"
+            "put it back, or end this process and store its events in a new database with:"
             f" pycrorm spool rebind --url {quote(address.to_type)} --spool {quote(str(spool.path))}"
         )
     watching = asyncio.create_task(_watch_file(log), name="pycrorm watch file")
     try:
         spool.bind(log.log_id)
-        projector = Projector(log, views=views, projections=projections, installed=installed_besides(projections))
+        projector = Projector(log, views=views, projections=projections, installed=installed_projections(projections))
         healed = HealedLog(log, spool.path, settings, clock=clock) if settings is not None else None
         destination = LogAndTables(log, projector, healed)
         await destination.open_tables()

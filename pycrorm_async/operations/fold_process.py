@@ -146,7 +146,7 @@ class FoldProcess(NamedTuple):
         self.connection.close()
 
     def is_stopped(self) -> bool:
-        """Whether the process is stopped, by a signal or by a debugger."""
+        """Return whether the process is stopped, by a signal or by a debugger."""
         try:
             status = Path(f"/proc/{self.process.pid}/stat").read_text(encoding="utf-8", errors="replace")
         except OSError:  # it has ended

@@ -24,10 +24,10 @@ from typing import Final, NamedTuple, TypeAlias
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
-from pycrorm_async.projections.custom.discovery import installed_besides
+from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.run.batch_fold import Prepared
+from pycrorm_async.projections.run.batch_fold import PreparedBatch
 from pycrorm_async.projections.run.pipeline import Outlook
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -107,7 +107,7 @@ class _RequestHandler:
         self._assignment = assignment
         self._log: EventLog | None = None
         self._projector: Projector | None = None
-        self._batch: Prepared | None = None
+        self._batch: PreparedBatch | None = None
 
     async def answer(self, request: Request) -> Answer:
         try:
@@ -137,7 +137,7 @@ class _RequestHandler:
             self._log = await self._open_same_log()
         if self._projector is None:
             projections = self._assignment.projections
-            projector = Projector(self._log, projections=projections, installed=installed_besides(projections))
+            projector = Projector(self._log, projections=projections, installed=installed_projections(projections))
             await projector.open()
             self._projector = projector
         return self._projector

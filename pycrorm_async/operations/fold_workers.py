@@ -314,7 +314,7 @@ class FoldWorkers:
 
     @property
     def are_wanted(self) -> bool:
-        """Whether every worker is started or will be."""
+        """True if every worker is started or will be."""
         return all(each.wanted.is_set() for each in self._workers)
 
     def want(self, events: int) -> None:

@@ -18,8 +18,9 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, clear, recorded
-from pycrorm_async.projections.schema.generations import all_noted, projections_in
+from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, recorded
+from pycrorm_async.projections.replaced_tables import clear
+from pycrorm_async.projections.schema.generations import projections_in, read_generations
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -101,7 +102,7 @@ async def projections_of(url: str) -> list[str]:
     log = await EventLog.open(shared_address(url), create=False)
     try:
         async with log.reading() as connection:
-            return [*projections_in(await all_noted(connection))]
+            return [*projections_in(await read_generations(connection))]
     finally:
         await log.close()
 

@@ -1,4 +1,4 @@
-"""`pycrorm writer --once`: store what the recorders of a spool left, and bind a spool to another database.
+"""`pycrorm writer --once`: store the events that recorders left in a spool, and bind a spool to another database.
 
 The folders of dead recorders are drained into the log, folded and deleted. Those of living recorders that no daemon
 drains are drained as far as they are synced, and stay.
@@ -18,7 +18,7 @@ from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.operations.destination import open_destination, shared_address
-from pycrorm_async.projections.custom.discovery import checked
+from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.files.spool import Spool
@@ -117,7 +117,7 @@ async def recover(
     settings = settings or Settings()
     place = Spool(spool or address.default_spool, settings.file_access)
     async with open_destination(
-        address, place, clock=SYSTEM_CLOCK, projections=checked(projections), settings=settings
+        address, place, clock=SYSTEM_CLOCK, projections=validate_projections(projections), settings=settings
     ) as destination:
         with ExitStack() as stack:
             living = list(_living_queues(place, failures, stack))

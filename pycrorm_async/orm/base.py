@@ -13,7 +13,7 @@ from sqlalchemy import BigInteger, Boolean, Double, ForeignKey, Text, inspect
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship
 
-from pycrorm_async.orm.types import Moment, Named
+from pycrorm_async.orm.types import EnumName, Moment
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
 
@@ -29,11 +29,11 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
         str: Text(),
         bool: Boolean(),
         datetime: Moment(),
-        Arms: Named(Arms),
-        Grasp: Named(Grasp),
-        GripperState: Named(GripperState),
-        ObjectType: Named(ObjectType),
-        TaskStatus: Named(TaskStatus),
+        Arms: EnumName(Arms),
+        Grasp: EnumName(Grasp),
+        GripperState: EnumName(GripperState),
+        ObjectType: EnumName(ObjectType),
+        TaskStatus: EnumName(TaskStatus),
     }
 
     def __repr__(self) -> str:

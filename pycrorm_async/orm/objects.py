@@ -20,8 +20,7 @@ from pycrorm_async.world.enums import ObjectType
 __all__ = ["Object", "ObjectPart", "BelieveObject", "LocatedObject", "ObjectRemoval", "Attachment", "JointChange"]
 
 _STEPS_MAX = 6
-"""Bounds the relationships between a query's class and an `ObjectPart` whose `part_of` is loaded; no class needs more.
-"""
+"""Bounds the relationships between a query's class and an `ObjectPart` with a loaded `part_of`; no class needs more."""
 
 
 class Object(Base):

@@ -22,7 +22,7 @@ from sqlalchemy.types import TypeDecorator
 
 from pycrorm_async.events.fields import table_name
 
-__all__ = ["Moment", "Named", "JsonText", "ClassOfRow", "KnownClasses", "known_classes"]
+__all__ = ["Moment", "EnumName", "JsonText", "ClassOfRow", "KnownClasses", "known_classes"]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECOND = timedelta(microseconds=1)
@@ -45,7 +45,7 @@ class Moment(TypeDecorator[datetime]):
         return None if value is None else _EPOCH + timedelta(microseconds=value)
 
 
-class Named(TypeDecorator[Any]):
+class EnumName(TypeDecorator[Any]):
     """A member of `enum`, stored by name. Compares with members and with names."""
 
     impl = String

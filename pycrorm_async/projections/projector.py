@@ -15,7 +15,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.custom.projection_tables import CustomTables
-from pycrorm_async.projections.run.batch_fold import Folding, Prepared
+from pycrorm_async.projections.run.batch_fold import BatchFold, PreparedBatch
 from pycrorm_async.projections.run.parked_release import release_parked
 from pycrorm_async.projections.schema.generations import (
     Generation,
@@ -64,7 +64,7 @@ class Projector:
         self._batch_events = batch_events
         self._custom = CustomTables(log, projections, installed, batch_events=batch_events)
         self._has_news = True
-        self._folding: Folding | None = None
+        self._folding: BatchFold | None = None
         self._last_number = 0
 
     async def open(self) -> None:
@@ -86,7 +86,7 @@ class Projector:
                 if current is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
                 generation = await release_parked(connection, _LiveTarget(), generation)
-            self._folding = Folding(self._log, _LiveTarget(), generation)
+            self._folding = BatchFold(self._log, _LiveTarget(), generation)
             await self._sweep()
 
     async def catch_up(self) -> int:
@@ -120,13 +120,13 @@ class Projector:
         with self._log.translated():
             return await self._refresh() or await self._custom.fold_next_batch(now=now)
 
-    async def prepare(self, spans: Sequence[Span]) -> Prepared:
+    async def prepare(self, spans: Sequence[Span]) -> PreparedBatch:
         """Read and fold the events of these spans, and write nothing. Raises `DatabaseUnavailable`."""
         assert self._folding is not None, "opened before anything is folded"
         with self._log.translated():
             return await self._folding.prepare(spans, await self._log.spans(spans))
 
-    async def write(self, batch: Prepared) -> int:
+    async def write(self, batch: PreparedBatch) -> int:
         """Write a prepared batch; return the number of its events written, 0 if the tables changed since `prepare`."""
         assert self._folding is not None, "opened before anything is folded"
         before = self._folding.generation.revision

@@ -19,13 +19,12 @@ rolls back and folds outside the transaction again, so that others wait for a sh
 fewer events after the switch than before. The new revision is above both old ones: a batch folded for the old tables
 fails its check and is folded again (`generations`).
 
-Queries that began before the switch may still read the replaced tables. The switch never drops them: `clear` waits up
-to `sum(_DROP_PAUSES_S)` seconds for such queries, and reports tables that are still in use.
+Queries that began before the switch may still read the replaced tables. The switch never drops them: `clear` in
+`replaced_tables` waits some seconds for such queries, and reports tables that are still in use.
 """
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -36,7 +35,13 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, layout_of, make_own, refuse_taken
+from pycrorm_async.projections.custom.projection_tables import (
+    CustomFoldDefinition,
+    layout_of,
+    make_projection_tables,
+    refuse_taken,
+)
+from pycrorm_async.projections.replaced_tables import REPLACED, readable_generations
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import TABLES
 from pycrorm_async.projections.run.catch_up import WHOLE, CatchUp, Share, SideTarget
@@ -46,44 +51,36 @@ from pycrorm_async.projections.schema.generations import (
     PROJECTION_VERSION,
     SHOWN,
     Generation,
-    all_noted,
     current_generation,
-    forget,
+    delete_generation,
     grow_tables,
     make_empty,
     make_generation,
-    note,
-    noted,
     projections_in,
+    read_generation,
     show,
+    write_generation,
 )
 from pycrorm_async.projections.schema.growth import grow
 from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
-from pycrorm_async.projections.schema.materialised_views import kept_tables, refresh_some
+from pycrorm_async.projections.schema.materialised_views import refresh_some
 from pycrorm_async.projections.schema.public_views import public_views
 from pycrorm_async.projections.schema.session_views import with_views
-from pycrorm_async.projections.schema.tables import CORE, physical_name
 from pycrorm_async.projections.schema.user_views import UserView, view_text, with_user_views
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
-__all__ = ["Rebuild", "Share", "claimed", "clear", "recorded"]
+__all__ = ["Rebuild", "Share", "claimed", "recorded"]
 
-_MAKING, _GONE = "/making", "/gone/"
+_MAKING = "/making"
 _BATCH_EVENTS = 8_000
 """Bounds the events of one transaction: on SQLite such a batch holds the write lock for some 50 ms."""
-_SLICE_ROWS = 10_000
-"""Bounds the rows of a replaced table that one transaction deletes."""
-_PAUSE_S = 0.02
-"""The pause between two slices. SQLite connections poll for the write lock and would never find it free otherwise."""
 _LATE_EVENTS_MAX = 2_000
 """Bounds the events folded inside the switch, during which all other writers wait."""
 _SHOW_ATTEMPTS = 50
 """Bounds the attempts to switch while other processes record faster than this one folds."""
-_DROP_PAUSES_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
-"""The pauses before the attempts to drop a table, in which queries that began before the switch end."""
 _RECORDED = text("SELECT count(*), coalesce(sum(head), 0) FROM episode")
 
 
@@ -148,12 +145,12 @@ class Rebuild:
             payloads = await log.declarations()
             async with log.engine.begin() as connection:
                 await dialect_of(connection).lock_log_changes(connection)
-                generations = await _generations(log, connection)
+                generations = await readable_generations(log, connection)
                 shown = generations.get(SHOWN)
                 # The switch checks this too; checking here reports a conflict before hours of work.
                 await dialect_of(connection).only_views(connection, shown.views if shown else ())
                 if projection is not None:
-                    return cls(log, await _begin_own(connection, generations, projection), projection=projection)
+                    return cls(log, await _begin_projection(connection, generations, projection), projection=projection)
                 making = await _resumable(
                     connection, generations, SHOWN, lambda each: each.version == PROJECTION_VERSION
                 )
@@ -162,7 +159,7 @@ class Rebuild:
                     making = await make_generation(connection, 1 + max(numbers, default=0))
                     await make_empty(connection, {checkpoints.TABLE: checkpoints.COLUMNS}, making.number)
                 making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
-                await note(connection, MAKING, making)
+                await write_generation(connection, MAKING, making)
             target = SideTarget(MAKING, None, making.version, number=making.number)
             while (grown := await _grow_slice(log, target, payloads)).layout != making.layout:
                 making = grown
@@ -174,14 +171,14 @@ class Rebuild:
                     layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
                 layout = with_user_views(layout, views, connection.dialect)
                 making = await grow_tables(connection, making, layout)
-                await note(connection, MAKING, making)
+                await write_generation(connection, MAKING, making)
         return cls(log, making)
 
     @classmethod
     async def join(cls, log: EventLog, share: Share) -> Self:
         """Join the rebuild of the built-in tables that another process has begun, to fold a share of it."""
         async with log.reading() as connection:
-            making = await noted(connection, MAKING)
+            making = await read_generation(connection, MAKING)
         if making is None:
             raise InternalError(f"{log.address}: no rebuild is running that this worker could join")
         return cls(log, making, share=share)
@@ -242,7 +239,7 @@ class Rebuild:
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).lock_log_changes(connection)
             # Every fold shares this row's lock while it writes, so no fold writes to the old tables from here on.
-            old = await noted(connection, self._key, hold="change")
+            old = await read_generation(connection, self._key, hold="change")
             new = await self._making.generation(connection, "change")
             seen = checkpoints.SEEN
             if self._projection is not None:
@@ -259,8 +256,8 @@ class Rebuild:
                     return False
                 new = await self._making.generation(connection, "change")
             if old is not None:
-                await note(connection, f"{self._key}{_GONE}{old.number}", old)
-            await forget(connection, f"{self._key}{_MAKING}")
+                await write_generation(connection, f"{self._key}{REPLACED}{old.number}", old)
+            await delete_generation(connection, f"{self._key}{_MAKING}")
             if self._projection is None:
                 await self._show_tables(connection, old, new)
             else:
@@ -285,7 +282,7 @@ class Rebuild:
 
     async def _show_projection(self, connection: AsyncConnection, old: Generation | None, new: Generation) -> None:
         revision = 1 + max(new.revision, old.revision if old is not None else 0)
-        await note(connection, self._key, replace(new, revision=revision))
+        await write_generation(connection, self._key, replace(new, revision=revision))
         tables = await current_generation(connection, hold="change")
         assert tables is not None, "`begin` checked that there are tables"
         await show(connection, replace(tables, revision=tables.revision + 1))
@@ -305,12 +302,12 @@ async def _resumable(
     making = generations.get(f"{key}{_MAKING}")
     if making is None or usable(making):
         return making
-    await forget(connection, f"{key}{_MAKING}")
-    await note(connection, f"{key}{_GONE}{making.number}", making)
+    await delete_generation(connection, f"{key}{_MAKING}")
+    await write_generation(connection, f"{key}{REPLACED}{making.number}", making)
     return None
 
 
-async def _begin_own(
+async def _begin_projection(
     connection: AsyncConnection, generations: Mapping[str, Generation], projection: Projection
 ) -> Generation:
     tables = await current_generation(connection)
@@ -322,79 +319,4 @@ async def _begin_own(
     making = await _resumable(
         connection, generations, key, lambda each: each.version == projection.version and each.layout == layout
     )
-    return making or await make_own(connection, projection, f"{key}{_MAKING}")
-
-
-async def clear(log: EventLog) -> list[str]:
-    """Empty and drop replaced tables in slices; return the names of tables that are still in use and were left."""
-    left: list[str] = []
-    with log.translated():
-        async with log.reading() as connection:
-            generations = await _generations(log, connection)
-        await _sweep(log)
-        for key, generation in generations.items():
-            if key == SHOWN:
-                await _drop(log, checkpoints.place_of(generation.number))
-            owner, separator, _ = key.partition(_GONE)
-            if not separator:
-                continue
-            is_built_in = owner == SHOWN
-            tables = [
-                *(CORE if is_built_in else ()),
-                *generation.layout.leaves,
-                *kept_tables(generation.layout),
-                checkpoints.TABLE if is_built_in else f"{checkpoints.TABLE}_{owner.removeprefix(PROJECTION)}",
-            ]
-            named = [physical_name(each, generation.number) for each in tables]
-            in_use = await _drop_all(log, named)
-            left += in_use
-            if not in_use:
-                async with log.engine.begin() as connection:
-                    await forget(connection, key)
-    return left
-
-
-async def _generations(log: EventLog, connection: AsyncConnection) -> dict[str, Generation]:
-    """Read all generations. Raises `DatabaseForeign` if a newer version made one, whose tables this one cannot list."""
-    generations = await all_noted(connection)
-    newest = max((each.version for key, each in generations.items() if not key.startswith(PROJECTION)), default=0)
-    if newest > PROJECTION_VERSION:
-        versions = f"there are tables made by version {newest} of the fold, this is version {PROJECTION_VERSION}"
-        raise DatabaseForeign(f"{log.address}: {versions}: use a newer pycrorm")
-    return generations
-
-
-async def _sweep(log: EventLog) -> None:
-    async with log.engine.begin() as connection:
-        await dialect_of(connection).sweep(connection)
-
-
-async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
-    """Drop these tables; return those that stay in use after the last attempt."""
-    for pause_s in _DROP_PAUSES_S:
-        await asyncio.sleep(pause_s)
-        await _sweep(log)  # drops replaced views first, because a table cannot be dropped before its views
-        while tables and await _drop(log, tables[0]):
-            tables = tables[1:]
-        if not tables:
-            return []
-    return [each for each in tables if not await _drop(log, each)]
-
-
-async def _drop(log: EventLog, table: str) -> bool:
-    dialect = dialect_of(log.engine)
-    async with log.reading() as connection:
-        if not await dialect.has_table(connection, table):
-            return True
-    full = True
-    while full:
-        async with log.engine.begin() as connection:
-            full = await dialect.empty(connection, table, rows_max=_SLICE_ROWS)
-        if full:
-            await asyncio.sleep(_PAUSE_S)
-    try:
-        async with log.engine.begin() as connection:
-            await dialect.drop(connection, table)
-    except dialect.faults:
-        return False  # a query still reads it
-    return True
+    return making or await make_projection_tables(connection, projection, f"{key}{_MAKING}")

@@ -14,7 +14,7 @@ from sqlalchemy import BigInteger, Boolean, Float, Integer, Select, String, insp
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import MissingExtra
-from pycrorm_async.orm.types import Moment, Named
+from pycrorm_async.orm.types import EnumName, Moment
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -72,7 +72,7 @@ def _column(name: str, expression: Any, kind: Any) -> _FrameColumn:
     """Return the column; times and enums are read as stored, because a frame has no use for their Python values."""
     if isinstance(kind, Moment):
         return _FrameColumn(name, type_coerce(expression, BigInteger()), _MOMENT)
-    if isinstance(kind, Named):
+    if isinstance(kind, EnumName):
         return _FrameColumn(name, type_coerce(expression, String()), "object")
     with_missing = (dtype for types, dtype in _WITH_MISSING if isinstance(kind, types))
     return _FrameColumn(name, expression, next(with_missing, "object"))

@@ -16,11 +16,11 @@ from pycrorm_async.orm import Designator, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["EpisodeSummary", "NodeSummary", "Thinker", "episodes", "episode_named", "task_tree"]
+__all__ = ["EpisodeSummary", "NodeSummary", "SimulatingNode", "episodes", "episode_named", "task_tree"]
 
 
 @dataclass(frozen=True)
-class Thinker:
+class SimulatingNode:
     """The node that performed a simulation.
 
     Attributes:
@@ -61,7 +61,7 @@ class EpisodeSummary:
     nodes: int
     failed: int
     simulated: bool = False
-    thought_by: Thinker | None = None
+    thought_by: SimulatingNode | None = None
     continues: str | None = None
     continued_in: str | None = None
 
@@ -112,7 +112,7 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             nodes=row.nodes,
             failed=row.failed,
             simulated=row.simulated,
-            thought_by=Thinker(row.thought_by, row.thinker_number, row.thinker_id, row.thinker_dtype)
+            thought_by=SimulatingNode(row.thought_by, row.thinker_number, row.thinker_id, row.thinker_dtype)
             if row.thought_by is not None
             else None,
             continues=row.continues,

@@ -81,7 +81,7 @@ class Reading:
 
     @property
     def is_open(self) -> bool:
-        """Whether the log is open, which it is from the first query on."""
+        """True from the first query on, which opens the log, until `close`."""
         return self._opened is not None
 
     async def close(self) -> None:

@@ -23,7 +23,7 @@ from bench.breaking.outcome import Outcome, Step
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.operations.destination import LogAndTables
-from pycrorm_async.projections.verify.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.queue import RecorderQueue, RecoveredQueue
 from pycrorm_async.store.log import EventLog
 from tests.backups import Backup
@@ -232,7 +232,7 @@ def only_flushes_fold(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_round_is_verified_while_none_of_its_events_is_on_its_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def verify_later(log: EventLog) -> Verified:
+    async def verify_later(log: EventLog) -> VerifyResult:
         await asyncio.sleep(0.3)  # six times what an event needs to be stored
         return await verify(log)
 

@@ -22,7 +22,8 @@ from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.custom.projection_tables import states
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.rebuild import Rebuild, claimed
+from pycrorm_async.projections.replaced_tables import clear
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.projections.verify.verify import verify

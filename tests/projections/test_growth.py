@@ -27,7 +27,7 @@ from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema import growth, layout
 from pycrorm_async.projections.schema.tables import index_name, physical_name
-from pycrorm_async.projections.verify.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server
@@ -61,7 +61,7 @@ async def told(log: EventLog) -> list[tuple[int, str]]:
     return [(each.number, each.parked or "") for each in await log.stopped()]
 
 
-async def clean(log: EventLog) -> Verified:
+async def clean(log: EventLog) -> VerifyResult:
     found = await verify(log)
     assert (found.damage, found.drift) == (0, 0), found
     return found

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.projections.schema.layout import Contradictory, Layout, Leaf
+from pycrorm_async.projections.schema.layout import Layout, LayoutConflict, Leaf
 from tests.projections.event_script import PICK_UP, SAYING, declared, field
 
 
@@ -58,19 +58,19 @@ def test_lists_and_dicts_have_no_column() -> None:
     ids=["another type", "another case", "another kind", "a table of ours", "a table in another case"],
 )
 def test_what_cannot_share_the_tables_is_refused_with_both_named(second: DesignatorTypeDeclared, reason: str) -> None:
-    with pytest.raises(Contradictory) as raised:
+    with pytest.raises(LayoutConflict) as raised:
         layout_of(SAYING, second)
     assert str(raised.value) == reason
 
 
 def test_a_contradiction_with_another_table_of_the_type_is_one_too() -> None:
-    with pytest.raises(Contradictory):
+    with pytest.raises(LayoutConflict):
         layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
 
 
 def test_a_table_that_an_authors_class_gave_a_contradicting_column_cannot_join_the_type() -> None:
     layout = layout_of(SAYING).with_leaves([Leaf("ORMSaying", {"text": "real"})])
-    with pytest.raises(Contradictory, match=r"SayingAction\.text is declared as text and as real"):
+    with pytest.raises(LayoutConflict, match=r"SayingAction\.text is declared as text and as real"):
         layout.with_declaration(declared("SayingAction", "ORMSaying", field("volume", "real", 2)))
     assert layout.with_declaration(SAYING) == layout
 
@@ -136,7 +136,7 @@ def test_a_type_and_what_it_was_called_are_one_type_whichever_was_declared_first
 def test_a_name_that_two_types_say_they_had_is_that_of_the_first() -> None:
     bow = replace(declared("BowAction", "bow_action"), aliases=("GreetAction",))
     layout = layout_of(GREET, WELCOME)
-    with pytest.raises(Contradictory, match="so BowAction cannot have the alias GreetAction: remove it"):
+    with pytest.raises(LayoutConflict, match="so BowAction cannot have the alias GreetAction: remove it"):
         layout.with_declaration(bow)
     # Who says both names continues both.
     both = layout.with_declaration(replace(bow, aliases=("GreetAction", "WelcomeAction")))
@@ -168,7 +168,7 @@ def test_what_a_type_cannot_have_been_is_refused_and_changes_nothing(
     former: DesignatorTypeDeclared, reason: str
 ) -> None:
     layout = layout_of(former)
-    with pytest.raises(Contradictory, match=reason):
+    with pytest.raises(LayoutConflict, match=reason):
         layout.with_declaration(WELCOME)
     assert layout_of(WELCOME).types["WelcomeAction"].tables == ("welcome_action",)
 
@@ -176,5 +176,5 @@ def test_what_a_type_cannot_have_been_is_refused_and_changes_nothing(
 def test_tables_that_become_those_of_one_type_must_all_agree() -> None:
     own = replace(declared("WelcomeAction", "ORMWelcome"), aliases=("GreetAction",))
     layout = layout_of(GREET, declared("WelcomeAction", "welcome_action", field("loud", "text", 2)))
-    with pytest.raises(Contradictory, match="loud"):
+    with pytest.raises(LayoutConflict, match="loud"):
         layout.with_declaration(own)

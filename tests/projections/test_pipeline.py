@@ -20,7 +20,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.run import pipeline
-from pycrorm_async.projections.run.batch_fold import Prepared
+from pycrorm_async.projections.run.batch_fold import PreparedBatch
 from pycrorm_async.projections.run.pipeline import FoldPipeline, Outlook
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
@@ -36,7 +36,7 @@ class InLoop:
     def __init__(self, projector: Projector) -> None:
         self.projector = projector
         self.wrote: list[int] = []
-        self.batch: Prepared | None = None
+        self.batch: PreparedBatch | None = None
 
     async def prepare(self, spans: Sequence[Span]) -> Outlook:
         self.batch = await self.projector.prepare(spans)

@@ -28,7 +28,7 @@ from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextVie
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.generations import current_generation
-from pycrorm_async.projections.schema.layout import Contradictory
+from pycrorm_async.projections.schema.layout import LayoutConflict
 from pycrorm_async.projections.schema.user_views import UserView, view_texts
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
@@ -230,7 +230,7 @@ async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_vie
     # The table of an author's class waits for the designator that will name it.
     waiting = layout.leaves.keys() - {table for each in layout.types.values() for table in each.tables}
     for name in there - waiting:
-        with pytest.raises(Contradictory):
+        with pytest.raises(LayoutConflict):
             layout.with_declaration(declared("NobodysAction", name))
         with pytest.raises(CallerError):
             view_texts([UserView(name, select(ParkArmsAction.arm))], layout, sqlite.dialect())

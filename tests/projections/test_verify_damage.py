@@ -12,7 +12,7 @@ import pytest
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.codec import encode
-from pycrorm_async.projections.verify.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
@@ -62,7 +62,7 @@ def everything(url: str) -> list[Any]:
     return [*logged, *(rows_of(url, table) for table in shown(url))]
 
 
-async def told(log: EventLog, url: str, monkeypatch: pytest.MonkeyPatch) -> Verified:
+async def told(log: EventLog, url: str, monkeypatch: pytest.MonkeyPatch) -> VerifyResult:
     """What is found, whatever the parts; and nothing was written."""
     before = everything(url)
     found = await look(log)
@@ -217,7 +217,7 @@ async def file(tmp_path: Path) -> Path:
     return tmp_path / "memory.db"
 
 
-async def verified(file: Path) -> Verified:
+async def verified(file: Path) -> VerifyResult:
     reader = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{file}"), create=False)
     try:
         return await verify(reader)

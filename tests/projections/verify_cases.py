@@ -34,9 +34,10 @@ from pycrorm_async.events.types import (
     StateSampled,
 )
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.rebuild import Rebuild, claimed
+from pycrorm_async.projections.replaced_tables import clear
 from pycrorm_async.projections.verify import verify as verifying
-from pycrorm_async.projections.verify.verify import Verified, verify
+from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
@@ -134,25 +135,25 @@ def parked(number: int) -> Script:
 # --- looking ----------------------------------------------------------------------------------------------------
 
 
-async def look(log: EventLog, *, episode: int | None = None) -> Verified:
+async def look(log: EventLog, *, episode: int | None = None) -> VerifyResult:
     """At all of it, or at one episode."""
     rows = {each.number: each for each in await log.episodes()}
     return await verify(log, episode=None if episode is None else rows[episode])
 
 
-def findings(found: Verified) -> tuple[Any, ...]:
+def findings(found: VerifyResult) -> tuple[Any, ...]:
     """In an order that does not depend on the parts in which the log was read."""
     whole = found._replace(damages=[], differences=[])
     return (*whole, sorted(found.damages, key=repr), sorted(found.differences, key=repr))
 
 
-async def in_parts(log: EventLog, events: int, monkeypatch: pytest.MonkeyPatch) -> Verified:
+async def in_parts(log: EventLog, events: int, monkeypatch: pytest.MonkeyPatch) -> VerifyResult:
     with monkeypatch.context() as patched:
         patched.setattr(verifying, "_PART_EVENTS", events)
         return await look(log)
 
 
-def assert_clean(found: Verified) -> None:
+def assert_clean(found: VerifyResult) -> None:
     assert (found.damages, found.differences) == ([], [])
     assert (found.damage, found.drift) == (0, 0)
 

@@ -36,7 +36,7 @@ from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.tables import COLUMNS
 from pycrorm_async.projections.schema.user_views import UserView
-from pycrorm_async.query.named_queries import Thinker
+from pycrorm_async.query.named_queries import SimulatingNode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import (
@@ -235,9 +235,9 @@ async def test_the_overview_leaves_thoughts_out_unless_they_are_asked_for(log: E
         all_of_them = await reading.episodes(simulated=True)
     assert [(each.number, each.simulated, each.thought_by) for each in all_of_them] == [
         (1, False, None),
-        (2, True, Thinker(episode_text(REAL), 1, row(THINKING), "NavigateAction")),
-        (3, True, Thinker(deeper.episode, 2, row(2, number=2), None)),
-        (4, True, Thinker(elsewhere.episode, None, None, None)),
+        (2, True, SimulatingNode(episode_text(REAL), 1, row(THINKING), "NavigateAction")),
+        (3, True, SimulatingNode(deeper.episode, 2, row(2, number=2), None)),
+        (4, True, SimulatingNode(elsewhere.episode, None, None, None)),
     ]
     assert {(each.nodes, each.failed) for each in all_of_them} == {(6, 1)}
 

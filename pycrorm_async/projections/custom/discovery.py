@@ -19,14 +19,14 @@ from typing import Any
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.custom.projection import Projection, columns_of
 
-__all__ = ["GROUP", "checked", "named", "installed_besides"]
+__all__ = ["GROUP", "validate_projections", "load_projections", "installed_projections"]
 
 GROUP = "pycrorm.projections"
 
 _log = logging.getLogger("pycrorm_async.projections")
 
 
-def checked(projections: Sequence[Projection]) -> tuple[Projection, ...]:
+def validate_projections(projections: Sequence[Projection]) -> tuple[Projection, ...]:
     """Validate projections and return them. Raises `CallerError` for an invalid one, and for two of one name."""
     names: set[str] = set()
     for each in projections:
@@ -39,14 +39,14 @@ def checked(projections: Sequence[Projection]) -> tuple[Projection, ...]:
     return tuple(projections)
 
 
-def named(references: Sequence[str]) -> tuple[Projection, ...]:
+def load_projections(references: Sequence[str]) -> tuple[Projection, ...]:
     """Import projections by `module:Class`, also from the working directory. Raises `CallerError`."""
     if references and str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
-    return checked([_named(each) for each in references])
+    return validate_projections([_load_projection(each) for each in references])
 
 
-def _named(reference: str) -> Projection:
+def _load_projection(reference: str) -> Projection:
     module_name, _, class_name = reference.partition(":")
     if not module_name or not class_name:
         raise CallerError(f"{reference!r} names no projection: write module:Class")
@@ -71,7 +71,7 @@ def _instance(kind: Any, reference: str) -> Projection:
     return projection
 
 
-def installed_besides(projections: Sequence[Projection]) -> tuple[Projection, ...]:
+def installed_projections(projections: Sequence[Projection]) -> tuple[Projection, ...]:
     """Return the installed projections whose names these do not have. A faulty one is logged and left out."""
     names = {each.name for each in projections}
     installed: list[Projection] = []

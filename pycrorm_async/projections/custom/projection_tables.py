@@ -25,11 +25,11 @@ from pycrorm_async.projections.run.catch_up import CatchUp, SideTarget
 from pycrorm_async.projections.schema.generations import (
     PROJECTION,
     Generation,
-    all_noted,
     grow_tables,
     make_empty,
-    note,
     projections_in,
+    read_generations,
+    write_generation,
 )
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.tables import OWN, Storage
@@ -42,7 +42,7 @@ __all__ = [
     "states",
     "CustomFoldDefinition",
     "layout_of",
-    "make_own",
+    "make_projection_tables",
     "refuse_taken",
     "fault_in_version",
 ]
@@ -80,15 +80,15 @@ def layout_of(projection: Projection, dialect: Dialect) -> Layout:
     return with_user_views(layout, projection.views, dialect)
 
 
-async def make_own(connection: AsyncConnection, projection: Projection, key: str) -> Generation:
+async def make_projection_tables(connection: AsyncConnection, projection: Projection, key: str) -> Generation:
     """Create the projection's tables and checkpoints, empty, as a new generation under this key."""
-    generations = await all_noted(connection)
+    generations = await read_generations(connection)
     own = f"{PROJECTION}{projection.name}"
     numbers = [each.number for name, each in generations.items() if name == own or name.startswith(f"{own}/")]
     empty = Generation(1 + max(numbers, default=0), 0, Layout(), {}, projection.version)
     generation = await grow_tables(connection, empty, layout_of(projection, connection.dialect))
     await make_empty(connection, {f"{checkpoints.TABLE}_{projection.name}": checkpoints.COLUMNS}, generation.number)
-    await note(connection, key, generation)
+    await write_generation(connection, key, generation)
     return generation
 
 
@@ -115,19 +115,19 @@ async def _set_up(connection: AsyncConnection, projection: Projection, tables: L
     Raises `CallerError` for a name that is taken, `DatabaseForeign` for tables of another version.
     """
     layout = layout_of(projection, connection.dialect)
-    generations = projections_in(await all_noted(connection))
+    generations = projections_in(await read_generations(connection))
     refuse_taken(projection.name, layout, tables, generations)
     generation = generations.get(projection.name)
     key = f"{PROJECTION}{projection.name}"
     if generation is None:
-        return await make_own(connection, projection, key), True
+        return await make_projection_tables(connection, projection, key), True
     fault = fault_in_version(projection, generation, layout)
     if fault is not None:
         raise DatabaseForeign(fault)
     if generation.layout == layout:
         return generation, False
     generation = replace(generation, revision=generation.revision + 1, layout=layout)
-    await note(connection, key, generation)
+    await write_generation(connection, key, generation)
     return generation, True
 
 
@@ -227,7 +227,7 @@ async def states(log: EventLog, projections: Sequence[Projection]) -> list[Proje
     by_name = {each.name: each for each in projections}
     result: list[ProjectionState] = []
     async with log.reading() as connection:
-        for name, each in projections_in(await all_noted(connection)).items():
+        for name, each in projections_in(await read_generations(connection)).items():
             place = checkpoints.place_of(each.number, name)
             fault = None
             if name in by_name:

@@ -41,13 +41,13 @@ from pycrorm_async.projections.fold.parameters import Designators, ParameterRows
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, Row, Rows
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "Undecodable"]
+__all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "UndecodablePayload"]
 
 
 _NO_OUTCOME: Row = (None, None, None, None)
 
 
-class Undecodable(CannotFold):
+class UndecodablePayload(CannotFold):
     """The payload does not decode as its own type and version, so the log is damaged."""
 
 
@@ -63,7 +63,7 @@ def fold_happening(event: StoredEvent, happening: Happening, designators: Design
 
 
 def happening_of(event: StoredEvent) -> Happening:
-    """Decode the payload of an episode's event; custom projections use this too. Raises `CannotFold`, `Undecodable`."""
+    """Decode the payload of an episode's event, for every fold. Raises `CannotFold`, `UndecodablePayload`."""
     _, _, type_, version, _, _, payload = event
     if type_ not in _FOLDS:
         raise CannotFold(f"{type_} is not an event this version knows")
@@ -72,7 +72,7 @@ def happening_of(event: StoredEvent) -> Happening:
     except UnknownShape as reason:
         raise CannotFold(str(reason)) from None
     except msgspec.DecodeError as error:
-        raise Undecodable(f"{type_} cannot be decoded: {error}") from None
+        raise UndecodablePayload(f"{type_} cannot be decoded: {error}") from None
 
 
 # --- episodes -------------------------------------------------------------------------------------------------

@@ -33,14 +33,14 @@ from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.fold.row_writer import insertion_of, write_rows
 from pycrorm_async.projections.schema.generations import Generation, Hold
-from pycrorm_async.projections.schema.growth import Growing, grow
+from pycrorm_async.projections.schema.growth import GrowthTarget, grow
 from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialect import Insertion, Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["Folding", "FoldTarget", "FoldDefinition", "Batch", "Prepared", "TABLES"]
+__all__ = ["BatchFold", "FoldTarget", "FoldDefinition", "Batch", "PreparedBatch", "TABLES"]
 
 _REASON_LENGTH_MAX = 2_000
 """Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
@@ -48,7 +48,7 @@ _SLICE_EVENTS = 100
 """The events folded between two yields to the event loop, some 0.4 ms."""
 
 
-class FoldTarget(Growing, Protocol):
+class FoldTarget(GrowthTarget, Protocol):
     """A generation to fold into, and its checkpoints. Every method runs in the caller's transaction."""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
@@ -87,7 +87,7 @@ class FoldDefinition(Protocol):
 
 
 @dataclass(frozen=True)
-class _Folded:
+class _FoldedBatch:
     """A folded batch: its rows for the generation `number`, (episode, folded before, folded now) for each episode, and
     the reasons of the episodes to park."""
 
@@ -108,13 +108,13 @@ class _Types:
 
 
 @dataclass(frozen=True)
-class Prepared:
+class PreparedBatch:
     """A batch between `prepare` and `write`."""
 
     spans: Sequence[Span]
     events: Sequence[StoredEvent]
     types: _Types
-    done: _Folded
+    done: _FoldedBatch
 
     @property
     def count(self) -> int:
@@ -123,7 +123,7 @@ class Prepared:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it folds all its events, so that it parks no episode."""
+        """True if all its events are folded, so that it parks no episode."""
         return not self.done.parked
 
     @property
@@ -162,7 +162,7 @@ class _Tables:
 TABLES = _Tables()
 
 
-class Folding:
+class BatchFold:
     """Folds events of one log into one target. `generation` is its state when this process last read it."""
 
     def __init__(
@@ -181,12 +181,12 @@ class Folding:
         """
         return await self.write(await self.prepare(spans, events))
 
-    async def prepare(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> Prepared:
+    async def prepare(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> PreparedBatch:
         """Fold the events into rows, yielding to the event loop at intervals. Writes nothing."""
         types = await self._types_now()
-        return Prepared(spans, events, types, await self._folded(spans, events, types))
+        return PreparedBatch(spans, events, types, await self._folded(spans, events, types))
 
-    async def write(self, batch: Prepared) -> int:
+    async def write(self, batch: PreparedBatch) -> int:
         """Write a prepared batch; return the number of events folded, as `batch` does."""
         try:
             async with self._log.writing() as connection:
@@ -212,13 +212,13 @@ class Folding:
             return False
         return await self._write(connection, done, generation) is not None
 
-    async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent], types: _Types) -> _Folded:
+    async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent], types: _Types) -> _FoldedBatch:
         rows, number = types.batch(), self.generation.number
         steps, parked = await _fold_all(spans, events, rows)
         await rows.ready(self._log.engine, number)
-        return _Folded(rows, number, steps, parked)
+        return _FoldedBatch(rows, number, steps, parked)
 
-    async def _generation(self, connection: AsyncConnection, done: _Folded, types: _Types) -> Generation | None:
+    async def _generation(self, connection: AsyncConnection, done: _FoldedBatch, types: _Types) -> Generation | None:
         """Lock the generation and create missing tables; return None if its number or revision has changed.
 
         The layout of the result differs from that of `types` if some tables could not be created.
@@ -233,7 +233,7 @@ class Folding:
         return await grow(connection, self._target, generation, types.payloads) if growing else generation
 
     async def _write(
-        self, connection: AsyncConnection, done: _Folded, generation: Generation | None
+        self, connection: AsyncConnection, done: _FoldedBatch, generation: Generation | None
     ) -> Generation | None:
         """Write rows and checkpoints; return None, to roll back, without a generation or if a checkpoint has moved."""
         if generation is None or not await self._target.advance(connection, done.steps):

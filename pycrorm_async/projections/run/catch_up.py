@@ -20,8 +20,14 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign, InternalError, LogDamaged
 from pycrorm_async.projections.run import checkpoints
-from pycrorm_async.projections.run.batch_fold import TABLES, FoldDefinition, Folding, Prepared
-from pycrorm_async.projections.schema.generations import Generation, Hold, grow_tables, note, noted
+from pycrorm_async.projections.run.batch_fold import TABLES, BatchFold, FoldDefinition, PreparedBatch
+from pycrorm_async.projections.schema.generations import (
+    Generation,
+    Hold,
+    grow_tables,
+    read_generation,
+    write_generation,
+)
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.log import EventLog
@@ -63,7 +69,7 @@ class SideTarget:
         self.place = ""
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
-        generation = await noted(connection, self._key, hold=hold)
+        generation = await read_generation(connection, self._key, hold=hold)
         if generation is None or self._number not in (None, generation.number):
             raise InternalError(
                 f"another process replaced the tables of {self._projection or 'the memory'} during the fold"
@@ -77,7 +83,7 @@ class SideTarget:
 
     async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
         grown = await grow_tables(connection, generation, layout)
-        await note(connection, self._key, grown)
+        await write_generation(connection, self._key, grown)
         return grown
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
@@ -108,9 +114,9 @@ class CatchUp:
         self._share = share
         self._after_tables = after_tables
         self._batch_events = batch_events
-        self.folding = Folding(log, target, generation, definition)
+        self.folding = BatchFold(log, target, generation, definition)
         self._after = 0
-        self._ready: Prepared | None = None
+        self._ready: PreparedBatch | None = None
 
     async def fold_next_batch(self) -> int | None:
         """Fold a batch; return the number of events, None when none is left of this share. Raises `LogDamaged`."""
@@ -132,7 +138,7 @@ class CatchUp:
             self._ready = ready
         return count
 
-    async def _prepared(self, reached: Mapping[int, int]) -> Prepared | None:
+    async def _prepared(self, reached: Mapping[int, int]) -> PreparedBatch | None:
         """Prepare the next batch. `reached`: the checkpoints after the batch before it is written."""
         while True:
             async with self._log.reading() as connection:

@@ -16,7 +16,7 @@ from pycrorm_async.projections.fold.fold import CannotFold, fold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation
-from pycrorm_async.projections.schema.growth import Growing, grow
+from pycrorm_async.projections.schema.growth import GrowthTarget, grow
 from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import park
@@ -30,7 +30,7 @@ _AT_AN_EVENT = re.compile(r"event (\d+): (?!the database refuses it)")
 whether the database accepts it now."""
 
 
-async def release_parked(connection: AsyncConnection, target: Growing, generation: Generation) -> Generation:
+async def release_parked(connection: AsyncConnection, target: GrowthTarget, generation: Generation) -> Generation:
     """Release episodes and create tables that the database refused before; return the generation with those.
 
     Runs in the caller's transaction, which must exclude all other writers of the memory.
@@ -57,7 +57,7 @@ async def release_parked(connection: AsyncConnection, target: Growing, generatio
 
 
 async def _retry_unmade(
-    connection: AsyncConnection, target: Growing, generation: Generation, payloads: Sequence[bytes]
+    connection: AsyncConnection, target: GrowthTarget, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
     """Try again to create the tables that the database refused; return the generation with those it creates now."""
     unmade = generation.layout.unmade

@@ -34,8 +34,8 @@ from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, Executable
 
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
 from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.materialised_views import kept_tables, make_kept, shown_texts
-from pycrorm_async.projections.schema.public_views import own_views, public_views
+from pycrorm_async.projections.schema.materialised_views import make_materialised, materialised_tables, shown_texts
+from pycrorm_async.projections.schema.public_views import projection_views, public_views
 from pycrorm_async.projections.schema.tables import (
     CORE,
     OWN,
@@ -58,12 +58,12 @@ __all__ = [
     "GONE",
     "PROJECTION",
     "current_generation",
-    "noted",
-    "all_noted",
+    "read_generation",
+    "read_generations",
     "projections_in",
     "view_texts_of",
-    "note",
-    "forget",
+    "write_generation",
+    "delete_generation",
     "make_generation",
     "make_empty",
     "grow_tables",
@@ -128,7 +128,7 @@ async def current_generation(connection: AsyncConnection, *, hold: Hold | None =
 
     Raises `DatabaseForeign` if a newer version made its tables, `TablesOutdated` if an older one did.
     """
-    generation = await noted(connection, SHOWN, hold=hold)
+    generation = await read_generation(connection, SHOWN, hold=hold)
     if generation is not None and generation.version != PROJECTION_VERSION:
         versions = (
             f"the tables were made by version {generation.version} of the fold, this is version {PROJECTION_VERSION}"
@@ -139,7 +139,7 @@ async def current_generation(connection: AsyncConnection, *, hold: Hold | None =
     return generation
 
 
-async def noted(connection: AsyncConnection, name: str, *, hold: Hold | None = None) -> Generation | None:
+async def read_generation(connection: AsyncConnection, name: str, *, hold: Hold | None = None) -> Generation | None:
     """Read the generation under this key, of any version."""
     if not await dialect_of(connection).has_table(connection, _NOTES):
         return None
@@ -150,7 +150,7 @@ async def noted(connection: AsyncConnection, name: str, *, hold: Hold | None = N
     return None if row is None else _generation(row)
 
 
-async def all_noted(connection: AsyncConnection) -> dict[str, Generation]:
+async def read_generations(connection: AsyncConnection) -> dict[str, Generation]:
     """Read all generations, by key."""
     if not await dialect_of(connection).has_table(connection, _NOTES):
         return {}
@@ -173,7 +173,7 @@ def _generation(row: Any) -> Generation:
     return Generation(row.generation, row.revision, layout, views, row.version)
 
 
-async def note(connection: AsyncConnection, name: str, generation: Generation) -> None:
+async def write_generation(connection: AsyncConnection, name: str, generation: Generation) -> None:
     """Write the generation under this key, replacing the row that has it."""
     values = {
         "projection": name,
@@ -186,7 +186,7 @@ async def note(connection: AsyncConnection, name: str, generation: Generation) -
     await connection.execute(_UPSERT, values)
 
 
-async def forget(connection: AsyncConnection, name: str) -> None:
+async def delete_generation(connection: AsyncConnection, name: str) -> None:
     """Delete the row under this key."""
     await connection.execute(delete(_notes).where(_notes.c.projection == name))
 
@@ -206,20 +206,20 @@ async def grow_tables(connection: AsyncConnection, generation: Generation, layou
     await make_empty(connection, new, generation.number)
     for name in layout.leaves.keys() & present.keys():
         await _add_columns(connection, name, layout.leaves[name], present[name], generation.number)
-    existing = kept_tables(generation.layout)
+    existing = materialised_tables(generation.layout)
     for kept in layout.kept.values():
         if kept.table not in existing:
-            await make_kept(connection, kept, generation.number)
+            await make_materialised(connection, kept, generation.number)
     return replace(generation, revision=generation.revision + 1, layout=layout)
 
 
 async def show(connection: AsyncConnection, generation: Generation) -> Generation:
     """Make this generation visible: replace the views in front of the tables that were visible before."""
-    before = await noted(connection, SHOWN, hold="change")
-    views = view_texts_of(connection, generation, projections_in(await all_noted(connection)))
+    before = await read_generation(connection, SHOWN, hold="change")
+    views = view_texts_of(connection, generation, projections_in(await read_generations(connection)))
     await dialect_of(connection).replace_views(connection, before.views if before else {}, views)
     shown = replace(generation, views=views)
-    await note(connection, SHOWN, shown)
+    await write_generation(connection, SHOWN, shown)
     return shown
 
 
@@ -250,7 +250,7 @@ def view_texts_of(
             _log.warning("the projection %s has no views: the names %s belong to the memory", name, names_taken)
             continue
         taken |= names
-        selects |= own_views(each.layout, each.number, number, stored, simulated=simulated)
+        selects |= projection_views(each.layout, each.number, number, stored, simulated=simulated)
         own |= each.layout.user_views
     return {name: view_text(each, connection.dialect) for name, each in selects.items()} | users | own
 

@@ -29,7 +29,7 @@ from pycrorm_async.projections.schema.generations import Generation
 from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["Growing", "grow"]
+__all__ = ["GrowthTarget", "grow"]
 
 _SLICE = 1_000
 """Bounds the tables created in one transaction: a default PostgreSQL has room for some 7,000 locks, and a table with
@@ -38,7 +38,7 @@ its index, its TOAST table and its view takes up to five."""
 _log = logging.getLogger("pycrorm_async.projections")
 
 
-class Growing(Protocol):
+class GrowthTarget(Protocol):
     """The owner of a generation's row in `pycrorm_generation`."""
 
     async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
@@ -47,7 +47,7 @@ class Growing(Protocol):
 
 
 async def grow(
-    connection: AsyncConnection, target: Growing, generation: Generation, payloads: Sequence[bytes]
+    connection: AsyncConnection, target: GrowthTarget, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
     """Create the tables of these declarations, up to one slice and without those that the database refuses.
 
@@ -71,7 +71,7 @@ def _slice(layout: Layout, payloads: Sequence[bytes]) -> Sequence[bytes]:
 
 
 async def _grow(
-    connection: AsyncConnection, target: Growing, generation: Generation, payloads: Sequence[bytes]
+    connection: AsyncConnection, target: GrowthTarget, generation: Generation, payloads: Sequence[bytes]
 ) -> Generation:
     united = unite(generation.layout, payloads)
     if united.layout == generation.layout:

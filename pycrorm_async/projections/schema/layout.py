@@ -20,7 +20,7 @@ from pycrorm_async.events.fields import fault_in_declaration, mapped_declaration
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldType
 from pycrorm_async.projections.schema.tables import Storage
 
-__all__ = ["Layout", "DesignatorType", "Leaf", "Kept", "Contradictory", "STORED_AS", "Union", "unite"]
+__all__ = ["Layout", "DesignatorType", "Leaf", "MaterialisedView", "LayoutConflict", "STORED_AS", "Union", "unite"]
 
 STORED_AS: dict[FieldType, Storage] = {
     "integer": "integer",
@@ -43,7 +43,7 @@ with an index each, and a default server has room for some 7,000 locks."""
 _BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Language"}
 
 
-class Contradictory(ValueError):
+class LayoutConflict(ValueError):
     """A declaration contradicts the layout, so it cannot share its tables."""
 
 
@@ -64,7 +64,7 @@ class DesignatorType(msgspec.Struct, frozen=True):
     bases: tuple[str, ...] = ()
 
 
-class Kept(msgspec.Struct, frozen=True):
+class MaterialisedView(msgspec.Struct, frozen=True):
     """The tables of a materialised view: `table` contains its rows, `progress` its checkpoint for each episode."""
 
     columns: dict[str, Storage]
@@ -87,7 +87,7 @@ class Layout(msgspec.Struct, frozen=True):
     leaves: dict[str, dict[str, Storage]] = {}
     types: dict[str, DesignatorType] = {}
     user_views: dict[str, str] = {}
-    kept: dict[str, Kept] = {}
+    kept: dict[str, MaterialisedView] = {}
     outdated: tuple[str, ...] = ()
     renamed: dict[str, str] = {}
     unmade: dict[str, str] = {}
@@ -111,7 +111,7 @@ class Layout(msgspec.Struct, frozen=True):
         every = dict.fromkeys((*self.unreadable, *declarations))
         return msgspec.structs.replace(self, unreadable=tuple(every))
 
-    def with_views(self, views: Mapping[str, str], kept: Mapping[str, Kept]) -> Self:
+    def with_views(self, views: Mapping[str, str], kept: Mapping[str, MaterialisedView]) -> Self:
         """Return the layout with these users' views, which replace those of the same names."""
         present = {name: each for name, each in self.kept.items() if name not in views} | dict(kept)
         old = {table for each in self.kept.values() for table in (each.table, each.progress)}
@@ -121,23 +121,23 @@ class Layout(msgspec.Struct, frozen=True):
         )
 
     def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
-        """Return the layout with the table of this type. Raises `Contradictory` with the reason."""
+        """Return the layout with the table of this type. Raises `LayoutConflict` with the reason."""
         fault = fault_in_declaration(declared)
         if fault is not None:
-            raise Contradictory(f"{declared.dtype[:80]}: {fault}")
+            raise LayoutConflict(f"{declared.dtype[:80]}: {fault}")
         columns = {each.column: STORED_AS[each.type] for each in declared.fields if each.type in STORED_AS}
         dtype = self.present_name(declared.dtype)
         former = tuple(each for each in declared.aliases if each != dtype and self.present_name(each) != dtype)
         for each in former:
             if self.renamed.get(each, each) not in declared.aliases:
-                raise Contradictory(
+                raise LayoutConflict(
                     f"{each} was renamed to {self.renamed[each]}, so {dtype} cannot have the alias {each}: remove it"
                 )
         present = self.types.get(dtype) or DesignatorType(declared.kind, ())
         same_type = [present, *(self.types[each] for each in former if each in self.types)]
         for type_ in same_type:
             if declared.kind != type_.kind:
-                raise Contradictory(f"{declared.dtype} is declared as {type_.kind} and as {declared.kind}")
+                raise LayoutConflict(f"{declared.dtype} is declared as {type_.kind} and as {declared.kind}")
         others = (table for type_ in same_type for table in type_.tables)
         tables = tuple(dict.fromkeys((*present.tables, declared.table, *others)))
         self._refuse_taken(declared, {dtype, *former})
@@ -149,9 +149,9 @@ class Layout(msgspec.Struct, frozen=True):
             _refuse_different(declared.dtype, self.leaves.get(table, {}), agreed)
             agreed = agreed | self.leaves.get(table, {})
         if len(agreed) > COLUMNS_MAX:
-            raise Contradictory(f"{dtype} would have {len(agreed):,} columns, {COLUMNS_MAX:,} are allowed")
+            raise LayoutConflict(f"{dtype} would have {len(agreed):,} columns, {COLUMNS_MAX:,} are allowed")
         if declared.table not in self.leaves and len(self.leaves) >= LEAVES_MAX:
-            raise Contradictory(
+            raise LayoutConflict(
                 f"{dtype} would be type {len(self.leaves) + 1:,}, a memory has tables for {LEAVES_MAX:,}"
             )
         types = {name: each for name, each in self.types.items() if name not in former}
@@ -173,11 +173,11 @@ class Layout(msgspec.Struct, frozen=True):
         request = f"{declared.dtype} needs the table {declared.table}"
         for dtype, each in self.types.items():
             if declared.table in each.tables and dtype not in own:
-                raise Contradictory(f"{request}, which belongs to {dtype} (set another dtype)")
+                raise LayoutConflict(f"{request}, which belongs to {dtype} (set another dtype)")
         # Databases treat names that differ only in case as equal.
         for name in (*self.user_views, *(each for each in self.leaves if each != declared.table)):
             if name.lower() == declared.table.lower():
-                raise Contradictory(f"{request}, but {name} exists already (set another dtype)")
+                raise LayoutConflict(f"{request}, but {name} exists already (set another dtype)")
 
     def members(self, table: str) -> tuple[str, ...]:
         """Return the leaf tables whose rows the view of `table` shows: its own, those of its types and descendants."""
@@ -229,9 +229,9 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
     for column, storage in columns.items():
         existing = lowered.get(column.lower(), column)
         if existing != column:
-            raise Contradictory(f"{dtype} is declared with the column {existing} and with {column}: rename one")
+            raise LayoutConflict(f"{dtype} is declared with the column {existing} and with {column}: rename one")
         if present.get(column, storage) != storage:
-            raise Contradictory(
+            raise LayoutConflict(
                 f"{dtype}.{column} is declared as {present[column]} and as {storage}"
                 " (types that share a name must agree: rename one field or set another dtype)"
             )
@@ -258,7 +258,7 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
             declared = mapped_declaration(declaration_of(payload))
             layout = layout.with_declaration(declared)
             accepted[name] = declared
-        except Contradictory as reason:
+        except LayoutConflict as reason:
             refused[name] = str(reason)
         except (UnknownShape, msgspec.DecodeError) as error:  # from a newer version, or damaged
             refused[name] = f"this version cannot read the declaration of its type: {error}"

@@ -13,11 +13,11 @@ from sqlalchemy import Index, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateIndex, CreateTable
 
-from pycrorm_async.projections.schema.layout import Kept, Layout
+from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
 from pycrorm_async.projections.schema.tables import Storage, index_name, make_table, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["EPISODE", "make_kept", "refresh_some", "shown_texts", "kept_tables"]
+__all__ = ["EPISODE", "make_materialised", "refresh_some", "shown_texts", "materialised_tables"]
 
 EPISODE = "process_metadata_id"
 _EPISODES = 200
@@ -25,7 +25,7 @@ _EPISODES = 200
 _PROGRESS: dict[str, Storage] = {"id": "key", "folded": "integer"}
 
 
-async def make_kept(connection: AsyncConnection, kept: Kept, generation: int) -> None:
+async def make_materialised(connection: AsyncConnection, kept: MaterialisedView, generation: int) -> None:
     """Create the two tables of a materialised view, empty."""
     stored = dialect_of(connection).stored_column
     rows = make_table(kept.table, kept.columns, generation, stored)
@@ -35,7 +35,7 @@ async def make_kept(connection: AsyncConnection, kept: Kept, generation: int) ->
     await connection.execute(CreateTable(make_table(kept.progress, _PROGRESS, generation, stored)))
 
 
-def kept_tables(layout: Layout) -> list[str]:
+def materialised_tables(layout: Layout) -> list[str]:
     """Return all tables of materialised views, including those of views whose SQL was changed since."""
     present = [name for kept in layout.kept.values() for name in (kept.table, kept.progress)]
     return [*present, *layout.outdated]

@@ -3,7 +3,7 @@
 Most views select their table unchanged. `designator`, `action`, `motion`, `language` and `robot_state` select from
 `task_tree_node`, `position` and `quaternion` from `pose`; a leaf's view unites the tables of its descendants.
 
-The views exclude simulations, so that every reader sees only what really happened. `session_views` replaces them, for
+The views exclude simulations, so that every reader sees only real episodes. `session_views` replaces them, for
 one connection, by views of the same names that include simulations.
 """
 
@@ -39,7 +39,7 @@ from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.pick_up_view import pick_ups_with_context
 from pycrorm_async.projections.schema.tables import CORE, OWN, column_type, make_table
 
-__all__ = ["public_views", "own_views", "View"]
+__all__ = ["public_views", "projection_views", "View"]
 
 View: TypeAlias = Select[Any] | CompoundSelect[Any]
 _Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
@@ -141,7 +141,7 @@ def public_views(
     return views
 
 
-def own_views(
+def projection_views(
     layout: Layout, number: int, generation: int, stored: Callable[[str], str], *, simulated: bool = False
 ) -> dict[str, View]:
     """Return the views of a custom projection.

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.projections.schema.generations import Generation, all_noted, projections_in, view_texts_of
+from pycrorm_async.projections.schema.generations import Generation, projections_in, read_generations, view_texts_of
 from pycrorm_async.store.dialects import dialect_of
 
 __all__ = ["with_views", "all_views"]
@@ -30,5 +30,5 @@ async def with_views(engine: AsyncEngine, views: Mapping[str, str]) -> AsyncIter
 
 async def all_views(connection: AsyncConnection, generation: Generation) -> dict[str, str]:
     """Return name and SQL of every view including simulations; a view may select from those before it."""
-    projections = projections_in(await all_noted(connection))
+    projections = projections_in(await read_generations(connection))
     return view_texts_of(connection, generation, projections, simulated=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from pycrorm_async.events.codec import fingerprint
-from pycrorm_async.projections.schema.generations import SHOWN, noted
+from pycrorm_async.projections.schema.generations import SHOWN, read_generation
 from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -20,7 +20,7 @@ class _DtypeOnly(msgspec.Struct):
 async def unmade_types(log: EventLog) -> dict[str, str]:
     """Return the reasons by dtype, or by fingerprint where the declaration's dtype cannot be read."""
     async with log.snapshot() as connection:
-        generation = await noted(connection, SHOWN)
+        generation = await read_generation(connection, SHOWN)
         payloads = await dialect_of(connection).declarations(connection)
     refused = unite(Layout() if generation is None else generation.layout, payloads).refused
     names = {fingerprint(each): _dtype(each) for each in payloads if fingerprint(each) in refused}

@@ -16,7 +16,7 @@ from sqlalchemy import Dialect, Select, TableClause, column, table
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
-from pycrorm_async.projections.schema.layout import Kept, Layout
+from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
 from pycrorm_async.projections.schema.mapped_tables import storage_of
 from pycrorm_async.projections.schema.materialised_views import EPISODE
 
@@ -55,13 +55,13 @@ def with_user_views(layout: Layout, views: Sequence[UserView], dialect: Dialect)
     return layout.with_views(texts, {each.name: _kept(each, texts[each.name]) for each in views if each.materialised})
 
 
-def _kept(view: UserView, sql: str) -> Kept:
+def _kept(view: UserView, sql: str) -> MaterialisedView:
     columns = {name: storage_of(each.type) for name, each in view.meaning.subquery().c.items()}
     if EPISODE not in columns:
         raise CallerError(f"the view {view.name} cannot be materialised: its rows name no episode (select {EPISODE})")
     # The digest gives a changed query another table, so that it never shows rows of the query before.
     digest = hashlib.blake2b(f"{view.name}{sql}{columns}".encode(), digest_size=6).hexdigest()
-    return Kept(columns, f"pycrorm_view_{digest}", f"pycrorm_view_{digest}_progress")
+    return MaterialisedView(columns, f"pycrorm_view_{digest}", f"pycrorm_view_{digest}_progress")
 
 
 def view_texts(views: Sequence[UserView], layout: Layout, dialect: Dialect) -> dict[str, str]:

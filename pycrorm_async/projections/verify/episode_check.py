@@ -11,7 +11,7 @@ from typing import Any
 
 from pycrorm_async.events.ids import row_id, row_key
 from pycrorm_async.events.order import OrderCheck
-from pycrorm_async.projections.fold.fold import CannotFold, Undecodable, fold_happening, happening_of
+from pycrorm_async.projections.fold.fold import CannotFold, UndecodablePayload, fold_happening, happening_of
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.tables import COLUMNS
@@ -114,7 +114,7 @@ class EpisodeCheck:
                 fold_happening(event, happening, designators, rows)
         except CannotFold as reason:
             # An event that is in the tables could be folded once, so the log has changed since.
-            if shown or isinstance(reason, Undecodable):
+            if shown or isinstance(reason, UndecodablePayload):
                 self._damaged(
                     event.sequence, f"is in the tables, and cannot be folded: {reason}" if shown else str(reason)
                 )

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 from pycrorm_async.projections.verify.row_comparison import Difference
 
-__all__ = ["Damage", "Stopped", "Verified"]
+__all__ = ["Damage", "StoppedEpisode", "VerifyResult"]
 
 
 class Damage(NamedTuple):
@@ -23,7 +23,7 @@ class Damage(NamedTuple):
         return f"episode {self.number}, event {self.sequence}: {self.reason}"
 
 
-class Stopped(NamedTuple):
+class StoppedEpisode(NamedTuple):
     """An episode that is no longer folded (parked) or no longer stored (refused)."""
 
     number: int
@@ -31,7 +31,7 @@ class Stopped(NamedTuple):
     reason: str
 
 
-class Verified(NamedTuple):
+class VerifyResult(NamedTuple):
     """The result of a verification.
 
     Attributes:
@@ -56,6 +56,6 @@ class Verified(NamedTuple):
     differences: list[Difference]
     remarks: int
     not_compared: Mapping[str, str]
-    stopped: list[Stopped]
+    stopped: list[StoppedEpisode]
     unmade: Mapping[str, str]
     outdated: str | None

@@ -43,8 +43,8 @@ class Difference(NamedTuple):
 
     def __str__(self) -> str:
         if self.column is None:
-            what = "has a row that no event makes" if self.expected is None else "lacks a row"
-            return f"{self.table} {what}: {self.stored if self.expected is None else self.expected}"
+            fault = "has a row that no event makes" if self.expected is None else "lacks a row"
+            return f"{self.table} {fault}: {self.stored if self.expected is None else self.expected}"
         return f"{self.table}.{self.column} is {self.stored!r}, and should be {self.expected!r}"
 
 

@@ -23,14 +23,14 @@ from pycrorm_async.projections.schema.generations import Generation, current_gen
 from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.projections.schema.unmade_types import unmade_types
 from pycrorm_async.projections.verify.episode_check import EpisodeCheck
-from pycrorm_async.projections.verify.findings import Damage, Stopped, Verified
+from pycrorm_async.projections.verify.findings import Damage, StoppedEpisode, VerifyResult
 from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
-from pycrorm_async.projections.verify.verify_custom import compared, not_compared
+from pycrorm_async.projections.verify.verify_custom import compare_projection, uncompared_projections
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 
-__all__ = ["Verified", "Damage", "Stopped", "verify"]
+__all__ = ["VerifyResult", "Damage", "StoppedEpisode", "verify"]
 
 _PART_EVENTS = 4_000
 """Bounds the events of one part, and so the memory used."""
@@ -61,7 +61,7 @@ async def verify(
     episode: EpisodeRow | None = None,
     projections: Sequence[Projection] = (),
     report_progress: Callable[[int, int], None] = lambda _done, _total: None,
-) -> Verified:
+) -> VerifyResult:
     """Verify a whole memory, or one episode.
 
     Args:
@@ -100,14 +100,14 @@ class _Check:
         self._damage = self._drift = self._remarks = 0
         self._episodes = self._events = self._rows = self._behind = 0
         self._not_compared: dict[str, str] = {}
-        self._stopped: list[Stopped] = []
+        self._stopped: list[StoppedEpisode] = []
         self._unmade: dict[str, str] = {}
         self.outdated: str | None = None
         self._unfinished = EpisodeCheck(0)
         self._comparison: Comparison | None = None
 
-    def result(self) -> Verified:
-        return Verified(
+    def result(self) -> VerifyResult:
+        return VerifyResult(
             episodes=self._episodes,
             events=self._events,
             rows=self._rows,
@@ -143,9 +143,9 @@ class _Check:
         for each in await self._log.stopped():
             if episode is None or each.number == episode.number:
                 if each.refused is not None:
-                    self._stopped.append(Stopped(each.number, "refused", each.refused))
+                    self._stopped.append(StoppedEpisode(each.number, "refused", each.refused))
                 if each.parked is not None:
-                    self._stopped.append(Stopped(each.number, "parked", each.parked))
+                    self._stopped.append(StoppedEpisode(each.number, "parked", each.parked))
         if episode is None:
             self._unmade = await unmade_types(self._log)
 
@@ -169,13 +169,13 @@ class _Check:
 
     async def projections(self, projections: Sequence[Projection], episode: EpisodeRow | None) -> None:
         """Compare the tables of these projections, for all episodes or for one."""
-        self._not_compared = await not_compared(self._log, projections)
+        self._not_compared = await uncompared_projections(self._log, projections)
         first, end = (0, None) if episode is None else (episode.number, episode.number + 1)
         for each in projections:
             if each.name in self._not_compared:
                 continue
             try:
-                async for part in compared(self._log, each, first=first, end=end):
+                async for part in compare_projection(self._log, each, first=first, end=end):
                     self._rows += part.rows
                     for difference in part.differences:
                         self._differs(difference)

@@ -16,32 +16,32 @@ from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinit
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch
-from pycrorm_async.projections.schema.generations import Generation, all_noted, projections_in
+from pycrorm_async.projections.schema.generations import Generation, projections_in, read_generations
 from pycrorm_async.projections.schema.tables import OWN
 from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
-__all__ = ["Compared", "compared", "not_compared"]
+__all__ = ["PartComparison", "compare_projection", "uncompared_projections"]
 
 _PART_EVENTS = 4_000
 _EPISODES_MAX = 400
 _ATTEMPTS = 10
 
 
-class Compared(NamedTuple):
+class PartComparison(NamedTuple):
     """The result for some episodes: the number of rows compared, and the differences."""
 
     rows: int
     differences: list[Difference]
 
 
-async def not_compared(log: EventLog, projections: Sequence[Projection]) -> dict[str, str]:
+async def uncompared_projections(log: EventLog, projections: Sequence[Projection]) -> dict[str, str]:
     """Return the projections of this memory that cannot be compared, by name, with the reasons."""
     by_name = {each.name: each for each in projections}
     async with log.snapshot() as connection:
-        generations = projections_in(await all_noted(connection))
+        generations = projections_in(await read_generations(connection))
         dialect = connection.dialect
     reasons: dict[str, str] = {}
     for name, each in generations.items():
@@ -53,9 +53,9 @@ async def not_compared(log: EventLog, projections: Sequence[Projection]) -> dict
     return reasons
 
 
-async def compared(
+async def compare_projection(
     log: EventLog, projection: Projection, *, first: int = 0, end: int | None = None
-) -> AsyncIterator[Compared]:
+) -> AsyncIterator[PartComparison]:
     """Yield the comparison of the episodes with numbers from `first` up to but not including `end`, part by part.
 
     Yields one empty part if the projection has no tables yet. Raises `DatabaseForeign` if a table is missing.
@@ -66,12 +66,14 @@ async def compared(
         yield part
 
 
-async def _part(log: EventLog, projection: Projection, first: int, end: int | None) -> tuple[int | None, Compared]:
+async def _part(
+    log: EventLog, projection: Projection, first: int, end: int | None
+) -> tuple[int | None, PartComparison]:
     for _ in range(_ATTEMPTS):
         async with log.snapshot() as connection:
-            generation = projections_in(await all_noted(connection)).get(projection.name)
+            generation = projections_in(await read_generations(connection)).get(projection.name)
             if generation is None or generation.version != projection.version:
-                return None, Compared(0, [])
+                return None, PartComparison(0, [])
             comparison = Comparison(generation, dialect_of(connection).stored_column, {})
             place = checkpoints.place_of(generation.number, projection.name)
             if await dialect_of(connection).keep(connection, [*comparison.tables, place]):
@@ -85,7 +87,7 @@ async def _part(log: EventLog, projection: Projection, first: int, end: int | No
 
 async def _look(
     connection: AsyncConnection, projection: Projection, comparison: Comparison, first: int, end: int | None
-) -> tuple[int | None, Compared]:
+) -> tuple[int | None, PartComparison]:
     folded = await _folded(connection, projection, comparison.generation, first, end)
     payloads = await dialect_of(connection).declarations(connection)
     _, batch = CustomFoldDefinition(projection).learn(comparison.generation.layout, payloads)
@@ -111,7 +113,7 @@ async def _look(
     within = Range(first << 31 or None, None if following is None else following << 31, None, None)
     differences = await comparison.differences(connection, rows, within, carried=(), settled=())
     findings += [each._replace(table=each.table.removeprefix(OWN)) for each in differences if each.number not in lost]
-    return None if following == end else following, Compared(comparison.count, findings)
+    return None if following == end else following, PartComparison(comparison.count, findings)
 
 
 async def _folded(
