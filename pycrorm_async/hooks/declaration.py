@@ -249,12 +249,12 @@ def _declarable_fields(
 ) -> typing.Iterator[Field]:
     """Yield the fields that can be columns of one table, each with its own slot; add the others to `undeclared`."""
     accepted: list[FieldDeclared] = []
-    all_fit = fault_in_fields([field.declared for field in fields])
-    if strict and all_fit is not None:
-        raise DeclarationRefused(_path(designator), all_fit)
+    combined_fault = fault_in_fields([field.declared for field in fields])
+    if strict and combined_fault is not None:
+        raise DeclarationRefused(_path(designator), combined_fault)
     for field in fields:
         name, kind = field.declared.name, _type_text(field.declared)
-        fault = fault_in_fields([*accepted, field.declared]) if all_fit is not None else None
+        fault = fault_in_fields([*accepted, field.declared]) if combined_fault is not None else None
         if field_types.get(name, kind) != kind:
             fault = f"field {name!r} was {field_types[name]} before and is {kind} now (rename it, or set another dtype)"
         if fault is None:

@@ -194,7 +194,7 @@ class Episode:
             parent=self._parent_of(node.parent),
             designator=declared.fingerprint or None,
             parameters=read_parameters(node.designator, declared, self, missing),
-            robot=self._robot(),
+            robot=self._robot_state(),
             simulated=self.simulated,
             continues=continues,
         )
@@ -329,7 +329,7 @@ class Episode:
         for name, reason in missing.items():
             self._emitter.missing.note(declared.dtype, name, reason)
 
-    def _robot(self) -> RobotValue | None:
+    def _robot_state(self) -> RobotValue | None:
         if self.world is None:
             return None
         if not self.acts_in_recorded_world:

@@ -156,7 +156,7 @@ class Sampler:
         written = motion.written
         changed = {
             channel: value
-            for channel, value in _channels(robot).items()
+            for channel, value in _read_channels(robot).items()
             if channel not in written or abs(value - written[channel]) > margin
         }
         # The garbage collector may have ended the motion in this thread since the channels were read.
@@ -172,7 +172,7 @@ class Sampler:
         recorded_world.sampled.setdefault(robot, {}).update(changed)
 
 
-def _channels(robot: Object) -> dict[str, float]:
+def _read_channels(robot: Object) -> dict[str, float]:
     """Read base pose and joints as last set. Each read is atomic, even while another thread sets the value."""
     pose = robot.pose
     x, y, z = pose.position

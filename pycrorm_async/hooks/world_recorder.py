@@ -121,7 +121,7 @@ class WorldRecorder:
                 added.object_type.name,
                 pose_value(added.pose),
                 dict(added.joint_positions()),
-                self._node(),
+                self._causing_node(),
             ),
             row_of=added,
         )
@@ -129,7 +129,7 @@ class WorldRecorder:
     def object_removed(self, removed: Object) -> None:
         reference = self._references.pop(removed, None)
         if reference is not None:
-            self._put(lambda: ObjectRemoved(reference, self._node()))
+            self._put(lambda: ObjectRemoved(reference, self._causing_node()))
 
     def object_moved(self, moved: Object) -> None:
         reference = self._references.get(moved)
@@ -137,7 +137,11 @@ class WorldRecorder:
             return
         self._put(
             lambda: ObjectMoved(
-                reference.object, clean(moved.name), moved.object_type.name, pose_value(moved.pose), self._node()
+                reference.object,
+                clean(moved.name),
+                moved.object_type.name,
+                pose_value(moved.pose),
+                self._causing_node(),
             ),
             row_of=moved,
             identity=reference.object,
@@ -146,23 +150,23 @@ class WorldRecorder:
     def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
         reference = self._references.get(moved)
         if reference is not None:
-            self._put(lambda: JointsMoved(reference, dict(positions), self._node()))
+            self._put(lambda: JointsMoved(reference, dict(positions), self._causing_node()))
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        pair = self._pair(parent, child)
+        pair = self._reference_pair(parent, child)
         if pair is not None:
-            self._put(lambda: ObjectAttached(*pair, link, self._node()))
+            self._put(lambda: ObjectAttached(*pair, link, self._causing_node()))
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        pair = self._pair(parent, child)
+        pair = self._reference_pair(parent, child)
         if pair is not None:
-            self._put(lambda: ObjectDetached(*pair, link, self._node()))
+            self._put(lambda: ObjectDetached(*pair, link, self._causing_node()))
 
-    def _pair(self, parent: Object, child: Object) -> tuple[ObjectReference, ObjectReference] | None:
+    def _reference_pair(self, parent: Object, child: Object) -> tuple[ObjectReference, ObjectReference] | None:
         first, second = self._references.get(parent), self._references.get(child)
         return (first, second) if first is not None and second is not None else None
 
-    def _node(self) -> int | None:
+    def _causing_node(self) -> int | None:
         """Return the node that caused a change: the context's innermost recorded node, if this episode recorded it."""
         node = current_node.get()
         while node is not None and node.record is None:

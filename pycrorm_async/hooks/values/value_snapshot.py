@@ -86,20 +86,22 @@ def encode_parameter(field: FieldDeclared, enum: type[Enum] | None, value: Any, 
     if field.type == "list":
         if isinstance(value, str | bytes) or not isinstance(value, Sequence | np.ndarray):
             raise _mismatch("list", value)
-        scalar = _WRITERS[field.item or "text"]
-        return [scalar(each, enum, references) if each is not None else None for each in _bounded(value, value)]
+        encode_item = _ENCODERS[field.item or "text"]
+        return [
+            encode_item(each, enum, references) if each is not None else None for each in _limit_items(value, value)
+        ]
     if field.type == "dict":
         if not isinstance(value, Mapping):
             raise _mismatch("dict", value)
-        scalar = _WRITERS[field.item or "text"]
+        encode_item = _ENCODERS[field.item or "text"]
         entries = {
-            _key(key): scalar(each, enum, references) if each is not None else None
-            for key, each in _bounded(value, value.items())
+            _encode_key(key): encode_item(each, enum, references) if each is not None else None
+            for key, each in _limit_items(value, value.items())
         }
         if len(entries) < len(value):
             raise UnrecordableValue("two keys of the dict have the same text")
         return entries
-    return _WRITERS[field.type](value, enum, references)
+    return _ENCODERS[field.type](value, enum, references)
 
 
 def encode_or_missing(value: Any, references: References) -> Any:
@@ -170,10 +172,10 @@ def _arguments(failure: BaseException, references: References, depth: int) -> li
     return [cut(clean(str(failure.message)), _TEXT_MAX), inside]
 
 
-# --- one writer per declared type ---------------------------------------------------------------------------------
+# --- one encoder per declared type --------------------------------------------------------------------------------
 
 
-def _integer(value: Any, _enum: type[Enum] | None, _references: References) -> int:
+def _encode_integer(value: Any, _enum: type[Enum] | None, _references: References) -> int:
     try:
         number = operator.index(value)
     except TypeError:
@@ -183,7 +185,7 @@ def _integer(value: Any, _enum: type[Enum] | None, _references: References) -> i
     return int(number)
 
 
-def _real(value: Any, _enum: type[Enum] | None, _references: References) -> float:
+def _encode_real(value: Any, _enum: type[Enum] | None, _references: References) -> float:
     if type(value) is not float:
         if isinstance(value, str | bytes) or not hasattr(value, "__float__"):
             raise _mismatch("float", value)
@@ -196,19 +198,19 @@ def _real(value: Any, _enum: type[Enum] | None, _references: References) -> floa
     return float.__float__(value)
 
 
-def _text(value: Any, _enum: type[Enum] | None, _references: References) -> str:
+def _encode_text(value: Any, _enum: type[Enum] | None, _references: References) -> str:
     if not isinstance(value, str):
         raise _mismatch("str", value)
-    return str.__str__(_checked(str.__str__(value)))
+    return str.__str__(_require_writable(str.__str__(value)))
 
 
-def _boolean(value: Any, _enum: type[Enum] | None, _references: References) -> bool:
+def _encode_boolean(value: Any, _enum: type[Enum] | None, _references: References) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise _mismatch("bool", value)
     return bool(value)
 
 
-def _datetime(value: Any, _enum: type[Enum] | None, _references: References) -> str:
+def _encode_datetime(value: Any, _enum: type[Enum] | None, _references: References) -> str:
     if not isinstance(value, datetime):
         raise _mismatch("datetime", value)
     if value.tzinfo is None:
@@ -216,16 +218,16 @@ def _datetime(value: Any, _enum: type[Enum] | None, _references: References) -> 
     return value.astimezone(UTC).isoformat(timespec="microseconds")
 
 
-def _member(value: Any, enum: type[Enum] | None, _references: References) -> str:
+def _encode_member(value: Any, enum: type[Enum] | None, _references: References) -> str:
     if enum is not None and not isinstance(value, enum):
         raise UnrecordableValue(f"{clean_repr(value)} is not a member of {enum.__name__}")
     name = value.name
     if not isinstance(name, str):
         raise UnrecordableValue(f"{clean_repr(value)} is not a named member of {type(value).__name__}")
-    return str(_checked(name))
+    return str(_require_writable(name))
 
 
-def _pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
+def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
     if not isinstance(value, Pose):
         raise _mismatch("Pose", value)
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
@@ -235,7 +237,7 @@ def _pose(value: Any, _enum: type[Enum] | None, _references: References) -> Pose
     return pose_value(value)
 
 
-def _object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
+def _encode_object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
     if isinstance(value, Object):
         return references.reference(value) or _unrecorded_object(value)
     if isinstance(value, ObjectPart):
@@ -270,7 +272,7 @@ def _pose_or_none(value: Any) -> PoseValue | None:
         pose = value.pose
     except Exception:  # noqa: BLE001  the object or link was removed; `perform` reports it
         return None
-    return _pose(pose, None, _NO_REFERENCES) if pose is not None else None
+    return _encode_pose(pose, None, _NO_REFERENCES) if pose is not None else None
 
 
 def _type_name(value: Any) -> str | None:
@@ -278,15 +280,15 @@ def _type_name(value: Any) -> str | None:
     return kind.name if isinstance(kind, Enum) else clean(str(kind)) if kind is not None else None
 
 
-_WRITERS: dict[str, Callable[[Any, type[Enum] | None, References], Any]] = {
-    "integer": _integer,
-    "real": _real,
-    "text": _text,
-    "boolean": _boolean,
-    "datetime": _datetime,
-    "enum": _member,
-    "pose": _pose,
-    "object": _object,
+_ENCODERS: dict[str, Callable[[Any, type[Enum] | None, References], Any]] = {
+    "integer": _encode_integer,
+    "real": _encode_real,
+    "text": _encode_text,
+    "boolean": _encode_boolean,
+    "datetime": _encode_datetime,
+    "enum": _encode_member,
+    "pose": _encode_pose,
+    "object": _encode_object,
 }
 
 
@@ -298,33 +300,33 @@ class _NoReferences:
 _NO_REFERENCES = _NoReferences()
 
 
-def _key(key: Any) -> str:
+def _encode_key(key: Any) -> str:
     if isinstance(key, Enum):
         return str(key.name)
     if not isinstance(key, str):
         raise UnrecordableValue(f"a key of the dict is a {type(key).__name__}, not a str")
-    return str(_checked(key))
+    return str(_require_writable(key))
 
 
-def _checked(value: Any) -> Any:
+def _require_writable(value: Any) -> Any:
     reason = unwritable(value)
     if reason is not None:
         raise UnrecordableValue(reason)
     return value
 
 
-def _bounded(holder: Any, items: Iterable[Any]) -> Iterable[Any]:
+def _limit_items(holder: Any, items: Iterable[Any]) -> Iterable[Any]:
     """Return the items of a container. Raises `UnrecordableValue` if there are more than `ITEMS_MAX`."""
     if len(holder) > ITEMS_MAX:
         raise UnrecordableValue(f"it holds {len(holder):,} items, at most {ITEMS_MAX:,} are allowed")
-    return items if type(holder) in _BUILT_IN_CONTAINERS else _counted(items)
+    return items if type(holder) in _BUILT_IN_CONTAINERS else _stop_at_limit(items)
 
 
 _BUILT_IN_CONTAINERS = (list, tuple, dict, np.ndarray)
 """Types whose `len` bounds their iteration; a user's own class may yield items without end."""
 
 
-def _counted(items: Iterable[Any]) -> Iterator[Any]:
+def _stop_at_limit(items: Iterable[Any]) -> Iterator[Any]:
     for number, each in enumerate(items):
         if number == ITEMS_MAX:
             raise UnrecordableValue(f"it holds more than {ITEMS_MAX:,} items")
@@ -346,16 +348,16 @@ class _ValueReader:
         if depth > _DEPTH_MAX:
             raise UnrecordableValue(f"it is nested more than {_DEPTH_MAX} deep")
         if isinstance(value, Enum):
-            return _checked(value.name)
+            return _require_writable(value.name)
         if value is None or isinstance(value, bool | np.bool_):
             return None if value is None else bool(value)
         if isinstance(value, str | int | float):
-            return _checked(_as_built_in(value))
+            return _require_writable(_as_built_in(value))
         if isinstance(value, np.generic):
             return self.read(value.item(), depth + 1)
-        for kind, writer in ((Pose, _pose), (datetime, _datetime), (OBJECT_TYPES, _object)):
+        for kind, encode in ((Pose, _encode_pose), (datetime, _encode_datetime), (OBJECT_TYPES, _encode_object)):
             if isinstance(value, kind):
-                return writer(value, None, self._references)
+                return encode(value, None, self._references)
         if isinstance(value, Outcome):
             value = value.in_brief()
         if isinstance(value, Mapping | list | tuple | np.ndarray):
@@ -368,7 +370,7 @@ class _ValueReader:
         self._enclosing_ids.add(id(value))
         items: Any
         if isinstance(value, Mapping):
-            items = {_key(key): self.read(each, depth + 1) for key, each in value.items()}
+            items = {_encode_key(key): self.read(each, depth + 1) for key, each in value.items()}
         else:
             items = [self.read(each, depth + 1) for each in value]
         self._enclosing_ids.discard(id(value))
@@ -381,7 +383,7 @@ def _as_built_in(value: str | float) -> str | int | float:
         return str.__str__(value)
     if isinstance(value, float):
         return float.__float__(value)
-    return _integer(value, None, _NO_REFERENCES)
+    return _encode_integer(value, None, _NO_REFERENCES)
 
 
 def _mismatch(declared: str, value: Any) -> UnrecordableValue:
