@@ -85,7 +85,7 @@ async def test_a_memory_that_is_closed_is_no_longer_asked(tmp_path: Path) -> Non
     closed.set()
     with pytest.raises(CallerError, match="is closed: ask while it is open"):
         await task
-    with pytest.raises(CallerError, match="asked of a memory"):
+    with pytest.raises(CallerError, match="queried from a memory"):
         await asked()
 
 

@@ -237,9 +237,9 @@ async def test_accessing_moves_a_joint_by_a_distance(
 @pytest.mark.parametrize(
     ("changed", "failure", "message"),
     [
-        ({"distance": 0.36}, EnvironmentManipulationImpossible, "goes from 0 to 0.35: from 0 not by 0.36"),
-        ({"distance": -0.01}, EnvironmentManipulationImpossible, "goes from 0 to 0.35: from 0 not by -0.01"),
-        ({"distance": math.nan}, EnvironmentManipulationImpossible, "not by nan"),
+        ({"distance": 0.36}, EnvironmentManipulationImpossible, "at 0 cannot move by 0.36: its limits are 0 to 0.35"),
+        ({"distance": -0.01}, EnvironmentManipulationImpossible, "at 0 cannot move by -0.01: its limits are 0 to 0.35"),
+        ({"distance": math.nan}, EnvironmentManipulationImpossible, "cannot move by nan"),
         ({"gripper": "left"}, IllPosedGoalFailure, "the gripper of the LEFT arm is l_gripper_tool_frame, not left"),
         (
             {"drawer_joint": "fridge_door_joint"},

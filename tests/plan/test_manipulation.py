@@ -289,7 +289,7 @@ async def test_a_thing_of_several_links_is_held_only_where_it_is(scene: Scene) -
 async def test_neither_furniture_nor_the_robot_is_held(scene: Scene) -> None:
     before = scene.world.save_state()
     for thing in (scene.kitchen, scene.robot):
-        with pytest.raises(IllPosedGoalFailure, match=f"{thing.name} is nothing that a gripper can hold"):
+        with pytest.raises(IllPosedGoalFailure, match=f"{thing.name} cannot be held by a gripper"):
             await GripActionPerformable(Arms.LEFT, thing, 1.0).perform()
     assert scene.world.save_state() == before
 
@@ -297,7 +297,7 @@ async def test_neither_furniture_nor_the_robot_is_held(scene: Scene) -> None:
 async def test_an_effort_below_zero_holds_nothing(scene: Scene) -> None:
     await reached(scene, 1.3)
     for effort in (-1.0, math.nan):
-        with pytest.raises(IllPosedGoalFailure, match=r"an effort of \S+ N holds nothing"):
+        with pytest.raises(IllPosedGoalFailure, match=r"effort must be >= 0 N, got"):
             await GripActionPerformable(Arms.LEFT, scene.milk, effort).perform()
     assert scene.robot.attachments == {}
 

@@ -137,9 +137,11 @@ async def test_the_arm_that_is_wanted_is_asked_for(scene: Scene) -> None:
 
 async def test_the_experience_of_the_context_is_asked_and_without_one_the_caller_is_told(scene: Scene) -> None:
     location = DatabaseCostmapLocation(scene.milk, scene.robot)
-    with pytest.raises(CallerError, match=r"asked of a memory: do it inside `async with Memory.open\(url\)`"):
+    with pytest.raises(
+        CallerError, match=r"queried from a memory, and none is open: resolve inside `async with Memory.open\(url\)`"
+    ):
         await location.resolve()
-    with pytest.raises(CallerError, match="asked of a memory"):
+    with pytest.raises(CallerError, match="queried from a memory"):
         async for _ in location:
             pass
     token = experience.set(Known(past()))
@@ -150,9 +152,9 @@ async def test_the_experience_of_the_context_is_asked_and_without_one_the_caller
 
 
 async def test_a_question_that_makes_no_sense_is_told(scene: Scene) -> None:
-    with pytest.raises(CallerError, match="give one as target, not a place"):
+    with pytest.raises(CallerError, match="pass an object as target, not a place"):
         DatabaseCostmapLocation(Pose())  # type: ignore[arg-type]  # the fault this test is about
-    with pytest.raises(CallerError, match="done with one arm: ask for LEFT, for RIGHT, or for None"):
+    with pytest.raises(CallerError, match="uses one arm: reachable_arm must be LEFT, RIGHT, or None"):
         remembered(scene, Known(), arm=Arms.BOTH)
     scene.world.remove(scene.robot)
     with pytest.raises(PerceptionObjectNotInWorld, match="pr2"):

@@ -1,1 +1,1 @@
-"""Actions of a mobile manipulator and the descriptions they are grounded from."""
+"""Built-in actions of a mobile manipulator, and descriptions that resolve to them."""

@@ -1,8 +1,8 @@
-"""The first of the actions that are there from the start: posture, driving, looking, picking up and placing.
+"""Basic actions: posture, driving, looking, picking up and placing.
 
-What one hand does with handles and things is in `plan.manipulation`, looking for and bringing things in
-`plan.fetching`. Each is recorded with its fields; concepts are those of SOMA. Positions are in metres in the
-map, angles in rad. Descriptions with alternatives for each of them are in `pycrorm_async.plan.actions.descriptions`.
+Actions with handles and grippers are in `actions.manipulation`, detection and transport in `actions.transport`. Each
+action is recorded with its fields; concepts are those of SOMA. Positions are in metres in the map, angles in rad.
+Descriptions with alternatives are in `actions.descriptions`.
 
 >>> await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
 """
@@ -47,7 +47,7 @@ __all__ = [
 
 
 class CheckedAction(ActionAbstract):
-    """Its fields are checked when it is built, as a motion's are. Raises `ResolutionError`."""
+    """An action whose fields are checked when it is built. Raises `ResolutionError`."""
 
     def __post_init__(self) -> None:
         check_properties(self)
@@ -86,7 +86,7 @@ class SetGripperActionPerformable(CheckedAction):
 
 @dataclass
 class ParkArmsActionPerformable(CheckedAction):
-    """Fold an arm, or both, out of the way."""
+    """Move an arm, or both, to the folded park posture."""
 
     concept: ClassVar[str | None] = "ParkingArms"
 
@@ -132,16 +132,16 @@ class LookAtActionPerformable(CheckedAction):
 
 @dataclass
 class PickUpActionPerformable(CheckedAction):
-    """Take an object with one arm and lift it by 3 cm; the object is attached to the gripper afterwards.
+    """Grasp an object with one arm and lift it by 3 cm; afterwards it is attached to the gripper.
 
-    The gripper is turned as `grasp` says in the object's own axes. It opens 0.1 m before the object, seen
-    along the direction it points to when the action begins.
+    `grasp` sets the gripper's orientation in the object's own axes. The gripper opens 0.1 m before the object, measured
+    along the direction in which it points when the action begins.
 
     Raises:
         IKError: one of the three goals of the arm is out of reach.
-        EndEffectorFailure: the gripper holds something else.
-        PerceptionObjectNotInWorld: there is no such object.
-        IllPosedGoalFailure: not one arm, or furniture or a robot is to be held.
+        EndEffectorFailure: the gripper holds another object.
+        PerceptionObjectNotInWorld: the object is not in the robot's world.
+        IllPosedGoalFailure: `arm` is not a single arm, or the object is furniture or a robot.
         CapabilityAbsenceFailure: the robot has no such arm.
     """
 
@@ -156,26 +156,26 @@ class PickUpActionPerformable(CheckedAction):
 
     async def perform(self) -> None:
         robot = require_robot()
-        wanted = in_world(self.object_designator)
-        check_takable(robot, self.arm, wanted)
+        target = in_world(self.object_designator)
+        check_takable(robot, self.arm, target)
         tool_frame = robot.one_arm(self.arm).tool_frame
-        before, at, above = pick_up_poses(wanted.pose, self.grasp, robot.body.link_pose(tool_frame))
+        before, at, above = pick_up_poses(target.pose, self.grasp, robot.body.link_pose(tool_frame))
         await MoveTCPMotion(before, self.arm, allow_gripper_collision=True).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(at, self.arm, allow_gripper_collision=True).perform()
         await MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
-        take(robot, self.arm, wanted)
+        take(robot, self.arm, target)
         await MoveTCPMotion(above, self.arm, allow_gripper_collision=True).perform()
 
 
 @dataclass
 class PlaceActionPerformable(CheckedAction):
-    """Put the held object down: it ends at `target_location`, the gripper 7 cm behind.
+    """Place the held object at `target_location`; the gripper ends 7 cm behind it.
 
     Raises:
-        IKError: the arm does not reach; then it holds the object, unless it is the way back that it does not reach.
-        ObjectLost: the arm does not hold it.
-        PerceptionObjectNotInWorld: there is no such object.
+        IKError: the target or the retracted pose is out of reach; only in the latter case the object is placed.
+        ObjectLost: the gripper does not hold the object.
+        PerceptionObjectNotInWorld: the object is not in the robot's world.
     """
 
     concept: ClassVar[str | None] = "Placing"
@@ -202,7 +202,7 @@ class PlaceActionPerformable(CheckedAction):
 
 @dataclass
 class FaceAtPerformable(CheckedAction):
-    """Turn on the spot to face a point, and look at it."""
+    """Rotate the base on the spot to face a point, and look at it."""
 
     concept: ClassVar[str | None] = "LookingAt"
 
@@ -212,16 +212,16 @@ class FaceAtPerformable(CheckedAction):
         return frozenset({Resource.BASE, Resource.HEAD})
 
     async def perform(self) -> None:
-        here = require_robot().body.pose
-        dx, dy = self.pose.position.x - here.position.x, self.pose.position.y - here.position.y
+        base = require_robot().body.pose
+        dx, dy = self.pose.position.x - base.position.x, self.pose.position.y - base.position.y
         heading = yaw_quaternion(math.atan2(dy, dx))
-        await NavigateActionPerformable(Pose(here.position, heading, here.frame)).perform()
+        await NavigateActionPerformable(Pose(base.position, heading, base.frame)).perform()
         await LookAtActionPerformable(self.pose).perform()
 
 
 @dataclass
 class MoveAndPickUpPerformable(CheckedAction):
-    """Drive to a place, face the object there, and pick it up."""
+    """Drive to a place, face the object from there, and pick it up."""
 
     concept: ClassVar[str | None] = "Fetching"
 

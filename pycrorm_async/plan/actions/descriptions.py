@@ -1,7 +1,7 @@
-"""A description of an action holds alternatives for each property; `resolve()` takes the first of each.
+"""Descriptions of actions hold alternatives for each property; `resolve()` uses the first alternative of each.
 
-A property with one value needs no list: `ParkArmsAction(Arms.LEFT)`. Iterating a description gives every
-combination, the last property varying fastest:
+A property with one value needs no list: `ParkArmsAction(Arms.LEFT)`. Iterating a description yields every combination,
+the last property varying fastest:
 
 >>> [each.motion.name for each in SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])]
 ['OPEN', 'CLOSE']
@@ -63,16 +63,16 @@ Objects: TypeAlias = ObjectDesignatorDescription | OneOrMore[ObjectLike]
 
 
 class ActionDescription(Composable, Generic[P]):
-    """What every description does; alternatives are given by name, in the order of the performable's fields.
+    """Base of descriptions; takes the alternatives by name, in the order of the performable's fields.
 
-    Objects that are described are looked for in the world each time it is asked.
+    Object descriptions among the alternatives are matched against the world at each resolution or iteration.
     """
 
     def __init__(self, performable: Callable[..., P], **alternatives: Any) -> None:
         self._performable = performable
         self._alternatives = {name: _as_alternatives(each) for name, each in alternatives.items()}
 
-    if not TYPE_CHECKING:  # a type checker finds the fault by itself
+    if not TYPE_CHECKING:  # hidden from type checkers, which report the fault themselves
 
         def __getattr__(self, name: str) -> NoReturn:
             if name == "perform" or name in self.__dict__.get("_alternatives", ()):
@@ -80,16 +80,16 @@ class ActionDescription(Composable, Generic[P]):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def resolve(self) -> P:
-        """The performable with the first alternative of each property.
+        """Return the performable with the first alternative of each property.
 
         Raises:
             IllPosedGoalFailure: a property has no alternative.
-            ObjectNotFound: no object in the world is as described.
+            ObjectNotFound: no object in the world matches the description.
         """
         return next(iter(self))
 
     def __iter__(self) -> Iterator[P]:
-        """Every combination, the last property varying fastest. Raises as `resolve` does."""
+        """Yield every combination, the last property varying fastest. Raises as `resolve` does."""
         choices = [self._choices(name, among) for name, among in self._alternatives.items()]
         for combination in itertools.product(*choices):
             yield self._performable(**dict(zip(self._alternatives, combination, strict=True)))
@@ -102,17 +102,17 @@ class ActionDescription(Composable, Generic[P]):
         return among
 
 
-def _as_alternatives(given: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
-    """The alternatives that are given; what holds none is the only one, and so is a word, whose letters are none."""
-    if isinstance(given, ObjectDesignatorDescription):
-        return given
-    if isinstance(given, str):
-        return (given,)
+def _as_alternatives(value: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
+    """Return the alternatives; a value that is not iterable is the only one, and so is a str."""
+    if isinstance(value, ObjectDesignatorDescription):
+        return value
+    if isinstance(value, str):
+        return (value,)
     try:
-        each = iter(given)
+        alternatives = iter(value)
     except TypeError:
-        return (given,)
-    return tuple(each)
+        return (value,)
+    return tuple(alternatives)
 
 
 class MoveTorsoAction(ActionDescription[MoveTorsoActionPerformable]):
@@ -130,7 +130,7 @@ class SetGripperAction(ActionDescription[SetGripperActionPerformable]):
 
 
 class ParkArmsAction(ActionDescription[ParkArmsActionPerformable]):
-    """Fold one of these arms, or both, out of the way."""
+    """Move one of these arms, or both, to the folded park posture."""
 
     def __init__(self, arms: OneOrMore[Arms]) -> None:
         super().__init__(ParkArmsActionPerformable, arm=arms)
@@ -151,7 +151,7 @@ class LookAtAction(ActionDescription[LookAtActionPerformable]):
 
 
 class PickUpAction(ActionDescription[PickUpActionPerformable]):
-    """Take an object: one, some, or whatever is as described."""
+    """Pick up an object: a given one, one of several, or one that matches a description."""
 
     def __init__(self, object_designator_description: Objects, arms: OneOrMore[Arms], grasps: OneOrMore[Grasp]) -> None:
         super().__init__(
@@ -163,7 +163,7 @@ class PickUpAction(ActionDescription[PickUpActionPerformable]):
 
 
 class PlaceAction(ActionDescription[PlaceActionPerformable]):
-    """Put the held object down at one of these poses."""
+    """Place the held object at one of these poses."""
 
     def __init__(
         self, object_designator_description: Objects, target_locations: OneOrMore[Pose], arms: OneOrMore[Arms]
@@ -177,7 +177,7 @@ class PlaceAction(ActionDescription[PlaceActionPerformable]):
 
 
 class GripAction(ActionDescription[GripActionPerformable]):
-    """Hold an object that is in the gripper, with one of these efforts (N)."""
+    """Close a gripper on an object between its fingers, with one of these efforts (N)."""
 
     def __init__(
         self, grippers: OneOrMore[Arms], object_designator_description: Objects, efforts: OneOrMore[float]
@@ -191,7 +191,7 @@ class GripAction(ActionDescription[GripActionPerformable]):
 
 
 class ReleaseAction(ActionDescription[ReleaseActionPerformable]):
-    """Let go of an object."""
+    """Release a held object."""
 
     def __init__(self, grippers: OneOrMore[Arms], object_designator_description: Objects) -> None:
         super().__init__(ReleaseActionPerformable, gripper=grippers, object_designator=object_designator_description)
@@ -219,14 +219,14 @@ class CloseAction(ActionDescription[CloseActionPerformable]):
 
 
 class DetectAction(ActionDescription[DetectActionPerformable]):
-    """Look for an object like one of these."""
+    """Detect an object of the type of one of these."""
 
     def __init__(self, object_designator_description: Objects) -> None:
         super().__init__(DetectActionPerformable, object_designator=object_designator_description)
 
 
 class TransportAction(ActionDescription[TransportActionPerformable]):
-    """Fetch an object and put it down at one of these poses."""
+    """Fetch an object and place it at one of these poses."""
 
     def __init__(
         self, object_designator_description: Objects, arms: OneOrMore[Arms], target_locations: OneOrMore[Pose]

@@ -1,4 +1,4 @@
-"""Actions of one hand on things that are there: hold and let go, grasp a handle, open and close with it.
+"""Actions of one gripper: hold and release objects, grasp handles, open and close drawers and doors.
 
 >>> handle = ObjectPart("sink_area_drawer_handle", kitchen)
 >>> await OpenActionPerformable(handle, Arms.LEFT).perform()
@@ -32,16 +32,17 @@ __all__ = [
 
 @dataclass
 class GripActionPerformable(CheckedAction):
-    """Close the gripper on an object where it is, with `effort` (N); the object is attached to the gripper afterwards.
+    """Close the gripper on an object with `effort` (N); afterwards the object is attached to the gripper.
 
-    The arm does not move. An object that hung on something else is taken over.
+    The arm does not move. An object that is attached to another one is detached from it.
 
     Raises:
-        GripperClosedCompletely: it would, for the tool frame is farther than `HOLD_DISTANCE_M_MAX` from the bounding
-            boxes of all the object's links.
-        EndEffectorFailure: the gripper holds something else.
-        PerceptionObjectNotInWorld: there is no such object.
-        IllPosedGoalFailure: not one arm, an effort below zero, or furniture or a robot is to be held.
+        GripperClosedCompletely: the tool frame is farther than `HOLD_DISTANCE_M_MAX` from the bounding boxes of all the
+            object's links.
+        EndEffectorFailure: the gripper holds another object.
+        PerceptionObjectNotInWorld: the object is not in the robot's world.
+        IllPosedGoalFailure: `gripper` is not a single arm, the effort is below 0, or the object is furniture or a
+            robot.
         CapabilityAbsenceFailure: the robot has no such arm.
     """
 
@@ -57,27 +58,29 @@ class GripActionPerformable(CheckedAction):
     async def perform(self) -> None:
         robot = require_robot()
         tool_frame = robot.one_arm(self.gripper).tool_frame
-        wanted = in_world(self.object_designator)
+        target = in_world(self.object_designator)
         if not self.effort >= 0:
-            raise IllPosedGoalFailure(f"an effort of {self.effort} N holds nothing", self.effort)
-        check_takable(robot, self.gripper, wanted)
+            raise IllPosedGoalFailure(f"effort must be >= 0 N, got {self.effort} N", self.effort)
+        check_takable(robot, self.gripper, target)
         tool = robot.body.link_pose(tool_frame)
-        apart = min(distance_to_box(tool, wanted.bounding_box(link)) for link in wanted.links)
-        if apart > HOLD_DISTANCE_M_MAX:
-            message = f"the {self.gripper.name} gripper would close on nothing: {wanted.name} is {apart:.3f} m from it"
-            raise GripperClosedCompletely(message, wanted.name, apart)
+        distance = min(distance_to_box(tool, target.bounding_box(link)) for link in target.links)
+        if distance > HOLD_DISTANCE_M_MAX:
+            message = (
+                f"the {self.gripper.name} gripper would close on nothing: {target.name} is {distance:.3f} m from it"
+            )
+            raise GripperClosedCompletely(message, target.name, distance)
         await MoveGripperMotion(GripperState.CLOSE, self.gripper).perform()
-        take(robot, self.gripper, wanted)
+        take(robot, self.gripper, target)
 
 
 @dataclass
 class ReleaseActionPerformable(CheckedAction):
-    """Open the gripper and let go of the object it holds, which stays where it is.
+    """Open the gripper and detach the held object, which keeps its pose.
 
     Raises:
-        ObjectLost: the gripper does not hold it.
-        PerceptionObjectNotInWorld: there is no such object.
-        IllPosedGoalFailure, CapabilityAbsenceFailure: not one arm; no such arm.
+        ObjectLost: the gripper does not hold the object.
+        PerceptionObjectNotInWorld: the object is not in the robot's world.
+        IllPosedGoalFailure, CapabilityAbsenceFailure: `gripper` is not a single arm; the robot has no such arm.
     """
 
     concept: ClassVar[str | None] = "Releasing"
@@ -100,16 +103,16 @@ class ReleaseActionPerformable(CheckedAction):
 
 @dataclass
 class GraspingActionPerformable(CheckedAction):
-    """Close the gripper around an object or a handle, coming straight along the way it will point; nothing is attached.
+    """Close the gripper around an object or a handle after a straight approach along its fingers; attaches nothing.
 
-    The tool frame ends in the frame of the object or the handle, turned like it; on the handle of a door it comes
-    from the side of the hinge.
+    The tool frame ends in the frame of the object or the handle, with its orientation; it approaches the handle of a
+    door from the side of the hinge.
 
     Raises:
-        IKError: it is out of reach, or the place 0.1 m before it is.
-        EndEffectorFailure: the gripper holds something.
-        PerceptionObjectNotInWorld: there is no such object.
-        IllPosedGoalFailure, CapabilityAbsenceFailure: not one arm; no such arm.
+        IKError: the goal, or the pose 0.1 m before it, is out of reach.
+        EndEffectorFailure: the gripper holds an object.
+        PerceptionObjectNotInWorld: the object is not in the robot's world.
+        IllPosedGoalFailure, CapabilityAbsenceFailure: `arm` is not a single arm; the robot has no such arm.
     """
 
     concept: ClassVar[str | None] = "Grasping"
@@ -132,13 +135,13 @@ class GraspingActionPerformable(CheckedAction):
 
 @dataclass
 class OpenActionPerformable(CheckedAction):
-    """Open a drawer or a door by its handle, up to 0.05 m or rad before its end; the open hand stays at the handle.
+    """Open a drawer or a door by its handle, up to 0.05 m or rad before its limit; the open hand stays at the handle.
 
-    Where to stand for that, `AccessingLocation` knows.
+    `AccessingLocation` finds base poses for it.
 
     Raises:
         EnvironmentManipulationImpossible: no joint moves the handle.
-        IKError: the handle is out of reach, or the hand cannot follow it all the way; then it holds the handle.
+        IKError: the handle is out of reach, or the hand cannot follow its whole path and remains closed on the handle.
         EndEffectorFailure, PerceptionObjectNotInWorld, IllPosedGoalFailure, CapabilityAbsenceFailure: as for grasping.
     """
 

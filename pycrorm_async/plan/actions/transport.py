@@ -1,4 +1,4 @@
-"""Actions that look for an object, and that bring one from where it is to where it shall be.
+"""Actions that detect an object, and that transport one to a target pose.
 
 >>> milk = await DetectActionPerformable(BelieveObject("milk", ObjectType.MILK, Pose([1.3, 1, 0.9]))).perform()
 >>> await TransportActionPerformable(milk, Arms.LEFT, Pose([1.3, 0.6, 0.95])).perform()
@@ -32,9 +32,10 @@ __all__ = ["DetectActionPerformable", "TransportActionPerformable"]
 
 @dataclass
 class DetectActionPerformable(CheckedAction):
-    """Look for an object of this one's type, which may be one that is only believed; returns the best seen.
+    """Detect objects of the same type as the designated one and return the most visible one.
 
-    The head does not turn. Raises `PerceptionObjectNotFound`, which says why nothing is seen.
+    The designated object may be a `BelieveObject`. The head does not move. Raises `PerceptionObjectNotFound`, which
+    names the reason for each object.
     """
 
     concept: ClassVar[str | None] = "LookingFor"
@@ -50,17 +51,18 @@ class DetectActionPerformable(CheckedAction):
 
 @dataclass
 class TransportActionPerformable(CheckedAction):
-    """Fetch an object with one arm, from the front, and put it down at `target_location`; arms are parked meanwhile.
+    """Pick up an object from the front with one arm and place it at `target_location`; arms are parked while driving.
 
-    Places to stand are looked for on the way (`CostmapLocation`), with the torso as it is. What the arm holds
-    already is only brought.
+    The action searches its base poses itself (`CostmapLocation`), with the torso as it is. An object that the arm
+    already holds is only delivered.
 
     Raises:
-        ObjectUnfetchable: there is no place to stand and pick it up.
-        ReachabilityFailure: there is none to put it down from; the arm holds it then.
-        EndEffectorFailure: the arm holds something else.
-        PerceptionObjectNotInWorld: there is no such object.
-        IllPosedGoalFailure, CapabilityAbsenceFailure: not one arm, or nothing that can be held; no such arm.
+        ObjectUnfetchable: no base pose allows the pick-up.
+        ReachabilityFailure: no base pose allows the placing; the arm keeps holding the object.
+        EndEffectorFailure: the arm holds another object.
+        PerceptionObjectNotInWorld: the object is not in the robot's world.
+        IllPosedGoalFailure, CapabilityAbsenceFailure: `arm` is not a single arm, or a gripper cannot hold the object;
+            the robot has no such arm.
     """
 
     concept: ClassVar[str | None] = "Transporting"
@@ -75,15 +77,15 @@ class TransportActionPerformable(CheckedAction):
     async def perform(self) -> None:
         robot = require_robot()
         tool_frame = robot.one_arm(self.arm).tool_frame
-        wanted = in_world(self.object_designator)
-        check_takable(robot, self.arm, wanted)
+        target = in_world(self.object_designator)
+        check_takable(robot, self.arm, target)
         await self._park_arms()
-        if robot.body.attachments.get(wanted) != tool_frame:
-            await NavigateActionPerformable(self._stand_to_fetch(robot.body)).perform()
+        if robot.body.attachments.get(target) != tool_frame:
+            await NavigateActionPerformable(self._fetching_pose(robot.body)).perform()
             await PickUpActionPerformable(self.object_designator, self.arm, Grasp.FRONT).perform()
             await self._park_arms()
-        there = CostmapLocation(self.target_location, reachable_for=robot.body, reachable_arm=self.arm).resolve()
-        await NavigateActionPerformable(there.pose).perform()
+        place = CostmapLocation(self.target_location, reachable_for=robot.body, reachable_arm=self.arm).resolve()
+        await NavigateActionPerformable(place.pose).perform()
         await PlaceActionPerformable(self.object_designator, self.arm, self.target_location).perform()
         await self._park_arms()
 
@@ -91,7 +93,7 @@ class TransportActionPerformable(CheckedAction):
         arms = require_robot().description.arms
         await ParkArmsActionPerformable(Arms.BOTH if len(arms) > 1 else self.arm).perform()
 
-    def _stand_to_fetch(self, body: Object) -> Pose:
+    def _fetching_pose(self, body: Object) -> Pose:
         try:
             return CostmapLocation(self.object_designator, reachable_for=body, reachable_arm=self.arm).resolve().pose
         except ObjectUnreachable as unreachable:

@@ -1,1 +1,1 @@
-"""Geometry of grasping, opening and holding."""
+"""Compute poses for grasping, opening and holding, and check what a gripper can take."""

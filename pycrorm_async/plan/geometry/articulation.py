@@ -1,7 +1,7 @@
-"""Which joint a handle moves, how far it opens, how a hand takes it, and where handle and hand pass on the way.
+"""Compute the joint of a handle, its open and closed positions, its grasp, and the paths of handle and hand.
 
-The same functions serve the motions that open and close and the search for a place to stand, so that what is
-offered is what will be done. Pure geometry in the map, metres and rad; nothing is moved.
+The opening motions and the search for base poses use the same functions, so that an offered base pose suits the motion.
+Pure geometry in the map, metres and rad; nothing is moved.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ __all__ = [
 ]
 
 OPENING_MARGIN = 0.05
-"""What opening leaves between the joint and its upper limit, m or rad."""
+"""Distance that opening leaves between the joint and its upper limit, m or rad."""
 STEP_M_MAX = 0.05
 STEP_RAD_MAX = 0.1
-"""So far apart, at most, are the points at which the way of a handle is looked at."""
+"""Greatest distance between two checked points on a handle's path."""
 _ROUNDING = 1e-9
 
 
 class Handle(NamedTuple):
-    """A link to hold on to, and the joint that moves it."""
+    """A link to hold, and the joint that moves it."""
 
     whole: Object
     link: str
@@ -48,22 +48,21 @@ class Handle(NamedTuple):
 
     @property
     def position(self) -> float:
-        """Where the joint stands now, m or rad."""
+        """The joint's current position, m or rad."""
         return self.whole.joint_position(self.joint)
 
 
 def handle_of(part: ObjectLike, joint: str | None = None) -> Handle:
-    """The handle, with the nearest movable joint above it, or with the one that is named.
+    """Return the handle with the nearest movable joint above it, or with the named joint.
 
     Raises:
-        EnvironmentManipulationImpossible: it is no part of an object; no joint moves it, or not the one that is
-            named.
+        EnvironmentManipulationImpossible: `part` is not an `ObjectPart`, no joint moves it, or the named one does not.
         PerceptionObjectNotInWorld: the object it is part of is not in the world.
         UnknownLink: that object has no such link.
     """
     if not isinstance(part, ObjectPart):
         raise EnvironmentManipulationImpossible(
-            f"{part.name} is no part of an object: name the handle, ObjectPart(handle, object)", part.name
+            f"{part.name} is not part of an object: pass the handle as ObjectPart(handle, object)", part.name
         )
     whole = in_world(part.part_of)
     joints = whole.joints_above(part.name)
@@ -74,40 +73,41 @@ def handle_of(part: ObjectLike, joint: str | None = None) -> Handle:
 
 
 def opened_position(handle: Handle) -> float:
-    """How far its joint opens: `OPENING_MARGIN` before its upper limit, and never less than it is open now.
+    """Return the joint's open position: `OPENING_MARGIN` below its upper limit, but not below the current position.
 
     Raises:
-        EnvironmentManipulationImpossible: the joint turns without end.
+        EnvironmentManipulationImpossible: the joint has no limits.
     """
     _, upper = _limits(handle)
     return max(handle.position, upper - OPENING_MARGIN)
 
 
 def closed_position(handle: Handle) -> float:
-    """The lower limit of its joint. Raises `EnvironmentManipulationImpossible` if the joint turns without end."""
+    """Return the joint's lower limit. Raises `EnvironmentManipulationImpossible` if the joint has no limits."""
     lower, _ = _limits(handle)
     return lower
 
 
 def moved_position(handle: Handle, distance: float) -> float:
-    """Where its joint is after it moved by `distance`, m or rad.
+    """Return the joint's position after a motion by `distance`, m or rad.
 
     Raises:
-        EnvironmentManipulationImpossible: that is beyond its limits.
+        EnvironmentManipulationImpossible: that position is outside the joint's limits.
     """
     lower, upper = handle.whole.joint_limits(handle.joint)
     goal = handle.position + distance
     if not lower - _ROUNDING <= goal <= upper + _ROUNDING:
-        message = f"{handle.joint} goes from {lower:g} to {upper:g}: from {handle.position:g} not by {distance:g}"
+        limits = f"its limits are {lower:g} to {upper:g}"
+        message = f"{handle.joint} at {handle.position:g} cannot move by {distance:g}: {limits}"
         raise EnvironmentManipulationImpossible(message, handle.link, handle.joint, distance)
     return min(max(goal, lower), upper)
 
 
 def handle_poses(handle: Handle, goal: float, start: float | None = None) -> list[Pose]:
-    """Where the handle's frame is on the way of its joint to `goal`: the start, points between, the goal.
+    """Return poses of the handle's frame while its joint moves to `goal`: the start, points between, the goal.
 
     Args:
-        start: where the joint begins; where it stands now, if left out.
+        start: the joint's first position; None means the current one.
     """
     begin = handle.position if start is None else start
     step = STEP_M_MAX if handle.whole.joint_type(handle.joint) is JointType.PRISMATIC else STEP_RAD_MAX
@@ -119,17 +119,17 @@ def handle_poses(handle: Handle, goal: float, start: float | None = None) -> lis
 
 
 def hold_pose(handle: Handle) -> Pose:
-    """How a hand takes the handle: the tool frame as seen from the handle's.
+    """Return the pose of the tool frame relative to the handle's frame in a grasp.
 
-    What slides is taken from the front: the hand is turned as the handle is. What swings is taken from the side
-    of the hinge: the hand is turned by a right angle about the hinge's axis, and points away from the hinge. For
-    on its way a door turns the hand, and one that began straight could not follow it from any place before it.
+    A drawer's handle is grasped from the front, with the handle's orientation. A door's handle is grasped from the side
+    of the hinge: the hand is rotated by 90 degrees about the hinge's axis and points away from the hinge. The moving
+    door rotates the hand, and a hand that starts straight could not follow it from any base pose.
     """
     if handle.whole.joint_type(handle.joint) is JointType.PRISMATIC:
         return Pose()
-    # seen from the handle, half a turn of the joint brings it to the other side of the hinge
-    now = handle.whole.link_pose(handle.link)
-    opposite = handle.whole.link_pose_at(handle.link, {handle.joint: handle.position + math.pi}).relative_to(now)
+    # Half a turn of the joint would bring the handle to the opposite side of the hinge: this locates the hinge.
+    current = handle.whole.link_pose(handle.link)
+    opposite = handle.whole.link_pose_at(handle.link, {handle.joint: handle.position + math.pi}).relative_to(current)
     x, y, z, _ = opposite.orientation
     from_hinge = [-across / 2 for across in opposite.position]
     for side in (1.0, -1.0):
@@ -140,30 +140,30 @@ def hold_pose(handle: Handle) -> Pose:
 
 
 def hand_poses(handle: Handle, goal: float, start: float | None = None) -> list[Pose]:
-    """As `handle_poses`, of the tool frame of a hand that took the handle as `hold` says."""
-    taken = hold_pose(handle)
-    return [each @ taken for each in handle_poses(handle, goal, start)]
+    """Return poses as `handle_poses` does, but of the tool frame of a hand that holds the handle."""
+    grip = hold_pose(handle)
+    return [each @ grip for each in handle_poses(handle, goal, start)]
 
 
-def grasp_pose(wanted: ObjectLike) -> Pose:
-    """Where the tool frame has to be to grasp it: in the frame of an object; of a handle as `hold` says.
+def grasp_pose(target: ObjectLike) -> Pose:
+    """Return the tool frame's pose for grasping: an object's own frame, or a handle's `hold_pose`.
 
     Raises:
-        PerceptionObjectNotInWorld: it is not in the world, or what it is part of is not.
-        UnknownLink: there is no such part.
+        PerceptionObjectNotInWorld: the object, or the object that has the part, is not in the world.
+        UnknownLink: the object has no such part.
     """
-    if not isinstance(wanted, ObjectPart):
-        return in_world(wanted).pose
-    whole = in_world(wanted.part_of)
-    if not whole.joints_above(wanted.name):
-        return whole.link_pose(wanted.name)
-    return whole.link_pose(wanted.name) @ hold_pose(handle_of(wanted))
+    if not isinstance(target, ObjectPart):
+        return in_world(target).pose
+    whole = in_world(target.part_of)
+    if not whole.joints_above(target.name):
+        return whole.link_pose(target.name)
+    return whole.link_pose(target.name) @ hold_pose(handle_of(target))
 
 
 def _limits(handle: Handle) -> tuple[float, float]:
     lower, upper = handle.whole.joint_limits(handle.joint)
     if not math.isfinite(upper - lower):
-        message = f"{handle.joint} turns without end: there is no open and no closed"
+        message = f"{handle.joint} has no limits, so it has no open and no closed position"
         raise EnvironmentManipulationImpossible(message, handle.link, handle.joint)
     return lower, upper
 

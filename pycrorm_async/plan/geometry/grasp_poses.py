@@ -1,7 +1,6 @@
-"""Where the gripper has to be to pick an object up, put it down or hold on to it. Pure geometry in the map, metres.
+"""Compute poses of the gripper for picking up, placing and holding. Pure geometry in the map, metres.
 
-The same functions serve the actions and the search for a place to stand, so that what is offered is what
-will be done.
+The actions and the search for base poses use the same functions, so that an offered base pose suits the action.
 """
 
 from __future__ import annotations
@@ -31,11 +30,11 @@ APPROACH_M = 0.1
 LIFT_M = 0.03
 RETRACT_M = 0.07
 HOLD_DISTANCE_M_MAX = 0.03
-"""A gripper can hold what its tool frame is no farther from than this."""
+"""Greatest distance between the tool frame and an object's bounding box at which the gripper can hold the object."""
 
 
 class PickUpPoses(NamedTuple):
-    """The three goals of the tool frame, in order."""
+    """The three goals of the tool frame in a pick-up, in order."""
 
     before: Pose
     at: Pose
@@ -43,39 +42,38 @@ class PickUpPoses(NamedTuple):
 
 
 def pick_up_poses(object_pose: Pose, grasp: Grasp, tool: Pose) -> PickUpPoses:
-    """The goals for an object at this pose, when the tool frame is at `tool` now.
+    """Return the goals for an object at this pose and a tool frame that is at `tool` now.
 
-    The approach is along the direction in which the gripper points *now*, not the one it will have at the
-    object.
+    The approach follows the gripper's *current* direction, not the direction it will have at the object.
     """
-    turned = product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
+    orientation = product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
     back = rotated(tool.orientation, (-APPROACH_M, 0.0, 0.0))
     x, y, z = object_pose.position
     frame = object_pose.frame
     return PickUpPoses(
-        Pose((x + back.x, y + back.y, z + back.z), turned, frame),
-        Pose((x, y, z), turned, frame),
-        Pose((x, y, z + LIFT_M), turned, frame),
+        Pose((x + back.x, y + back.y, z + back.z), orientation, frame),
+        Pose((x, y, z), orientation, frame),
+        Pose((x, y, z + LIFT_M), orientation, frame),
     )
 
 
 def place_pose(target: Pose, held: Pose, tool: Pose) -> Pose:
-    """Where the tool frame brings the held object to `target`."""
+    """Return the pose of the tool frame that brings the held object to `target`."""
     return target @ tool.relative_to(held)
 
 
 def approach(tool: Pose) -> Pose:
-    """The tool frame before it goes straight ahead, along its fingers, to `tool`."""
+    """Return the pose from which the tool frame moves straight ahead, along its fingers, to `tool`."""
     return tool @ Pose((-APPROACH_M, 0.0, 0.0))
 
 
 def retract(tool: Pose) -> Pose:
-    """The tool frame after moving back along its fingers."""
+    """Return the pose of the tool frame after moving back along its fingers."""
     return tool @ Pose((-RETRACT_M, 0.0, 0.0))
 
 
 def distance_to_box(tool: Pose, box: BoundingBox) -> float:
-    """How far the tool frame is from the box around something, m; 0 inside."""
+    """Return the distance of the tool frame from the box, m; 0 inside."""
     return math.hypot(
         *(max(low - at, at - high, 0.0) for at, low, high in zip(tool.position, box.min, box.max, strict=True))
     )

@@ -1,1 +1,1 @@
-"""Locations: designators that propose poses for the robot's base."""
+"""Location designators: search poses for the robot's base and for placing objects."""

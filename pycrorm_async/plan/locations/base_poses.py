@@ -1,7 +1,7 @@
-"""Where a robot can stand to reach or see something: the best cells of a costmap, each tried by inverse kinematics.
+"""Search base poses from which a robot reaches or sees a target: the best cells of a costmap, checked by kinematics.
 
-What is tried is what the actions will do (`plan.grasping`), from where the robot would stand, with its torso
-and arms as they are now, within the limits of the chosen robot. Nothing is moved.
+Each check uses the goals that the actions will use (`geometry.grasp_poses`), with the robot's torso and arms as they
+are now, within the limits of the chosen robot. Nothing is moved.
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ from pycrorm_async.world.robots.kinematics import Unreachable, solve
 __all__ = ["face", "reaching_arms", "resolve_robot", "base_poses"]
 
 CELLS_MAX = 600
+"""Bounds the cells checked per search, so that a search without a solution ends."""
 VISIBLE_SHARE_MIN = 0.5
+"""Minimum visible share of an object that counts as seen from a place."""
 
 
 def base_poses(
@@ -33,32 +35,35 @@ def base_poses(
     visible_for: ObjectLike | None,
     reachable_arm: Arms | None,
 ) -> Iterator[tuple[Pose, tuple[Arms, ...] | None]]:
-    """Poses of the base that face the target, best first, each with the arms that reach; None if it will not do."""
+    """Yield base poses that face the target, best first, each with the arms that reach it; None for unsuitable ones."""
     reacher = resolve_robot(reachable_for) if reachable_for is not None else None
-    seer = resolve_robot(visible_for) if visible_for is not None else None
+    viewer = resolve_robot(visible_for) if visible_for is not None else None
     goal = target if isinstance(target, Pose) else pose_of(target)
     check_in_map(goal)
-    costmap = _costmap(target, goal, [each for each in (reacher, seer) if each is not None], seer)
+    costmap = _costmap(target, goal, [each for each in (reacher, viewer) if each is not None], viewer)
     for cell in costmap.best(CELLS_MAX):
-        stand = face(cell, goal)
-        if seer is not None and not _sees(seer, stand, target, goal):
-            yield stand, None
+        base_pose = face(cell, goal)
+        if viewer is not None and not _sees(viewer, base_pose, target, goal):
+            yield base_pose, None
         elif reacher is not None:
-            yield stand, reaching_arms(reacher, reachable_arm, stand, partial(_goals, reacher, stand, target, goal))
+            yield (
+                base_pose,
+                reaching_arms(reacher, reachable_arm, base_pose, partial(_goals, reacher, base_pose, target, goal)),
+            )
         else:
-            yield stand, ()
+            yield base_pose, ()
 
 
 def resolve_robot(meant: ObjectLike) -> CurrentRobot:
-    """The robot that is meant. Raises `NoRobotHere` if it is none, or of a kind that is not known here."""
+    """Return the robot that the argument refers to. Raises `NoRobotHere` if it has no robot description."""
     body = in_world(meant)
     if body.robot_description is None:
-        raise NoRobotHere(f"{body.name!r} is not a robot of a kind that is known here")
+        raise NoRobotHere(f"{body.name!r} is not a robot with a robot description; the built-in one is 'pr2'")
     return CurrentRobot(body, body.robot_description)
 
 
 def face(place: Pose, goal: Pose, *, turned: float = 0.0) -> Pose:
-    """On the floor at the place, looking towards the goal, or `turned` (rad) from that to the left."""
+    """Return the pose on the floor at the place that faces the goal, rotated by `turned` (rad) to the left."""
     x, y, _ = place.position
     heading = math.atan2(goal.position.y - y, goal.position.x - x) + turned
     return Pose((x, y, 0.0), yaw_quaternion(heading))
@@ -66,61 +71,63 @@ def face(place: Pose, goal: Pose, *, turned: float = 0.0) -> Pose:
 
 def reaching_arms(
     robot: CurrentRobot,
-    wanted: Arms | None,
-    stand: Pose,
+    arm: Arms | None,
+    base_pose: Pose,
     goals: Callable[[Arms], Iterable[Pose]],
     *,
     torso_height: float | None = None,
 ) -> tuple[Arms, ...] | None:
-    """The arms that reach all their goals when the base is there; None if those that are wanted do not.
+    """Return the arms that reach all their goals from this base pose; None if the required ones do not.
 
     Args:
-        wanted: one arm, or BOTH: each of the two; None: any.
-        torso_height: m; as it is now, if left out.
+        arm: the required arm; BOTH requires both, None any.
+        torso_height: m; None means the current height.
 
     Raises `CapabilityAbsenceFailure` for an arm that the robot lacks.
     """
     limits = chosen_limits()
-    arms = tuple(robot.description.arms if wanted is None else robot.each_arm(wanted))
+    candidates = tuple(robot.description.arms if arm is None else robot.each_arm(arm))
     reaching = []
-    for arm in arms:
+    for candidate in candidates:
         try:
-            for each in goals(arm):
-                solve(robot.body, arm, each, base=stand, torso_height=torso_height, limits=limits)
+            for each in goals(candidate):
+                solve(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
         except Unreachable:
             continue
-        reaching.append(arm)
-    enough = reaching == list(arms) if wanted is Arms.BOTH else bool(reaching)
+        reaching.append(candidate)
+    enough = reaching == list(candidates) if arm is Arms.BOTH else bool(reaching)
     return tuple(reaching) if enough else None
 
 
-def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[CurrentRobot], seer: CurrentRobot | None) -> Costmap:
+def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[CurrentRobot], viewer: CurrentRobot | None) -> Costmap:
     world = require_world()
     origin = Pose((goal.position.x, goal.position.y, 0.0))
     ignored = {part for robot in robots for part in robot.with_load()}
     costmap = OccupancyCostmap(world, origin, ignore=ignored) * GaussianCostmap(origin)
-    if seer is None:
+    if viewer is None:
         return costmap
-    low, high = seer.description.camera_height_m
-    seen = goal if isinstance(target, Pose) else in_world(target)
-    return costmap * VisibilityCostmap(world, seen, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored)
+    low, high = viewer.description.camera_height_m
+    viewed = goal if isinstance(target, Pose) else in_world(target)
+    return costmap * VisibilityCostmap(
+        world, viewed, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored
+    )
 
 
-def _goals(robot: CurrentRobot, stand: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
+def _goals(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
     body, description = robot
     tool_frame = description.arms[arm].tool_frame
     tool = body.link_pose(tool_frame)
     if not isinstance(target, Pose):
-        return pick_up_poses(goal, Grasp.FRONT, stand @ tool.relative_to(body.pose))
+        return pick_up_poses(goal, Grasp.FRONT, base_pose @ tool.relative_to(body.pose))
     held = next((each for each, link in body.attachments.items() if link == tool_frame), None)
-    there = place_pose(goal, held.pose, tool) if held is not None else goal
-    return there, retract(there)
+    tool_goal = place_pose(goal, held.pose, tool) if held is not None else goal
+    return tool_goal, retract(tool_goal)
 
 
-def _sees(robot: CurrentRobot, stand: Pose, target: Pose | ObjectLike, goal: Pose) -> bool:
-    """Whether the camera would have the target in plain view from there."""
+def _sees(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose) -> bool:
+    """Return whether the target is visible from the camera's position at this base pose."""
     body, description = robot
-    eye = (stand @ body.link_pose(description.camera_link).relative_to(body.pose)).position
+    eye = (base_pose @ body.link_pose(description.camera_link).relative_to(body.pose)).position
     if isinstance(target, Pose):
         return require_world().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
     return require_world().visible(in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN

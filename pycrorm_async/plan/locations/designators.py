@@ -1,7 +1,7 @@
-"""Where to stand and where to put things: location designators that look for places and tell what they offered.
+"""Location designators search places for the robot's base or for objects, and report the search to the observer.
 
-`resolve()` gives the best place, iterating gives one after another, both at the moment they are asked. Each
-time a recorder is told once: what was offered, which was taken, how many places were looked at.
+`resolve()` returns the best place; iterating yields one after another. Both search in the current state of the world.
+Each resolution or iteration is reported once: the places offered, the one taken, the number considered.
 
 >>> stand = CostmapLocation(target=cereal, reachable_for=robot).resolve()
 >>> stand.reachable_arms
@@ -45,15 +45,15 @@ __all__ = [
 
 
 class LocationDesignator(ABC):
-    """What every location designator does. A subclass says which places it looks at.
+    """Base of location designators; a subclass defines the candidates.
 
-    Its fields are checked when it is built, as an action's are: `ResolutionError` names what does not fit.
+    Fields are checked when it is built, as an action's are: `ResolutionError` names those that do not fit.
     """
 
     def __post_init__(self) -> None:
         check_properties(self)
 
-    if not TYPE_CHECKING:  # a type checker finds the fault by itself
+    if not TYPE_CHECKING:  # hidden from type checkers, which report the fault themselves
 
         def __getattr__(self, name: str) -> NoReturn:
             if name in ("pose", "reachable_arms"):
@@ -62,18 +62,18 @@ class LocationDesignator(ABC):
 
     @abstractmethod
     def _candidates(self) -> Iterator[Location | None]:
-        """Every place it looks at, in order; None for one that will not do."""
+        """Yield every candidate in order; None for one that is unsuitable."""
 
     @abstractmethod
     def _no_place_failure(self) -> PlanFailure:
-        """What it means for a plan that there is no place."""
+        """Return the plan failure for a search without a suitable place."""
 
     def _name(self) -> str:
-        """What a recorder is told."""
+        """Return the name reported to the observer."""
         return type(self).__name__
 
     def resolve(self) -> Location:
-        """The first place that will do. Raises a plan failure, which each designator names, if there is none."""
+        """Return the first suitable place. Raises a plan failure, documented by each designator, if there is none."""
         places = iter(self)
         try:
             place = next(places, None)
@@ -84,7 +84,7 @@ class LocationDesignator(ABC):
         return place
 
     def __iter__(self) -> Generator[Location, None, None]:
-        """One place after another that will do; the last one asked for counts as taken, none if all were."""
+        """Yield suitable places; the last one yielded counts as taken, or none if the iteration is exhausted."""
         observer, node = recorder.get(), current_node.get()
         offered: list[Candidate] = []
         taken: int | None = None
@@ -110,9 +110,9 @@ class LocationDesignator(ABC):
 
 @dataclass(frozen=True)
 class Location(LocationDesignator):
-    """A place: a pose in the map, and the arms that reach what it was looked for. Resolves to itself.
+    """A place: a pose in the map, and the arms that reach the target of the search. Resolves to itself.
 
-    A place that comes from experience also says with which grasp and torso height (m) it went well.
+    A place from experience also has the grasp and the torso height (m) of the past success.
     """
 
     pose: Pose
@@ -124,12 +124,12 @@ class Location(LocationDesignator):
         yield self
 
     def _no_place_failure(self) -> PlanFailure:
-        raise AssertionError("a place is somewhere")
+        raise AssertionError("a location always yields itself")
 
 
 @dataclass(frozen=True)
 class ObjectRelativeLocation(LocationDesignator):
-    """The place that is at `relative_pose` as seen from an object. Raises `PerceptionObjectNotInWorld`."""
+    """The place at `relative_pose` relative to an object. Raises `PerceptionObjectNotInWorld`."""
 
     relative_pose: Pose
     reference_object: ObjectLike
@@ -138,24 +138,23 @@ class ObjectRelativeLocation(LocationDesignator):
         yield Location(pose_of(self.reference_object) @ self.relative_pose)
 
     def _no_place_failure(self) -> PlanFailure:
-        raise AssertionError("beside a thing is somewhere")
+        raise AssertionError("a relative location always yields one place")
 
 
 @dataclass(frozen=True)
 class CostmapLocation(LocationDesignator):
-    """Where a robot can stand, facing the target, to reach or to see it: near it, and clear of what is around.
+    """Base poses near the target and clear of obstacles from which a robot, facing the target, reaches or sees it.
 
     Args:
-        target: an object, to be picked up, or a pose, to bring the tool frame to or to put a held object
-            down at.
-        reachable_for: the robot that is to reach it. For an object that means all three goals of a pick-up
-            from the front (`Grasp.FRONT`), for a pose those of placing what the arm holds, with the torso
-            and the arms as they are now, within the limits of the chosen robot (`simulated_robot_within`).
-        visible_for: the robot that is to see it.
-        reachable_arm: only places where this arm reaches; for BOTH, each of the two.
+        target: an object to pick up, or a pose to which the tool frame or a held object is brought.
+        reachable_for: the robot that must reach the target. For an object that means all three goals of a pick-up
+            from the front (`Grasp.FRONT`), for a pose those of placing the held object, with the torso and the arms
+            as they are now, within the limits of the chosen robot (`simulated_robot_within`).
+        visible_for: the robot that must see the target.
+        reachable_arm: the arm that must reach the target; BOTH requires each of the two.
 
-    Up to 600 places are looked at, best first. Resolving raises `ObjectUnreachable` (an object),
-    `ReachabilityFailure` (a pose), `LookingHighLevelFailure` (only to be seen) or
+    The search considers up to 600 places, best first. Resolving raises `ObjectUnreachable` (for an object),
+    `ReachabilityFailure` (for a pose), `LookingHighLevelFailure` (if only visibility is required) or
     `PerceptionObjectNotInWorld`.
     """
 
@@ -175,7 +174,7 @@ class CostmapLocation(LocationDesignator):
 
     def _no_place_failure(self) -> PlanFailure:
         if self.reachable_for is None:
-            return LookingHighLevelFailure("there is no place to see it from")
+            return LookingHighLevelFailure("there is no place to stand from which the target is visible")
         if isinstance(self.target, Pose):
             return ReachabilityFailure(f"there is no place to stand and reach {self.target}", self.target)
         name = self.target.name
@@ -184,7 +183,7 @@ class CostmapLocation(LocationDesignator):
 
 @dataclass(frozen=True)
 class AccessingLocation(LocationDesignator):
-    """Where a robot can stand to open a drawer or a door by its handle, and to close it again.
+    """Base poses from which a robot can open a drawer or a door by its handle and close it again.
 
     >>> handle = ObjectPart("sink_area_drawer_handle", kitchen)
     >>> stand = AccessingLocation(handle, robot).resolve()
@@ -192,13 +191,13 @@ class AccessingLocation(LocationDesignator):
     >>> await OpenActionPerformable(handle, stand.reachable_arms[0]).perform()
 
     Args:
-        handle: the part that the hand takes.
-        robot: who is to do it: with its torso as it is now, within the limits of the chosen robot
+        handle: the part that the gripper grasps.
+        robot: the robot, with its torso as it is now, within the limits of the chosen robot
             (`simulated_robot_within`).
-        arm: only places where this arm can do it; for BOTH, each of the two.
+        arm: the arm that must reach; BOTH requires each of the two.
 
-    Places are 0.4 m clear of what is around. Those that drawer or door will sweep come last. Resolving raises
-    `EnvironmentUnreachable`, `EnvironmentManipulationImpossible` (nothing moves the handle),
+    Places are 0.4 m clear of obstacles; places that the drawer or door sweeps come last. Resolving raises
+    `EnvironmentUnreachable`, `EnvironmentManipulationImpossible` (no joint moves the handle),
     `PerceptionObjectNotInWorld`, `CapabilityAbsenceFailure` and `UnknownLink`.
     """
 
@@ -217,16 +216,16 @@ class AccessingLocation(LocationDesignator):
 
 @dataclass(frozen=True)
 class SemanticCostmapLocation(LocationDesignator):
-    """Where something can be put on a link of an object, for example on the surface of a table.
+    """Poses for an object on a link of another object, for example on the surface of a table.
 
     Args:
         urdf_link_name: the link; the top of its bounding box is the surface.
         part_of: the object that has the link.
-        for_object: what is to be put there: its bottom will be on the surface, and it has room there.
-            Without it, the poses are on the surface itself.
+        for_object: the object to place: at these poses its bottom is on the surface and it collides with no other
+            object. Without it, the poses are on the surface itself.
 
-    The middle comes first, then places all over the surface in a fixed order. Resolving raises
-    `ObjectUnavailable` if there is no room, `PerceptionObjectNotInWorld` and `UnknownLink`.
+    The middle comes first, then places all over the surface in a fixed order. Resolving raises `ObjectUnavailable` if
+    there is no room, `PerceptionObjectNotInWorld` and `UnknownLink`.
     """
 
     urdf_link_name: str
@@ -238,5 +237,5 @@ class SemanticCostmapLocation(LocationDesignator):
             yield Location(pose) if pose is not None else None
 
     def _no_place_failure(self) -> PlanFailure:
-        what = self.for_object.name if self.for_object is not None else "anything"
-        return ObjectUnavailable(f"there is no room for {what} on {self.urdf_link_name}", self.urdf_link_name, what)
+        name = self.for_object.name if self.for_object is not None else "anything"
+        return ObjectUnavailable(f"there is no room for {name} on {self.urdf_link_name}", self.urdf_link_name, name)

@@ -1,4 +1,4 @@
-"""Where it went well before: places to pick an object up from that come from experience instead of from a search.
+"""Find places to pick an object up from past successes in the memory instead of by search.
 
 >>> stand = await DatabaseCostmapLocation(target=milk, reachable_for=robot).resolve()
 >>> if stand is not None:
@@ -29,26 +29,28 @@ from pycrorm_async.world.queries.costmaps import OccupancyCostmap
 __all__ = ["DatabaseCostmapLocation"]
 
 CLEARANCE_M = 0.3
-_CELLS = 300  # 6 m across: the floor from which people and policies have tried
-_UPRIGHT_MIN = 0.99  # the cosine of 8 degrees: a robot that leans more does not stand on its wheels
+"""Minimum distance between the middle of the robot's base and any obstacle, the thesis' value."""
+_CELLS = 300  # 6 m across: the range of the policies' base poses, with a margin
+_UPRIGHT_MIN = 0.99  # the cosine of 8 degrees: a base that leans more is not on the floor
 
 
 @dataclass(frozen=True)
 class DatabaseCostmapLocation:
-    """Where a robot stood when it picked up objects of the target's type, carried over to where the target is now.
+    """Base poses of past successful pick-ups of the target's type, transferred to the target's current pose.
 
     Args:
-        target: the object to be picked up.
-        reachable_for: the robot that is to do it. Only places from which it reaches all three goals of the
-            pick-up with the arm, the grasp and the torso height that went well, with its arms as they are now,
-            within the limits of the chosen robot.
-        reachable_arm: only what went well with this arm, LEFT or RIGHT.
-        experience: who knows what went well; the open memory, if left out.
+        target: the object to pick up.
+        reachable_for: the robot. Restricts the result to places from which it reaches all three goals of the pick-up
+            with the arm, grasp and torso height of the past success, with its arms as they are now, within the limits
+            of the chosen robot.
+        reachable_arm: use only successes with this arm, LEFT or RIGHT.
+        experience: the source of past successes; None means the open memory.
 
-    Each place has the one arm that did it, the grasp and the torso height, and is 0.3 m clear of what is around.
-    Experience is what is in the memory's tables: `await memory.flush()` makes that all that was performed so far.
+    Each place has the arm, the grasp and the torso height of the past success, and is 0.3 m clear of obstacles. The
+    experience covers what is visible in the memory's tables; `await memory.flush()` makes everything performed so far
+    visible.
 
-    Raises `CallerError` when there is no memory to be asked, or not one arm is named; `NoWorld`, `NoRobotHere` and
+    Raises `CallerError` without a memory or for `Arms.BOTH`; `NoWorld`, `NoRobotHere` and
     `PerceptionObjectNotInWorld`.
     """
 
@@ -59,13 +61,13 @@ class DatabaseCostmapLocation:
 
     def __post_init__(self) -> None:
         if not isinstance(self.target, Object | ObjectDesignator):
-            raise CallerError("experience is remembered by the type of an object: give one as target, not a place")
+            raise CallerError("experience is recorded by the type of an object: pass an object as target, not a place")
         check_properties(self)
         if self.reachable_arm is Arms.BOTH:
-            raise CallerError("a pick-up is done with one arm: ask for LEFT, for RIGHT, or for None, either of them")
+            raise CallerError("a pick-up uses one arm: reachable_arm must be LEFT, RIGHT, or None for either of them")
 
     async def resolve(self) -> Location | None:
-        """The place where it went best; None if nothing that is remembered fits here."""
+        """Return the place with the best experience; None if no past success is usable in the current scene."""
         places = iter(await self.remembered())
         try:
             return next(places, None)
@@ -73,26 +75,26 @@ class DatabaseCostmapLocation:
             places.close()
 
     def __aiter__(self) -> AsyncIterator[Location]:
-        """One place after another, the best first; the last one asked for counts as taken, none if all were."""
+        """Iterate over the places, best first; the last one yielded counts as taken, or none if all were yielded."""
         return _PlaceIterator(self)
 
     async def remembered(self) -> LocationDesignator:
-        """The same places as an ordinary location designator, with what is known at this moment."""
-        known = self.experience if self.experience is not None else experience.get()
-        if known is None:
+        """Query the experience once, and return its places as an ordinary location designator."""
+        source = self.experience if self.experience is not None else experience.get()
+        if source is None:
             raise CallerError(
-                "what went well before is asked of a memory: do it inside `async with Memory.open(url)`,"
-                " or give it as `experience`"
+                "past successes are queried from a memory, and none is open: resolve inside"
+                " `async with Memory.open(url)`, or pass one as `experience`"
             )
-        past = await known.successes(designator_of(self.target).object_type, arm=self.reachable_arm)
+        past = await source.successes(designator_of(self.target).object_type, arm=self.reachable_arm)
         return _ExperienceLocation(self.target, self.reachable_for, past)
 
 
 class _PlaceIterator:
-    """No async generator: left in the middle, it is over at once, and not when the loop gets round to it."""
+    """An asynchronous iterator; a dropped one is closed at once, an async generator only later by the event loop."""
 
-    def __init__(self, asked: DatabaseCostmapLocation) -> None:
-        self._asked = asked
+    def __init__(self, designator: DatabaseCostmapLocation) -> None:
+        self._designator = designator
         self._places: Iterator[Location] | None = None
 
     def __aiter__(self) -> _PlaceIterator:
@@ -100,7 +102,7 @@ class _PlaceIterator:
 
     async def __anext__(self) -> Location:
         if self._places is None:
-            self._places = iter(await self._asked.remembered())
+            self._places = iter(await self._designator.remembered())
         for place in self._places:
             return place
         raise StopAsyncIteration
@@ -108,7 +110,7 @@ class _PlaceIterator:
 
 @dataclass(frozen=True)
 class _ExperienceLocation(LocationDesignator):
-    """The same question, once the experience is known."""
+    """The places of a `DatabaseCostmapLocation` after its experience has been queried."""
 
     target: ObjectLike
     reachable_for: ObjectLike | None
@@ -118,35 +120,35 @@ class _ExperienceLocation(LocationDesignator):
         return DatabaseCostmapLocation.__name__
 
     def _candidates(self) -> Iterator[Location | None]:
-        there = pose_of(self.target)
+        target_pose = pose_of(self.target)
         robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
-        origin = Pose((there.position.x, there.position.y, 0.0))
+        origin = Pose((target_pose.position.x, target_pose.position.y, 0.0))
         ignored = robot.with_load() if robot is not None else None
         free = OccupancyCostmap(
             require_world(), origin, distance_to_obstacle_m=CLEARANCE_M, size_cells=_CELLS, ignore=ignored
         )
         for each in self.past:
-            stand = _stand(there @ each.stand)
-            if stand is None or not free.value_at(*stand.position[:2]):
+            base_pose = _upright_pose(target_pose @ each.stand)
+            if base_pose is None or not free.value_at(*base_pose.position[:2]):
                 yield None
                 continue
-            reaches = robot is None or _reaches(robot, stand, there, each)
-            yield Location(stand, (each.arm,), each.grasp, each.torso_height) if reaches else None
+            reaches = robot is None or _reaches(robot, base_pose, target_pose, each)
+            yield Location(base_pose, (each.arm,), each.grasp, each.torso_height) if reaches else None
 
     def _no_place_failure(self) -> PlanFailure:
         name = self.target.name
-        return ObjectUnreachable(f"nothing that is remembered fits for {name}", name)
+        return ObjectUnreachable(f"no past success is usable for {name} in this scene", name)
 
 
-def _stand(base: Pose) -> Pose | None:
-    """The base on the floor; None if it would lean, as it does for an object that lies where others stood."""
+def _upright_pose(base: Pose) -> Pose | None:
+    """Project the base pose to the floor; None if it leans, because the object lies and the recorded ones stood."""
     if rotated(base.orientation, (0.0, 0.0, 1.0)).z < _UPRIGHT_MIN:
         return None
     return Pose((base.position.x, base.position.y, 0.0), yaw_quaternion(base.yaw), base.frame)
 
 
-def _reaches(robot: CurrentRobot, stand: Pose, there: Pose, past: PastSuccess) -> bool:
-    """Whether that arm reaches all three goals of that grasp from there, with the torso at that height."""
+def _reaches(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> bool:
+    """Return whether the arm reaches all three goals of the grasp from the base pose at the past torso height."""
     body, description = robot
     if past.arm not in description.arms:
         return False
@@ -157,6 +159,6 @@ def _reaches(robot: CurrentRobot, stand: Pose, there: Pose, past: PastSuccess) -
 
     def goals(arm: Arms) -> tuple[Pose, ...]:
         tool = body.link_pose(description.arms[arm].tool_frame)
-        return pick_up_poses(there, past.grasp, stand @ tool.relative_to(body.pose))
+        return pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
 
-    return reaching_arms(robot, past.arm, stand, goals, torso_height=past.torso_height) is not None
+    return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height) is not None

@@ -1,8 +1,8 @@
-"""Where a robot can stand to open a drawer or a door by its handle, and to close it again.
+"""Search base poses from which a robot can open a drawer or a door by its handle and close it again.
 
-What is tried is what `OpenAction` and `CloseAction` will do (`plan.accessing`): taking the handle where it is
-closed, where it is open and where it is now, and following it all the way, with the torso as it is now and
-within the limits of the chosen robot. Nothing is moved.
+Each check uses the goals of `OpenAction` and `CloseAction` (`geometry.articulation`): grasping the handle in its
+closed, open and current position, and following its whole path, with the torso as it is now and within the limits of
+the chosen robot. Nothing is moved.
 """
 
 from __future__ import annotations
@@ -34,38 +34,38 @@ _SWEEP_STEPS = 10
 def opening_poses(
     part: ObjectLike, robot: ObjectLike, arm: Arms | None
 ) -> Iterator[tuple[Pose, tuple[Arms, ...] | None]]:
-    """Poses of the base, best first, each with the arms that can do it all from there; None if it will not do.
+    """Yield base poses, best first, each with the arms that reach every goal; None for unsuitable ones.
 
-    First the places that what is opened does not sweep, facing the handle; then turned from that by each
-    multiple of 45 degrees; then the same for the places that it does sweep.
+    Places that the opening part does not sweep come first, facing the handle and then rotated by each multiple of 45
+    degrees; the places that it sweeps follow in the same order.
     """
     handle, reacher = handle_of(part), resolve_robot(robot)
-    there = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
+    handle_pose = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
     goals = _goals(handle)
-    for costmap in _costmaps(handle, there, reacher):
+    for costmap in _costmaps(handle, handle_pose, reacher):
         cells = costmap.best(CELLS_MAX)
         for number in range(HEADINGS):
             for cell in cells:
-                stand = face(cell, there, turned=number * math.tau / HEADINGS)
-                yield stand, reaching_arms(reacher, arm, stand, lambda _: goals)
+                base_pose = face(cell, handle_pose, turned=number * math.tau / HEADINGS)
+                yield base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals)
 
 
 def _goals(handle: Handle) -> list[Pose]:
-    """All that the tool frame has to reach; the ends first, for they are what most places fail at."""
-    opened, closed, now = opened_position(handle), closed_position(handle), handle.position
-    way = hand_poses(handle, opened, closed)
-    ways = [*way[1:-1]]
-    ends = [way[0], way[-1]]
-    if now not in (opened, closed):
-        from_here = hand_poses(handle, opened)
-        ends.append(from_here[0])
-        ways += [*from_here[1:], *hand_poses(handle, closed)[1:]]
-    return [*ends, *(approach(each) for each in ends), *ways]
+    """Return all goals of the tool frame; the ends of the path first, because most places fail at them."""
+    opened, closed, current = opened_position(handle), closed_position(handle), handle.position
+    path = hand_poses(handle, opened, closed)
+    between = [*path[1:-1]]
+    ends = [path[0], path[-1]]
+    if current not in (opened, closed):
+        from_current = hand_poses(handle, opened)
+        ends.append(from_current[0])
+        between += [*from_current[1:], *hand_poses(handle, closed)[1:]]
+    return [*ends, *(approach(each) for each in ends), *between]
 
 
-def _costmaps(handle: Handle, there: Pose, robot: CurrentRobot) -> Iterator[Costmap]:
-    """Near the handle and clear of all that is there: first what is not swept, then what is."""
-    world, origin = handle.whole.world, Pose((there.position.x, there.position.y, 0.0))
+def _costmaps(handle: Handle, handle_pose: Pose, robot: CurrentRobot) -> Iterator[Costmap]:
+    """Yield two costmaps of free places near the handle: those the moving part does not sweep, and those it does."""
+    world, origin = handle.whole.world, Pose((handle_pose.position.x, handle_pose.position.y, 0.0))
     near = GaussianCostmap(origin, sigma_cells=_SIGMA_CELLS, size_cells=_CELLS, resolution_m=CELL_M)
     free, unswept = (
         OccupancyCostmap(
@@ -84,7 +84,7 @@ def _costmaps(handle: Handle, there: Pose, robot: CurrentRobot) -> Iterator[Cost
 
 
 def _swept(handle: Handle) -> Iterator[BoundingBox]:
-    """The boxes that the links which move with the handle's joint have on its way."""
+    """Yield the boxes that the links moved by the handle's joint occupy along its path."""
     whole, opened, closed = handle.whole, opened_position(handle), closed_position(handle)
     moving = [link for link in whole.links if handle.joint in whole.joints_above(link)]
     for number in range(_SWEEP_STEPS + 1):

@@ -1,4 +1,4 @@
-"""Where on a surface a thing can be put: the middle first, then everywhere in a fixed, scattered order."""
+"""Find poses for an object on a surface: the middle first, then all over the surface in a fixed random order."""
 
 from __future__ import annotations
 
@@ -16,27 +16,29 @@ STEP_M = 0.02
 _POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
 
 
-def surface_poses(link: str, whole: ObjectLike, thing: ObjectLike | None) -> Iterator[Pose | None]:
-    """Poses for `thing` on top of the link, turned as the link is; None for a place where something is already."""
+def surface_poses(link: str, whole: ObjectLike, obj: ObjectLike | None) -> Iterator[Pose | None]:
+    """Yield poses for `obj` on top of the link, with the link's heading; None for occupied places."""
     support = in_world(whole)
-    put = in_world(thing) if thing is not None else None
+    obj_to_put = in_world(obj) if obj is not None else None
     heading = yaw_quaternion(support.link_pose(link).yaw)
-    extent = _extent(put, heading) if put is not None else _POINT
+    extent = _extent(obj_to_put, heading) if obj_to_put is not None else _POINT
     surface = support.bounding_box(link)
     z = surface.max.z - extent.min.z
     occupied = [
-        each.bounding_box() for each in support.world.objects if each is not support and not _moves_along(each, put)
+        each.bounding_box()
+        for each in support.world.objects
+        if each is not support and not _moves_along(each, obj_to_put)
     ]
     for x, y in _grid_points(surface, extent):
-        there = _translate(extent, x, y, z)
-        if put is not None and any(_overlap(there, box) for box in occupied):
+        placed_box = _translate(extent, x, y, z)
+        if obj_to_put is not None and any(_overlap(placed_box, box) for box in occupied):
             yield None
         else:
             yield Pose((x, y, z), heading)
 
 
 def _grid_points(surface: BoundingBox, extent: BoundingBox) -> Iterator[tuple[float, float]]:
-    """Points at which a thing of that extent does not stick out; only the middle, if it does everywhere."""
+    """Yield the points at which a box of that extent stays on the surface; only the middle if it is too large."""
     ranges = []
     for low, high, below, above in zip(surface.min[:2], surface.max[:2], extent.min[:2], extent.max[:2], strict=True):
         middle = (low - below + high - above) / 2
@@ -45,17 +47,17 @@ def _grid_points(surface: BoundingBox, extent: BoundingBox) -> Iterator[tuple[fl
     middle_point = (ranges[0][len(ranges[0]) // 2], ranges[1][len(ranges[1]) // 2])
     yield middle_point
     points = [(x, y) for x in ranges[0] for y in ranges[1] if (x, y) != middle_point]
-    random.Random(0).shuffle(points)  # noqa: S311  the order is to be scattered, and the same every time
+    random.Random(0).shuffle(points)  # noqa: S311  a fixed seed: the order is random but reproducible
     yield from points
 
 
-def _extent(thing: Object, turn: Quaternion) -> BoundingBox:
-    """The box it would take at the origin, turned so; wherever and however it is now."""
-    here = thing.pose
+def _extent(obj: Object, turn: Quaternion) -> BoundingBox:
+    """Return the object's box at the origin with this rotation, independent of its current pose."""
+    pose = obj.pose
     placed = []
-    for link in thing.links:
-        frame = Pose((0.0, 0.0, 0.0), turn) @ thing.link_pose(link).relative_to(here)
-        placed.append(((frame.position, frame.orientation), thing.body.solids[link]))
+    for link in obj.links:
+        frame = Pose((0.0, 0.0, 0.0), turn) @ obj.link_pose(link).relative_to(pose)
+        placed.append(((frame.position, frame.orientation), obj.body.solids[link]))
     return box_around(placed) or _POINT
 
 
@@ -66,19 +68,19 @@ def _translate(box: BoundingBox, x: float, y: float, z: float) -> BoundingBox:
 
 
 def _overlap(a: BoundingBox, b: BoundingBox) -> bool:
-    """Whether they share more than a face."""
+    """Return whether the boxes share more than a face."""
     return all(
         low + 1e-6 < high and other + 1e-6 < over
         for low, high, other, over in zip(a.min, b.max, b.min, a.max, strict=True)
     )
 
 
-def _moves_along(each: Object, put: Object | None) -> bool:
-    """Whether it is the thing itself, what carries it, or what it carries: that will be gone or come along."""
-    if put is None:
+def _moves_along(each: Object, obj_to_put: Object | None) -> bool:
+    """Return whether `each` is the object to place, carries it, or is carried by it, and so is no obstacle."""
+    if obj_to_put is None:
         return False
-    chain = {put}
-    above = put.attached_to
+    chain = {obj_to_put}
+    above = obj_to_put.attached_to
     while above is not None:
         chain.add(above)
         above = above.attached_to

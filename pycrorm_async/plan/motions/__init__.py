@@ -1,1 +1,1 @@
-"""Motions and the process modules that execute them."""
+"""Define motions, and the process modules that execute them."""

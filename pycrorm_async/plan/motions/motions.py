@@ -1,5 +1,7 @@
-"""The motions: what a robot's controllers do at once. Each is carried out by the robot chosen with
-`with simulated_robot:`, and recorded with its target; concepts are the nearest ones of SOMA.
+"""Motions are single commands to a robot's controllers.
+
+The robot chosen with `with simulated_robot:` executes them; each is recorded with its target. Concepts are the nearest
+ones of SOMA.
 
 >>> with simulated_robot:
 ...     await MoveMotion(Pose([0.6, 0.4, 0])).perform()
@@ -53,11 +55,11 @@ class MoveMotion(BaseMotion):
 
 @dataclass
 class MoveTCPMotion(BaseMotion):
-    """Bring the tool frame of one arm to a pose in the map.
+    """Move the tool frame of one arm to a pose in the map.
 
     Raises:
-        IKError: it is out of reach.
-        CapabilityAbsenceFailure, IllPosedGoalFailure: the robot has no such arm; one arm is needed, not BOTH.
+        IKError: the pose is out of reach.
+        CapabilityAbsenceFailure, IllPosedGoalFailure: the robot has no such arm; `arm` is BOTH.
     """
 
     concept: ClassVar[str | None] = "AssumingArmPose"
@@ -107,9 +109,9 @@ class MoveGripperMotion(BaseMotion):
 
 @dataclass
 class MoveArmJointsMotion(BaseMotion):
-    """Bring arm joints (by name) to positions in rad, both arms at once.
+    """Move arm joints (by name) to positions in rad, both arms together.
 
-    Raises `ConfigurationNotReached`, and `UnknownJoint` for one that is not of that arm.
+    Raises `ConfigurationNotReached`, and `UnknownJoint` for a joint of another part.
     """
 
     concept: ClassVar[str | None] = "AssumingArmPose"
@@ -127,12 +129,12 @@ class MoveArmJointsMotion(BaseMotion):
 
 @dataclass
 class MoveJointsMotion(BaseMotion):
-    """Bring joints to positions in rad or m, all at once.
+    """Move joints to positions in rad or m, all together.
 
     Raises:
-        TorsoGoalUnreachable: the torso alone was to go where it cannot.
+        TorsoGoalUnreachable: the torso is the only joint, and the position is outside its limits.
         ConfigurationNotReached: a position is outside its joint's limits.
-        ResolutionError: not one position for each name, or a name twice.
+        ResolutionError: the numbers of names and positions differ, or a name occurs twice.
     """
 
     concept: ClassVar[str | None] = "AssumingPose"
@@ -145,14 +147,14 @@ class MoveJointsMotion(BaseMotion):
         if len(self.names) != len(self.positions):
             counts = f"expected {len(self.names)} values, one for each name, got {len(self.positions)}"
             raise ResolutionError(type(self).__name__, wrong=[f"positions: {counts}"])
-        if twice := {name for name in self.names if self.names.count(name) > 1}:
-            raise ResolutionError(type(self).__name__, wrong=[f"names: {', '.join(sorted(twice))} more than once"])
+        if duplicates := {name for name in self.names if self.names.count(name) > 1}:
+            raise ResolutionError(type(self).__name__, wrong=[f"names: {', '.join(sorted(duplicates))} more than once"])
 
     def resources(self) -> frozenset[Resource]:
         world = current_world.get()
         robot = world.robot if world is not None else None
-        known = robot.robot_description if robot is not None else None
-        return moving(self.names, known) if known is not None else NOTHING
+        description = robot.robot_description if robot is not None else None
+        return moving(self.names, description) if description is not None else NOTHING
 
     async def perform(self) -> None:
         await chosen_robot(self, "move_joints").move_joints(self)
@@ -160,9 +162,9 @@ class MoveJointsMotion(BaseMotion):
 
 @dataclass
 class DetectingMotion(BaseMotion):
-    """Look with the head's camera for objects of a type; returns the one that is seen best.
+    """Detect objects of a type with the head's camera and return the most visible one.
 
-    Raises `PerceptionObjectNotFound`, which says for each of that type why it is not seen.
+    Raises `PerceptionObjectNotFound`, which names for each object of that type the reason why it is not visible.
     """
 
     concept: ClassVar[str | None] = "LookingFor"
@@ -179,7 +181,7 @@ class DetectingMotion(BaseMotion):
 
 @dataclass
 class WorldStateDetectingMotion(BaseMotion):
-    """Ask the world itself for objects of a type, seen or not; returns the first. Raises `PerceptionObjectNotFound`."""
+    """Query the world for objects of a type, visible or not; return the first. Raises `PerceptionObjectNotFound`."""
 
     concept: ClassVar[str | None] = "CheckingObjectPresence"
 
@@ -192,12 +194,12 @@ class WorldStateDetectingMotion(BaseMotion):
 
 @dataclass
 class OpeningMotion(BaseMotion):
-    """With the hand on a handle, open what it belongs to, up to 0.05 m or rad before its end; the hand goes along.
+    """Open a drawer or a door with the hand on its handle, up to 0.05 m or rad before its limit; the hand follows.
 
     Raises:
         EnvironmentManipulationImpossible: no joint moves that part, or the hand is not on it.
-        IKError: the hand cannot follow all the way; nothing was moved.
-        PerceptionObjectNotInWorld: the whole is not in the world.
+        IKError: the hand cannot follow the whole path; nothing was moved.
+        PerceptionObjectNotInWorld: the object that has the handle is not in the world.
     """
 
     concept: ClassVar[str | None] = "Opening"
@@ -214,7 +216,7 @@ class OpeningMotion(BaseMotion):
 
 @dataclass
 class ClosingMotion(BaseMotion):
-    """With the hand on a handle, close what it belongs to; the hand goes along. Raises as `OpeningMotion` does."""
+    """Close a drawer or a door with the hand on its handle; the hand follows. Raises as `OpeningMotion` does."""
 
     concept: ClassVar[str | None] = "Closing"
 
@@ -230,14 +232,15 @@ class ClosingMotion(BaseMotion):
 
 @dataclass
 class AccessingMotion(BaseMotion):
-    """With the hand on a handle, move a joint by a distance; positive opens, negative closes. Raises as
-    `OpeningMotion` does, `EnvironmentManipulationImpossible` also for a distance beyond the joint's limits.
+    """Move a joint by a distance with the hand on its handle; a positive distance opens, a negative one closes.
+
+    Raises as `OpeningMotion` does, and `EnvironmentManipulationImpossible` for a distance beyond the joint's limits.
 
     Attributes:
         part_of: the furniture.
         gripper: the tool frame of the arm.
         drawer_joint: one of the joints above the handle.
-        drawer_handle: the link that the hand is on.
+        drawer_handle: the link that the hand holds.
         distance: m, or rad for a door.
     """
 

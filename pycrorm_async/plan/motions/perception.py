@@ -1,7 +1,7 @@
-"""What a robot perceives: which objects of a type its head's camera sees, or that the world itself tells of.
+"""Perceive objects of a type, with the head's camera or by a query of the world.
 
-Seen is what lies in the camera's field of view and of which no more than a fifth is hidden. When nothing is
-seen, the failure says for every object of that type why not.
+The camera perceives an object whose centre is in the field of view and of which at most a fifth is hidden. If it
+perceives none, the failure names the reason for every object of that type.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ __all__ = ["SEEN_SHARE_MIN", "in_field_of_view", "report_perception", "seen_by_c
 Source: TypeAlias = Literal["camera", "world_state"]
 
 SEEN_SHARE_MIN = 0.8
-"""Of an object that is seen, at least this share is not hidden."""
+"""Minimum visible share of a perceived object."""
 
 
 async def report_perception(
     looking: Awaitable[Sequence[Seen]], *, source: Source, object_type: ObjectType
 ) -> ObjectDesignator:
-    """The best of what was perceived; the recorder is told of all of it, also of nothing.
+    """Report a perception to the observer, also an empty one, and return the best detection.
 
     Raises:
-        PerceptionObjectNotFound: nothing was.
+        PerceptionObjectNotFound: no object was perceived.
     """
     seen: tuple[Seen, ...] = ()
     try:
@@ -51,41 +51,41 @@ async def report_perception(
 
 
 def seen_by_camera(robot: CurrentRobot, object_type: ObjectType) -> tuple[Seen, ...]:
-    """The objects of that type that the head's camera sees, the best seen first.
+    """Return the objects of that type that the head's camera perceives, the most visible first.
 
-    What the robot itself hides, or what it carries, is looked past.
+    The robot itself and the objects it carries do not occlude.
 
     Raises:
-        PerceptionObjectNotFound: there is none; its data are the type and, by name, why each is not seen.
+        PerceptionObjectNotFound: no object is visible; its data are the type and the reason for each object by name.
     """
     camera = robot.body.link_pose(robot.description.camera_link)
     seen: list[Seen] = []
     unseen: dict[str, str] = {}
-    for thing in require_world().objects:
-        if thing.object_type is not object_type or thing is robot.body:
+    for obj in require_world().objects:
+        if obj.object_type is not object_type or obj is robot.body:
             continue
-        share, reason = _visibility(robot, camera, thing)
+        share, reason = _visibility(robot, camera, obj)
         if reason is None:
-            seen.append(Seen(thing, share))
+            seen.append(Seen(obj, share))
         else:
-            unseen[thing.name] = reason
+            unseen[obj.name] = reason
     if not seen:
-        there = "; ".join(f"{name} {reason}" for name, reason in unseen.items())
-        count = f"{len(unseen)} in the world: {there}" if unseen else "there is none in the world"
+        reasons = "; ".join(f"{name} {reason}" for name, reason in unseen.items())
+        count = f"{len(unseen)} in the world: {reasons}" if unseen else "there is none in the world"
         raise PerceptionObjectNotFound(f"no {object_type.name} is seen; {count}", object_type, unseen)
     return tuple(sorted(seen, key=lambda each: -(each.visible or 0.0)))
 
 
 def objects_in_world(object_type: ObjectType) -> tuple[Seen, ...]:
-    """The objects of that type that there are, in the order they came. Raises `PerceptionObjectNotFound`."""
-    there = tuple(Seen(thing) for thing in require_world().objects if thing.object_type is object_type)
-    if not there:
+    """Return the world's objects of that type in the order of their creation. Raises `PerceptionObjectNotFound`."""
+    detections = tuple(Seen(obj) for obj in require_world().objects if obj.object_type is object_type)
+    if not detections:
         raise PerceptionObjectNotFound(f"there is no {object_type.name} in the world", object_type)
-    return there
+    return detections
 
 
 def in_field_of_view(camera: Pose, view: FieldOfView, point: Sequence[float]) -> bool:
-    """Whether the point (m, map) lies in the picture of a camera at that pose of its optical frame."""
+    """Return whether the point (m, map) is in the image of a camera whose optical frame is at that pose."""
     x, y, z = Pose(point).relative_to(camera).position
     return abs(math.atan2(x, z)) <= view.horizontal / 2 and abs(math.atan2(y, z)) <= view.vertical / 2
 
@@ -96,16 +96,16 @@ def _notify(source: Source, object_type: ObjectType, seen: tuple[Seen, ...]) -> 
         observer.object_detected(source=source, object_type=object_type, seen=seen, node=current_node.get())
 
 
-def _visibility(robot: CurrentRobot, camera: Pose, thing: Object) -> tuple[float, str | None]:
-    """The share of it that is not hidden, and why it is not seen, if it is not."""
-    if not in_field_of_view(camera, robot.description.camera_view_rad, thing.bounding_box().centre):
+def _visibility(robot: CurrentRobot, camera: Pose, obj: Object) -> tuple[float, str | None]:
+    """Return the object's visible share, and the reason why it is not perceived, or None if it is."""
+    if not in_field_of_view(camera, robot.description.camera_view_rad, obj.bounding_box().centre):
         return 0.0, "is outside the camera's field of view"
-    met = met_towards(thing.world, thing, camera.position, ignore=robot.with_load())
-    if not met:
+    hits = met_towards(obj.world, obj, camera.position, ignore=robot.with_load())
+    if not hits:
         return 0.0, "has no shape that could be seen"
-    by = Counter("the floor" if each is None else each.name for each in met)
-    share = by.pop(thing.name, 0) / len(met)
+    counts = Counter("the floor" if each is None else each.name for each in hits)
+    share = counts.pop(obj.name, 0) / len(hits)
     if share >= SEEN_SHARE_MIN:
         return share, None
-    hiding = ", ".join(f"{name} hides {count / len(met):.0%}" for name, count in by.most_common())
+    hiding = ", ".join(f"{name} hides {count / len(hits):.0%}" for name, count in counts.most_common())
     return share, f"is hidden: {hiding} of it"

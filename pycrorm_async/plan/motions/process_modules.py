@@ -1,10 +1,9 @@
-"""Who carries out motions: the process modules of the robot that `with simulated_robot:` chooses, for this
-context.
+"""Choose the robot whose process modules execute the motions of the current context: `with simulated_robot:`.
 
-The choice nests, ends with the block however it is left, and is inherited by tasks that start inside. A
-robot of one's own is a class with these methods: `with ChosenRobot("mine", MyModules()):`; a motion it has no
-method for fails with `CapabilityAbsenceFailure`. Arms keep to their soft limits; `with
-simulated_robot_within(Limits.HARD):` they go up to the stops.
+Choices nest, end with their block, and are inherited by tasks that start inside. A user's own robot is a class with
+these methods: `with ChosenRobot("mine", MyModules()):`; a motion without a method fails with
+`CapabilityAbsenceFailure`. Arms keep to their soft limits; in `with simulated_robot_within(Limits.HARD):` they move up
+to the mechanical stops.
 """
 
 from __future__ import annotations
@@ -48,9 +47,9 @@ __all__ = [
 
 
 class MovingModules(Protocol):
-    """What the robot itself moves: the least that a robot of one's own has.
+    """The motions of the robot itself, the minimum that a user's own robot implements.
 
-    One method a motion; each returns when the motion is over and raises a `PlanFailure` when it did not succeed.
+    One method per motion; it returns when the motion has ended and raises a `PlanFailure` if it failed.
     """
 
     async def navigate(self, motion: MoveMotion) -> None: ...
@@ -67,9 +66,9 @@ class MovingModules(Protocol):
 
 
 class ProcessModules(MovingModules, Protocol):
-    """What a robot may also be able to do: perceive, open and close.
+    """All motions, including the optional ones: perceiving, opening and closing.
 
-    Perceiving returns what was found, the best seen first; `PerceptionObjectNotFound` says why nothing was.
+    Perceiving returns the detections, the most visible first, or raises `PerceptionObjectNotFound` with the reason.
     """
 
     async def detecting(self, motion: DetectingMotion) -> Sequence[Seen]: ...
@@ -87,12 +86,12 @@ _chosen: ContextVar[tuple[ChosenRobot, ...]] = ContextVar("_chosen", default=())
 
 
 class ChosenRobot:
-    """A choice of process modules; `with` it, motions of this context are carried out by them.
+    """A choice of process modules; inside its `with` block they execute the motions of the context.
 
     Args:
-        name: for people.
-        modules: one robot's; those of `ProcessModules` that it has no method for are motions it cannot do.
-        limits: what its arms keep to, for those who ask in advance what they can reach (`CostmapLocation`).
+        name: used in messages.
+        modules: the robot's modules; a method of `ProcessModules` that they lack is a motion the robot cannot execute.
+        limits: joint limits of its arms, used by searches that check reachability (`CostmapLocation`).
     """
 
     def __init__(self, name: str, modules: MovingModules, *, limits: Limits = Limits.SOFT) -> None:
@@ -114,15 +113,15 @@ class ChosenRobot:
 
 
 def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> ChosenRobot:
-    """As `simulated_robot`, with arms that keep to these limits.
+    """Return the simulated robot with these limits of the arms' joints.
 
-    Soft limits are those of the thesis' experiments. Within hard ones an arm reaches about twice as much, also
+    Soft limits are those of the thesis' experiments. Within hard limits an arm reaches about twice as many poses, also
     from above with the torso down.
 
     Args:
-        limits: of the arms' joints.
-        collisions: a hand does not go where its arm, or what it holds, would be in something (except that a gripper
-            may, where the motion allows it): `ManipulationGoalInCollision`. Ways there are not looked at.
+        limits: limits of the arms' joints.
+        collisions: whether a goal at which the arm or the held object collides raises `ManipulationGoalInCollision`. A
+            motion may allow collisions of the gripper. Paths are not checked.
 
     >>> with simulated_robot_within(Limits.HARD):
     ...     await MoveTCPMotion(Pose([0.9495, 0.188, 0.790675]), Arms.LEFT).perform()
@@ -132,15 +131,15 @@ def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> Chose
 
 
 simulated_robot = simulated_robot_within(Limits.SOFT)
-"""The robot in the world of this context, moved kinematically: at once, exactly, without physics."""
+"""The robot of the current world, moved kinematically: instantly, exactly, without physics."""
 
 
 def chosen_robot(motion: BaseMotion, module: str) -> ProcessModules:
-    """The modules of the innermost choice, which have the method of that name.
+    """Return the modules of the innermost choice, which have the method of that name.
 
     Raises:
-        NoRobotChosen: nothing says which robot moves.
-        CapabilityAbsenceFailure: the robot has no such method.
+        NoRobotChosen: no robot is chosen in this context.
+        CapabilityAbsenceFailure: the modules lack the method.
     """
     chosen = _chosen.get()
     if not chosen:
@@ -154,6 +153,6 @@ def chosen_robot(motion: BaseMotion, module: str) -> ProcessModules:
 
 
 def chosen_limits() -> Limits:
-    """What the arms of the innermost choice keep to; soft limits outside of any."""
+    """Return the arm limits of the innermost choice; soft limits without a choice."""
     chosen = _chosen.get()
     return chosen[-1].limits if chosen else Limits.SOFT

@@ -1,6 +1,7 @@
-"""The simulated robot: motions as exact jumps of the robot in the world. No time, no noise, collisions if asked for.
+"""Execute motions as exact jumps of the robot in the world: no duration, no noise, collision checks on request.
 
-A motion either has its whole effect, which the world tells once for each thing that moved, or fails and has none.
+A motion either has its whole effect, and the world notifies its observers once per moved object, or it fails and has
+none.
 """
 
 from __future__ import annotations
@@ -56,10 +57,10 @@ __all__ = ["SimulatedModules"]
 
 
 class SimulatedModules:
-    """The process modules of `with simulated_robot:`, with arms that keep to these limits when they are to reach.
+    """The process modules of `with simulated_robot:`; inverse kinematics keeps the arms within `limits`.
 
-    With `collisions` an arm does not go where it, or what it holds, would reach into something else than the robot;
-    the gripper itself may, where the motion allows it.
+    With `collisions` a goal is refused at which the arm or the held object collides with another object; the gripper
+    itself may collide if the motion allows it.
     """
 
     def __init__(self, limits: Limits, *, collisions: bool = False) -> None:
@@ -90,13 +91,13 @@ class SimulatedModules:
 
     async def move_arm_joints(self, motion: MoveArmJointsMotion) -> None:
         robot = require_robot()
-        wanted: dict[str, float] = {}
+        targets: dict[str, float] = {}
         for arm, positions in ((Arms.LEFT, motion.left_arm_poses), (Arms.RIGHT, motion.right_arm_poses)):
             for joint in positions or {}:
-                if joint not in (known := robot.one_arm(arm).joints):
-                    raise UnknownJoint(f"{robot.body.name}, {arm.name} arm", joint, known)
-            wanted |= positions or {}
-        _set_joints(robot, wanted)
+                if joint not in (joints := robot.one_arm(arm).joints):
+                    raise UnknownJoint(f"{robot.body.name}, {arm.name} arm", joint, joints)
+            targets |= positions or {}
+        _set_joints(robot, targets)
 
     async def move_joints(self, motion: MoveJointsMotion) -> None:
         _set_joints(require_robot(), dict(zip(motion.names, motion.positions, strict=True)))
@@ -125,21 +126,21 @@ class SimulatedModules:
         self._move_handle(robot, motion.arm, handle, moved_position(handle, motion.distance))
 
     def _move_handle(self, robot: CurrentRobot, arm: Arms, handle: Handle, goal: float) -> None:
-        """Bring the handle's joint to `goal` with the hand that is on it; the hand is on it as before then."""
+        """Move the handle's joint to `goal` together with the hand, which keeps its pose relative to the handle."""
         check_same_world(robot, handle.whole)
         tool_frame = robot.one_arm(arm).tool_frame
         tool = robot.body.link_pose(tool_frame)
-        apart = distance_to_box(tool, handle.whole.bounding_box(handle.link))
-        if apart > HOLD_DISTANCE_M_MAX:
-            message = f"{tool_frame} is not on {handle.link} but {apart:.3f} m away: grasp it first"
-            raise EnvironmentManipulationImpossible(message, handle.link, apart)
+        distance = distance_to_box(tool, handle.whole.bounding_box(handle.link))
+        if distance > HOLD_DISTANCE_M_MAX:
+            message = f"{tool_frame} is not on {handle.link} but {distance:.3f} m away: grasp it first"
+            raise EnvironmentManipulationImpossible(message, handle.link, distance)
         grip = tool.relative_to(handle.whole.link_pose(handle.link))
-        way = [self._solve(robot, arm, each @ grip) for each in handle_poses(handle, goal)]
-        robot.body.set_joint_positions(way[-1])
+        path = [self._solve(robot, arm, each @ grip) for each in handle_poses(handle, goal)]
+        robot.body.set_joint_positions(path[-1])
         handle.whole.set_joint_position(handle.joint, goal)
 
     def _solve(self, robot: CurrentRobot, arm: Arms, target: Pose) -> dict[str, float]:
-        """The arm's joints with which its tool frame is at the target. Raises `IKError`."""
+        """Return the arm's joint angles for a tool frame at the target. Raises `IKError`."""
         tool_frame = robot.one_arm(arm).tool_frame
         try:
             return solve(robot.body, arm, target, limits=self._limits)
@@ -147,34 +148,36 @@ class SimulatedModules:
             raise IKError(target, arm, tool_frame, unreachable.reason) from unreachable
 
     def _check_clear(self, robot: CurrentRobot, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
-        """Raise `ManipulationGoalInCollision` if the arm would be in something with these joints."""
+        """Raise `ManipulationGoalInCollision` if the arm or the held object collides at these joint angles."""
         arm = robot.one_arm(motion.arm)
         last = arm.joints[-1] if motion.allow_gripper_collision else None
         body = robot.body
         above = {link: body.joints_above(link) for link in body.links if body.body.solids[link]}
-        links = [link for link, found in above.items() if arm.joints[0] in found and last not in found]
-        held = [thing for thing, link in body.attachments.items() if link == arm.tool_frame]
-        met = collisions_at(body, joints, links=links, carried=held)
-        if met:
-            part, thing = met[0]
-            message = f"there the {motion.arm.name} arm would be in {thing.name} with {part}"
-            raise ManipulationGoalInCollision(message, part, thing.name)
+        links = [
+            link for link, joints_above in above.items() if arm.joints[0] in joints_above and last not in joints_above
+        ]
+        held = [obj for obj, link in body.attachments.items() if link == arm.tool_frame]
+        collisions = collisions_at(body, joints, links=links, carried=held)
+        if collisions:
+            part, obj = collisions[0]
+            message = f"at its goal the {motion.arm.name} arm would be in {obj.name} with {part}"
+            raise ManipulationGoalInCollision(message, part, obj.name)
 
 
 def head_joints(robot: CurrentRobot, target: Pose) -> dict[str, float]:
-    """Pan and tilt (rad) with which the camera's axis goes towards the target, as far as the neck can turn.
+    """Return pan and tilt (rad) that point the camera's axis at the target, clamped to the joints' limits.
 
-    Pan turns about z of the pan link. Tilt turns about y of the tilt link, whose origin the pan carries
-    around, so it is worked out as it will be after panning.
+    Pan rotates about z of the pan link. Tilt rotates about y of the tilt link, whose origin moves with pan, so tilt is
+    computed for the head after panning.
     """
     body, description = robot
     pan_pose = body.link_pose(description.head_pan_link)
     tilt_origin = body.link_pose(description.head_tilt_link).relative_to(pan_pose).position
-    seen = target.relative_to(pan_pose).position
-    turn = math.atan2(seen.y, seen.x)
+    point = target.relative_to(pan_pose).position
+    turn = math.atan2(point.y, point.x)
     pan = math.remainder(body.joint_position(description.head_pan_joint) + turn, math.tau)
-    ahead = math.hypot(seen.x, seen.y) - tilt_origin.x
-    tilt = -math.atan2(seen.z - tilt_origin.z, ahead)
+    ahead = math.hypot(point.x, point.y) - tilt_origin.x
+    tilt = -math.atan2(point.z - tilt_origin.z, ahead)
     return {
         description.head_pan_joint: _clamp(pan, body.joint_limits(description.head_pan_joint)),
         description.head_tilt_joint: _clamp(tilt, body.joint_limits(description.head_tilt_joint)),
