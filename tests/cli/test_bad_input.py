@@ -259,7 +259,7 @@ def test_a_database_beside_which_nothing_can_be_written_is_told_with_its_path(fo
         done = pycrorm(*arguments, "--url", f"sqlite:///{folder}/pycrorm.db", cwd=folder)
         assert one_line_of(done) == (
             f"pycrorm: sqlite:///{folder}/pycrorm.db cannot be opened: the file must be readable and its folder"
-            " writable, for SQLite makes files beside it, also to read it"
+            " writable, because SQLite creates files beside it, also for reading"
         )
         assert done.returncode == 3
     (folder / "pycrorm.db-wal").rmdir()

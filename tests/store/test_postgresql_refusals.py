@@ -171,7 +171,7 @@ async def test_a_log_of_a_newer_version_is_refused(server: Server, caplog: pytes
     for create in (True, False):
         error = await refused(url, caplog, create=create)
         assert type(error) is DatabaseForeign
-        assert "its format is 99, this version knows 1" in str(error)
+        assert "its format is 99, this version reads 1" in str(error)
 
 
 async def test_no_connection_left(server: Server, caplog: pytest.LogCaptureFixture) -> None:

@@ -168,6 +168,6 @@ async def test_a_reader_gets_one_line_while_a_backup_is_put_back(
             with pytest.raises(DatabaseUnavailable, match="restore") as caught:
                 await asking()
             assert "\n" not in str(caught.value)
-    with pytest.raises(DatabaseUnavailable, match=r"holds no memory yet|a restore may be under way"):
+    with pytest.raises(DatabaseUnavailable, match=r"holds no memory yet|a restore may be running"):
         await EventLog.open(DatabaseAddress.parse(database_url), create=False)
     await log.close()

@@ -1,1 +1,1 @@
-"""Everything only PostgreSQL understands: how to connect, the tables' text, the statements, which fault is whose."""
+"""Implement the log on PostgreSQL: connections, roles, tables, statements and errors."""

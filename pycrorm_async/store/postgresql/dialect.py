@@ -1,4 +1,4 @@
-"""PostgreSQL's answers to what the log asks; the texts are in `statements` and `tables`."""
+"""Implement `Dialect` for PostgreSQL; the SQL is in `statements` and `tables`."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEven
 __all__ = ["PostgreSQL"]
 
 _SERVER_MIN = 140_000
-_RESTORING = "a restore may be under way; when it is finished, try again"
+_RESTORING = "a restore may be running; try again when it has finished"
 
 
 class PostgreSQL:
-    """Implements `Dialect`. Events go by COPY; whoever appends to an episode holds its row until COMMIT."""
+    """Implements `Dialect`. Events are inserted by COPY; an append locks its episodes' rows until COMMIT."""
 
     migrations: Migrations = tables.MIGRATIONS
     faults: tuple[type[Exception], ...] = errors.FAULTS
 
-    # --- making -------------------------------------------------------------------------------------------------
+    # --- finding and creating a log ---------------------------------------------------------------------------------
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
-        """Nothing has to be done outside a transaction."""
+        """Do nothing: PostgreSQL needs no preparation outside a transaction."""
 
     async def lock_log_changes(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql(tables.ALONE)
@@ -65,7 +65,7 @@ class PostgreSQL:
         return LogIdentity._make(found)
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
-        # In one message, past SQLAlchemy: within the transaction that a statement through it has begun before.
+        # One message, bypassing SQLAlchemy, in the transaction that an earlier statement through SQLAlchemy began.
         await (await _driver(connection)).execute("; ".join(statements))
 
     async def insert_log(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
@@ -98,9 +98,9 @@ class PostgreSQL:
         if number <= above:
             await self._skip(connection, number, above)
 
-    async def _skip(self, connection: AsyncConnection, given: int, above: int) -> None:
-        # By asking for all of them, and not by setval: that needs a privilege, and could set it back behind another's.
-        count = above + numbers_reserved(above) - given
+    async def _skip(self, connection: AsyncConnection, current: int, above: int) -> None:
+        # Uses nextval, because setval needs a privilege and could move the sequence back behind another session.
+        count = above + numbers_reserved(above) - current
         if count > 0:
             await connection.exec_driver_sql(sql.SKIP_NUMBERS, (count,))
 
@@ -111,7 +111,7 @@ class PostgreSQL:
         return await _rows(EpisodeRow, connection, sql.SELECT_HEADS, list(ids))
 
     async def note_incarnation(self, connection: AsyncConnection, incarnation: Incarnation) -> None:
-        # Who appends as one role of many may not make tables: then the owner has (`roles.GRANTS`).
+        # A role without the privilege to create tables relies on the owner's (`roles.GRANTS`).
         if not await self._has_incarnations(connection):
             await self.lock_log_changes(connection)
             await connection.exec_driver_sql(tables.INCARNATION)
@@ -129,7 +129,7 @@ class PostgreSQL:
         configured = (await connection.exec_driver_sql(sql.SYNCHRONOUS_STANDBYS)).scalar_one().strip()
         if not configured:
             return StoredOn(1)
-        # Without the right to see them (pg_read_all_stats) their states are null: COMMIT waits for them all the same.
+        # Without pg_read_all_stats their states are null, but COMMIT still waits for them.
         names = tuple((await connection.exec_driver_sql(sql.SELECT_SYNCHRONOUS)).scalars())
         return StoredOn(1 + max(1, _confirming(configured)), names or (configured,))
 
@@ -184,7 +184,7 @@ class PostgreSQL:
         return await _rows(StoredEvent, connection, sql.SELECT_EVENTS, number, after, limit)
 
     async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
-        # Past SQLAlchemy, which looks at every row twice.
+        # Bypasses SQLAlchemy, which processes every row twice.
         found = await (await _driver(connection)).fetch(sql.SELECT_SPANS, *_arrays(spans, 3))
         return [make(StoredEvent, row) for row in found]
 
@@ -195,7 +195,7 @@ class PostgreSQL:
         await connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
 
     async def in_order(self, connection: AsyncConnection) -> None:
-        # It takes the first few for more of all than they are, and would find and sort all of them.
+        # The planner overestimates the first few rows, and would read and sort all of them.
         await connection.exec_driver_sql("SET LOCAL enable_sort = off")
 
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
@@ -210,7 +210,7 @@ class PostgreSQL:
         return True
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:  # noqa: ARG002
-        return []  # a server looks after its pages itself
+        return []  # a server checks its pages itself
 
     # --- folding ------------------------------------------------------------------------------------------------
 
@@ -229,14 +229,14 @@ class PostgreSQL:
         found, stranger, login = tuple((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).one())
         if stranger is not None:
             raise TablesUntrusted(
-                f"the tables belong to {stranger}, whose members could run code of theirs with the rights of {login}:"
+                f"the tables belong to {stranger}, whose members could run their code with the rights of {login}:"
                 f" fold with a login that is a member of {stranger} and has no right to the log, read with one of"
                 " pycrorm_reader"
             )
         return bool(found)
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
-        """The server counts by itself."""
+        """Do nothing: the server gathers statistics itself."""
 
     def stored_column(self, name: str) -> str:
         return f"_{name}" if name in tables.SYSTEM_COLUMNS else name
@@ -252,24 +252,26 @@ class PostgreSQL:
         strangers = list(found.scalars())
         if strangers:
             raise DatabaseError(
-                f"{VIEWS_SCHEMA}.{strangers[0]} is not of the memory, and the schema {VIEWS_SCHEMA} is made anew with"
-                " every change: move it to another schema"
+                f"{VIEWS_SCHEMA}.{strangers[0]} does not belong to the memory, which replaces the schema {VIEWS_SCHEMA}"
+                " with every change of its views: move it to another schema"
             )
 
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
-        """All of them, made aside and put in place by renaming: to replace a view it would have to be locked, and so
-        to wait for every reader in a transaction, with every new reader waiting behind."""
+        """Create all views in a new schema and rename it into place.
+
+        Replacing a view in place would lock it: wait for every reader's transaction, with new readers queued behind.
+        """
         if before == after:
             return
         await self.only_views(connection, before)
         quote = connection.dialect.identifier_preparer.quote
-        made = [f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()]
-        await self.execute_all(connection, [*tables.NEW_VIEWS_SCHEMA, *made, *tables.SHOW_NEW_VIEWS_SCHEMA])
+        creations = [f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()]
+        await self.execute_all(connection, [*tables.NEW_VIEWS_SCHEMA, *creations, *tables.SHOW_NEW_VIEWS_SCHEMA])
 
     async def sweep(self, connection: AsyncConnection) -> None:
-        for schema, views in await _rows(_Gone, connection, tables.GONE_SCHEMAS):
+        for schema, views in await _rows(_ReplacedSchema, connection, tables.GONE_SCHEMAS):
             try:
                 async with connection.begin_nested():
                     await connection.exec_driver_sql(tables.WAIT_FOR_NOBODY)
@@ -279,10 +281,10 @@ class PostgreSQL:
             except DBAPIError as error:
                 if error.connection_invalidated:
                     raise
-                continue  # somebody reads them, or stands on them: next time
+                continue  # still read, or used by another view: the next sweep retries
 
     async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:  # noqa: ARG002
-        return False  # dropping deletes files, whatever is in them
+        return False  # dropping deletes files, whatever their size
 
     async def drop(self, connection: AsyncConnection, table: str) -> None:
         await connection.exec_driver_sql(tables.WAIT_FOR_NOBODY)
@@ -292,7 +294,7 @@ class PostgreSQL:
     @asynccontextmanager
     async def claim(self, engine: AsyncEngine) -> AsyncIterator[bool]:
         async with engine.connect() as connection:
-            # No transaction stays open, which would be ended for idling; the lock is the session's.
+            # Autocommit, because an idle transaction would be terminated; the lock belongs to the session.
             connection = await connection.execution_options(isolation_level="AUTOCOMMIT")
             claimed = bool((await connection.exec_driver_sql(tables.CLAIM)).scalar_one())
             try:
@@ -303,14 +305,14 @@ class PostgreSQL:
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
         quote = connection.dialect.identifier_preparer.quote
-        # Also where a connection may only read: a temporary view is nobody else's.
+        # Also on a read-only connection, because a temporary view belongs to the session alone.
         await connection.exec_driver_sql("SET TRANSACTION READ WRITE")
         await self.execute_all(
             connection, [f"CREATE TEMP VIEW {quote(name)} AS {text}" for name, text in views.items()]
         )
 
     async def insertion(self, rows: RowsByTable) -> Insertion:
-        return rows  # the driver makes a row ready while the server takes those before it
+        return rows  # the driver encodes a row while the server stores the previous ones
 
     async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
         for (table, columns), some in insertion.items():
@@ -319,7 +321,7 @@ class PostgreSQL:
     async def update_rows(
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
     ) -> None:
-        arrays = ", ".join(f"${place}::{kind}[]" for place, kind in enumerate(columns.values(), 1))
+        arrays = ", ".join(f"${index}::{kind}[]" for index, kind in enumerate(columns.values(), 1))
         changes = ", ".join(f"{column} = change.{column}" for column in list(columns)[1:])
         with _rows_refused():
             await connection.exec_driver_sql(
@@ -338,7 +340,7 @@ class PostgreSQL:
 
 
 def _confirming(configured: str) -> int:
-    """How many standbys confirm each COMMIT, as `synchronous_standby_names` says.
+    """Return how many standbys confirm each COMMIT, from `synchronous_standby_names`.
 
     >>> _confirming("ANY 2 (a, b, c)"), _confirming("FIRST 1 (a)"), _confirming("2 (a, b)"), _confirming("a, b")
     (2, 1, 2, 1)
@@ -347,8 +349,8 @@ def _confirming(configured: str) -> int:
     return int(words[-1]) if "(" in configured and words and words[-1].isdigit() else 1
 
 
-class _Gone(NamedTuple):
-    """A schema of views that were replaced."""
+class _ReplacedSchema(NamedTuple):
+    """A schema of replaced views."""
 
     schema: str
     views: list[str] | None
@@ -357,7 +359,7 @@ class _Gone(NamedTuple):
 async def _copy(
     connection: AsyncConnection, schema: str, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
 ) -> None:
-    """COPY, within the transaction that a statement through SQLAlchemy has begun before."""
+    """Insert rows by COPY, in the transaction that an earlier statement through SQLAlchemy began."""
     driver = await _driver(connection)
     with _rows_refused():
         await driver.copy_records_to_table(table, schema_name=schema, columns=columns, records=rows)
@@ -386,5 +388,5 @@ async def _rows(kind: Any, connection: AsyncConnection, statement: str, *paramet
 
 
 def _arrays(rows: Sequence[tuple[Any, ...]], columns: int) -> tuple[list[Any], ...]:
-    """Rows as one array a column, which is how a statement takes many."""
+    """Transpose rows to one array per column, the form in which a statement takes many rows."""
     return tuple([row[column] for row in rows] for column in range(columns))

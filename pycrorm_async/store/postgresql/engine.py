@@ -1,4 +1,4 @@
-"""An engine for a PostgreSQL server: durable at COMMIT, the search path pinned, every wait bounded."""
+"""Create an engine for a PostgreSQL server: durable at COMMIT, with a pinned search path and bounded waits."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ __all__ = [
 ]
 
 ANSWER_S_MAX = 60.0
-"""A statement that takes longer counts as a server that is away."""
+"""Bounds a statement; a server that takes longer counts as unavailable."""
 
 WARNING = "pycrorm_warning"
-"""Key of a connection's `info` under which the server's latest warning is kept."""
+"""Key in a connection's `info` for the server's latest warning."""
 
 _VANISHED = {
     "tcp_keepalives_idle": "10",
@@ -33,14 +33,14 @@ _VANISHED = {
     "tcp_keepalives_count": "3",
     "tcp_user_timeout": "25000",
 }
-"""A machine that vanishes in the middle of a statement says no goodbye. The server asks after it, and lets go of its
-locks half a minute later; as it comes, it waits two hours, and nobody can go on with what was being appended."""
+"""A machine that loses power during a statement does not close its connection. With these settings the server detects
+that and releases its locks after half a minute; the default is two hours, in which its episodes stay locked."""
 
 WHERE = ("host", "port")
-"""The parameters of a URL that say where the server is, and so may be shown."""
+"""URL parameters that locate the server, and so may be shown."""
 
 TLS = ("sslmode", "sslrootcert", "sslcert", "sslkey")
-"""The parameters of a URL that say how the connection is encrypted, as libpq understands them. Paths are no secret."""
+"""URL parameters for the encryption of the connection, as in libpq. Their paths are not secret."""
 
 _TLS_FILES = {"sslrootcert", "sslcert", "sslkey"}
 
@@ -49,7 +49,7 @@ _SSL_MODES = ("disable", "allow", "prefer", "require", "verify-ca", "verify-full
 
 
 def refusal(url: URL) -> str | None:
-    """What is wrong with a PostgreSQL URL, without a word of it, which may be of a password; None if nothing is."""
+    """Return what is wrong with a PostgreSQL URL, or None. Quotes no part of it, which may belong to a password."""
     if "@" in (url.host or ""):
         return "an @ in a password is written %40"
     if not url.database:
@@ -69,13 +69,14 @@ def _number(text: str) -> int:
 
 
 def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEngine:
-    """An engine for the server and database this URL names. Connecting takes at most `busy_timeout_s`.
+    """Create an engine for the server and database of this URL.
 
-    A read-only one refuses to write. A lock of another session is waited for as long, then the database counts as away.
+    Connecting, and waiting for another session's lock, take at most `busy_timeout_s`; then the database counts as
+    unavailable. A read-only engine refuses writes.
     """
     settings = {
         "application_name": "pycrorm",
-        "search_path": "pg_catalog",  # until it is pinned
+        "search_path": "pg_catalog",  # until `PIN` sets it
         "synchronous_commit": "on",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
         "lock_timeout": f"{int(busy_timeout_s * 1000)}",
         "idle_in_transaction_session_timeout": "60000",
@@ -83,7 +84,7 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
         "default_transaction_read_only": "on" if read_only else "off",
         "timezone": "UTC",
     }
-    # The driver reads these from a URL alone; what else is in it comes as arguments, which count for more.
+    # The driver reads these only from a URL; other parts of the URL are passed as arguments, which take precedence.
     tls = {name: value for name, value in url.query.items() if name in TLS}
     for name in sorted(_TLS_FILES & tls.keys()):
         if not os.access(str(tls[name]), os.R_OK):
@@ -96,7 +97,7 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
             "timeout": busy_timeout_s,
             "command_timeout": ANSWER_S_MAX,
             "server_settings": settings,
-            # A plan that is kept fails once when a view it reads has got a column, which happens with every new type.
+            # A cached plan fails once after its view gets a column, which happens with every new type.
             "prepared_statement_cache_size": 0,
         },
         pool_size=2,
@@ -108,7 +109,7 @@ def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEng
 
 
 def _set_up(connection: Any, record: ConnectionPoolEntry) -> None:
-    """Pins the search path of a new connection, and keeps the server's latest warning in its `info`."""
+    """Pin the search path of a new connection, and keep the server's latest warning in its `info`."""
 
     def keep(_: Any, message: Any) -> None:
         if getattr(message, "severity_en", None) == "WARNING":

@@ -1,29 +1,30 @@
-"""Roles of a memory on PostgreSQL: three, each with no more rights than its work needs.
+"""Define three roles of a memory on PostgreSQL, each with only the rights that its work needs.
 
     pycrorm_recorder   appends to the log
     pycrorm_folder     appends, and makes tables and views from the log: plans, `pycrorm writer`, `pycrorm rebuild`
     pycrorm_reader     reads log, tables and views: `pycrorm episodes`, `show`, `verify`, notebooks
 
-None of them can change or delete an event: they lack the privilege, and triggers refuse it to the owner too. The owner
-of the database opens the memory once (`pycrorm writer --once`), which makes the log; then the owner runs `GRANTS`,
-which may be run again. They hand the tables and views, which are made from the log and can be made again, to the
-folder, and leave the log with the owner. An owner who may not create roles gets the statements that a role with
-CREATEROLE has to run first. People and programs get a role by membership:
+No role can change or delete an event: they lack the privilege, and triggers refuse it to the owner too. The owner of
+the database creates the log by opening the memory once (`pycrorm writer --once`), and then runs `GRANTS`, which may be
+repeated. `GRANTS` transfers the tables and views, which can be rebuilt from the log, to `pycrorm_folder`; the log stays
+with the owner. An owner without CREATEROLE gets the statements that a role with it must run first. Users and programs
+get a role by membership:
 
     GRANT pycrorm_reader TO ada;
     GRANT pycrorm_folder TO robot; ALTER ROLE robot IN DATABASE memory SET role = 'pycrorm_folder';
 
-The second line makes what a robot creates belong to all robots, so that each can grow the tables of the others.
+The second line makes the objects that one robot creates belong to all robots, so that each can extend the others'
+tables.
 
-From then on the owner's own login appends and brings the log up to date, and is refused at tables and views: members of
-`pycrorm_folder` could have planted code there, which would run with the owner's rights (`path` has the reasons). The
-owner folds and reads with logins that have no other rights:
+From then on the owner's own login can append and migrate the log, but is refused at tables and views: members of
+`pycrorm_folder` could plant code there that would run with the owner's rights (see `search_path`). The owner folds and
+reads with logins that have no other rights:
 
     CREATE ROLE lab LOGIN IN ROLE pycrorm_folder; ALTER ROLE lab IN DATABASE memory SET role = 'pycrorm_folder';
 
-All recorders and folders of a memory trust each other: each can append to the episodes of the others, end them, and use
-up the episode numbers, because to compare each event's episode with the login that began it costs an eighth of the rate
-of appending. All readers trust the folders, whose views they read.
+All recorders and folders of a memory trust each other: each can append to the others' episodes, end them, and use up
+the episode numbers, because checking each event's episode against the login that began it costs an eighth of the append
+rate. All readers trust the folders, whose views they read.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from pycrorm_async.store.postgresql.tables import INCARNATION
 
 __all__ = ["GRANTS"]
 
-_MADE = f"""
+_TRANSFER = f"""
 DO $$
 DECLARE
     name text;
@@ -82,7 +83,7 @@ _READING = "pycrorm_recorder, pycrorm_folder, pycrorm_reader"
 _APPENDING = "pycrorm_recorder, pycrorm_folder"
 
 GRANTS: tuple[str, ...] = (
-    _MADE,
+    _TRANSFER,
     INCARNATION,
     f"REVOKE ALL ON SCHEMA {LOG}, {TABLES}, {VIEWS} FROM PUBLIC",
     f"GRANT USAGE ON SCHEMA {LOG} TO {_READING}",
@@ -95,7 +96,7 @@ GRANTS: tuple[str, ...] = (
     f"GRANT USAGE ON SCHEMA {TABLES}, {VIEWS} TO pycrorm_reader",
     f"GRANT SELECT ON ALL TABLES IN SCHEMA {TABLES} TO pycrorm_reader",
     f"GRANT SELECT ON ALL TABLES IN SCHEMA {VIEWS} TO pycrorm_reader",
-    # What the folder makes later: tables, and the schema of the views, which is made anew with each change of them.
+    # For later objects of the folder: tables, and the schema of the views, which each change of the views replaces.
     "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT USAGE ON SCHEMAS TO pycrorm_reader",
     "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT SELECT ON TABLES TO pycrorm_reader",
 )

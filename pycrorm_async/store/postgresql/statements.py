@@ -1,10 +1,10 @@
-"""What the log says to PostgreSQL. A batch is one statement a table: COPY for events, arrays for the rest.
+"""Define the log's SQL for PostgreSQL. A batch is one statement per table: COPY for events, arrays for the rest.
 
-Every function is named with its schema, so that none of somebody else in the search path is called in its place;
-`unnest` of several arrays alone is syntax, which means the one in pg_catalog and cannot be named so.
+Every function is qualified with its schema, so that no function of another role in the search path replaces it. Only
+`unnest` with several arrays cannot be qualified, because it is syntax; it always means the one in pg_catalog.
 """
 
-# ruff: noqa: S608 - what is put together here are lists of columns; every value is a parameter
+# ruff: noqa: S608 - the SQL is composed of column lists only; every value is a parameter
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ ON CONFLICT (number) DO UPDATE
 SET head = excluded.head, ended_wall_ns = excluded.ended_wall_ns, refused = excluded.refused"""
 
 WRITE_AHEAD = "SELECT pg_catalog.pg_logical_emit_message(true, 'pycrorm', '')"
-"""Writes an empty message into the server's write-ahead log: a COMMIT with nothing there waits for no standby, and
-would acknowledge what another transaction committed and no standby has yet."""
+"""Writes an empty message to the server's write-ahead log. A COMMIT without any record there waits for no standby, and
+could acknowledge events of another transaction that no standby has yet."""
 
 _EVENT = (
     "event.episode, event.sequence, event.type, event.version, event.wall_ns, event.monotonic_ns,"
@@ -80,11 +80,11 @@ JOIN pycrorm.event USING (episode, sequence)"""
 
 _EPISODE = "number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked"
 
-# In one order, so that two writers of the same episodes wait for each other and never in a circle.
+# Locks in a fixed order, so that two writers of the same episodes cannot deadlock.
 SELECT_EPISODES_BY_ID = f"""
 SELECT {_EPISODE} FROM pycrorm.episode WHERE id = ANY ($1::text[]) ORDER BY number FOR UPDATE"""
 
-# The witness is read as it is, so that the appends of two recorders do not wait for each other.
+# Reads the witness without a lock, so that the appends of two recorders do not wait for each other.
 SELECT_EPISODES_AND_WITNESS = f"""
 WITH locked AS MATERIALIZED ({SELECT_EPISODES_BY_ID})
 SELECT * FROM locked UNION ALL SELECT {_EPISODE} FROM pycrorm.episode WHERE id = $2"""
@@ -104,7 +104,7 @@ SELECT {_EPISODE} FROM pycrorm.episode WHERE head >= $1 AND ended_wall_ns IS NUL
 SELECT_EVENTS = f"""
 SELECT {_EVENT} FROM pycrorm.event WHERE episode = $1 AND sequence > $2 ORDER BY sequence LIMIT $3"""
 
-# LATERAL, so that each span is read by the key, however much there is.
+# LATERAL, so that each span is read by the primary key, whatever the size of the table.
 SELECT_SPANS = f"""
 SELECT event.* FROM unnest($1::bigint[], $2::bigint[], $3::bigint[])
 WITH ORDINALITY AS span (number, after, last, place) CROSS JOIN LATERAL (
@@ -114,8 +114,8 @@ WITH ORDINALITY AS span (number, after, last, place) CROSS JOIN LATERAL (
 
 SELECT_DECLARATIONS = "SELECT pg_catalog.convert_to(payload, 'UTF8') FROM pycrorm.pycrorm_declaration ORDER BY ordinal"
 
-# The rows are taken by number first, as everywhere: an UPDATE by itself takes them in whatever order it meets them, and
-# two who fold the same episodes would now and then wait for each other in a circle, for a second each time.
+# Locks the rows by number first, as elsewhere. An UPDATE alone locks them in any order, so that two processes that fold
+# the same episodes would sometimes deadlock, for a second each time.
 ADVANCE_FOLDED = """
 WITH step AS MATERIALIZED (
     SELECT * FROM unnest($1::bigint[], $2::bigint[], $3::bigint[]) AS one (number, before, folded)

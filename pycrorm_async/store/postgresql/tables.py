@@ -1,4 +1,4 @@
-"""The log's tables on PostgreSQL, as numbered migrations: format N is what the first N of them make."""
+"""Define the log's tables on PostgreSQL as numbered migrations; the first N of them create format N."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ __all__ = [
 ]
 
 SYSTEM_COLUMNS = frozenset("xmin xmax cmin cmax ctid tableoid".split())
-"""Every table has them already; a view may have its own."""
+"""Names that every table reserves for system columns; a view may use them."""
 
 SERVER_VERSION = "SELECT pg_catalog.current_setting('server_version_num')::int"
 
 ALONE = "SELECT pg_catalog.pg_advisory_xact_lock(7266203370152417861)"
-"""The number says who we are: the first letters of our name as a number. IF NOT EXISTS alone races."""
+"""Serialises creation and migration, because IF NOT EXISTS alone races. The key encodes our name."""
 CLAIM = "SELECT pg_catalog.pg_try_advisory_lock(7266203370152417862)"
 RELEASE = "SELECT pg_catalog.pg_advisory_unlock(7266203370152417862)"
 
-# Less than deadlock_timeout: whoever changes tables is the one who gives up, never a reader.
+# Less than deadlock_timeout, so that the session that changes tables fails, never a reader.
 WAIT_BRIEFLY = "SET LOCAL lock_timeout = '300ms'"
 WAIT_FOR_NOBODY = "SET LOCAL lock_timeout = '20ms'"
 WAIT_AS_EVER = "SET LOCAL lock_timeout TO DEFAULT"
@@ -54,7 +54,7 @@ JOIN pg_catalog.pg_depend ON refclassid = 'pg_catalog.pg_namespace'::regclass::o
 LEFT JOIN pg_catalog.pg_class ON classid = 'pg_catalog.pg_class'::regclass::oid AND pg_class.oid = objid
 WHERE nspname = '{VIEWS}' AND (relname = ANY ($1::text[])) IS NOT TRUE
 AND classid <> 'pg_catalog.pg_default_acl'::regclass::oid"""  # noqa: S608
-"""What is in the schema of the views beside these."""
+"""Selects the objects in the views' schema other than these views."""
 
 NEW_VIEWS_SCHEMA = (
     f"CREATE SCHEMA {_NEW}",
@@ -83,7 +83,7 @@ pg_catalog.array_agg(pg_catalog.format('%I.%I', nspname, relname)) FILTER (WHERE
 FROM pg_catalog.pg_namespace LEFT JOIN pg_catalog.pg_class ON relnamespace = pg_namespace.oid
 WHERE pg_catalog.starts_with(nspname::text, '{VIEWS}_gone_') AND pg_catalog.pg_has_role(nspowner, 'USAGE')
 GROUP BY nspname"""  # noqa: S608
-"""Schemas of views that were replaced, and the views in them."""
+"""Selects the schemas of replaced views, with their views."""
 
 _LOG = f"""
 CREATE TABLE {LOG}.pycrorm_log (
@@ -100,7 +100,7 @@ CREATE TABLE {LOG}.pycrorm_declaration (
     payload text NOT NULL
 )"""
 
-# From a sequence, so that no robot waits for the transaction of another; what is rolled back leaves a hole.
+# A sequence, so that no robot waits for another one's transaction; a rollback leaves a hole.
 _NUMBERS = f"CREATE SEQUENCE {LOG}.episode_number"
 
 _EPISODE = f"""
@@ -115,12 +115,12 @@ CREATE TABLE {LOG}.episode (
     parked text
 )"""
 
-# Whether an episode is behind changes with each append and each fold, so no update of a row is heap-only, however much
-# room its page has. That is the price of a poll that costs the same with any number of episodes.
+# Each append and each fold changes whether an episode is in this index, so no update is heap-only, whatever space its
+# page has. In return a poll costs the same with any number of episodes.
 _BEHIND = f"CREATE INDEX episode_behind ON {LOG}.episode (number) WHERE folded < head AND parked IS NULL"
 _STOPPED = f"CREATE INDEX episode_stopped ON {LOG}.episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
 
-# As text, not jsonb: that refuses U+0000, reorders keys and rounds numbers; the bytes of the queue stay the bytes.
+# text, because jsonb refuses U+0000, reorders keys and rounds numbers; text keeps the bytes of the queue.
 _EVENT = f"""
 CREATE TABLE {LOG}.event (
     episode bigint NOT NULL,
@@ -175,7 +175,7 @@ CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_incarnation (
     noticed_by text NOT NULL,
     reason text NOT NULL
 )"""
-"""Made when a log is first found to have gone back, and no part of its format: older programs read and write it."""
+"""Created when a log is first found to have gone back. Not part of the format: older programs still use the log."""
 HAS_INCARNATION = f"SELECT pg_catalog.to_regclass('{LOG}.pycrorm_incarnation') IS NOT NULL"
 
 TABLE_NAMES = f"""

@@ -1,1 +1,1 @@
-"""Everything only SQLite understands: how to connect, the tables' text, the statements, which fault is whose."""
+"""Implement the log on SQLite: connections, locks, tables, statements and errors."""

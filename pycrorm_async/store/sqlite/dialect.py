@@ -1,4 +1,4 @@
-"""SQLite's answers to what the log asks; the texts are in `statements` and `tables`."""
+"""Implement `Dialect` for SQLite; the SQL is in `statements` and `tables`."""
 
 from __future__ import annotations
 
@@ -38,24 +38,28 @@ __all__ = ["SQLite"]
 
 
 class SQLite:
-    """Implements `Dialect`. A batch is few statements, because `executemany` gives up the interpreter at every row."""
+    """Implements `Dialect`. A batch takes few statements: `executemany` releases the interpreter lock at every row."""
 
     migrations: Migrations = tables.MIGRATIONS
-    faults: tuple[type[Exception], ...] = (DBAPIError, sqlite3.Error, UnicodeDecodeError)  # of a name in a damaged file
+    faults: tuple[type[Exception], ...] = (
+        DBAPIError,
+        sqlite3.Error,
+        UnicodeDecodeError,
+    )  # UnicodeDecodeError: a name in a damaged file
 
-    # --- making -------------------------------------------------------------------------------------------------
+    # --- finding and creating a log ---------------------------------------------------------------------------------
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
         async with engine.connect() as connection:
-            # Not before the database is known to be ours or empty: the journal mode is a lasting change of the file.
+            # First check that the database is ours or empty: setting the journal mode changes the file permanently.
             await connection.execution_options(**{BEGIN: None})
             await self.find_log(connection, name)
             mode = (await connection.exec_driver_sql(USE_WAL)).scalar_one()
             if mode != "wal":
-                raise DatabaseUnavailable(f"{name}: SQLite cannot keep a write-ahead log there (a network folder?)")
+                raise DatabaseUnavailable(f"{name}: SQLite cannot keep a write-ahead log existing (a network folder?)")
 
     async def lock_log_changes(self, connection: AsyncConnection) -> None:
-        """A writing transaction holds the write lock from its beginning."""
+        """Do nothing: a writing transaction holds the write lock from its beginning."""
 
     async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
         names = set((await connection.exec_driver_sql(tables.TABLE_NAMES)).scalars())
@@ -92,7 +96,7 @@ class SQLite:
         return list(range(taken + 1, taken + 1 + count))
 
     async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
-        """A number is one more than the highest one there is: `new_numbers` knows those that were lost."""
+        """Do nothing: SQLite has no sequence; `new_numbers` skips the numbers."""
 
     async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:
         return set((await connection.exec_driver_sql(sql.SELECT_NUMBERS_TAKEN, (_json(numbers),))).scalars())
@@ -122,7 +126,7 @@ class SQLite:
         await connection.exec_driver_sql(sql.UPSERT_EPISODES, (_json([_columns(each) for each in episodes]),))
 
     async def force_durable_commit(self, connection: AsyncConnection) -> None:
-        """Nothing has to be done: what another transaction committed is on the disk before this one sees it."""
+        """Do nothing: another transaction's changes are on the disk before this one sees them."""
 
     async def commit(self, connection: AsyncConnection) -> None:
         await connection.commit()
@@ -157,28 +161,28 @@ class SQLite:
         driver = await _driver(connection)
         parts = [part for span in spans for part in _parts_of(span, _EVENTS_AT_ONCE)]
         try:
-            found = await driver.rows_in_turn(sql.SELECT_SPAN, parts)
-        except sqlite3.DataError:  # so large that SQLite does not give some of them as one value
+            rows = await driver.rows_in_turn(sql.SELECT_SPAN, parts)
+        except sqlite3.DataError:  # together too large for one SQLite value
             parts = [part for span in spans for part in _parts_of(span, 1)]
-            found = await driver.rows_in_turn(sql.SELECT_SPAN, parts)
-        return [event for part, row in zip(parts, found, strict=True) for event in _events(part.number, *row)]
+            rows = await driver.rows_in_turn(sql.SELECT_SPAN, parts)
+        return [event for part, row in zip(parts, rows, strict=True) for event in _events(part.number, *row)]
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
 
     async def begin_snapshot(self, connection: AsyncConnection) -> None:
-        """A transaction is a snapshot."""
+        """Do nothing: a transaction is a snapshot."""
 
     async def in_order(self, connection: AsyncConnection) -> None:
-        """It does so where an index has the order."""
+        """Do nothing: SQLite reads an index in order if one fits."""
 
-    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:  # they are of the snapshot
-        there = (await connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'")).scalars()
-        return set(tables) <= set(there)
+    async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:  # the snapshot protects them
+        existing = (await connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'")).scalars()
+        return set(tables) <= set(existing)
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
-        found = list((await connection.exec_driver_sql("PRAGMA integrity_check")).scalars())
-        return [] if found == ["ok"] else found
+        rows = list((await connection.exec_driver_sql("PRAGMA integrity_check")).scalars())
+        return [] if rows == ["ok"] else rows
 
     # --- folding ------------------------------------------------------------------------------------------------
 
@@ -191,15 +195,15 @@ class SQLite:
     # --- tables and views ---------------------------------------------------------------------------------------
 
     async def make_place(self, connection: AsyncConnection) -> None:
-        """They are in the same file."""
+        """Do nothing: tables and views are in the same file."""
 
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
         return (await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).first() is not None
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
-        # To count holds the write lock for as long as that takes, and who never counted takes every table for as large
-        # as any other: a question by status began with all nodes there are, and took four times as long.
-        await connection.exec_driver_sql(f"ANALYZE {_quote(tables[0].table)}")  # makes the planner's table
+        # Counting the rows would hold the write lock all that time. Without statistics the planner assumes equal sizes:
+        # a query by status began with all nodes and took four times as long.
+        await connection.exec_driver_sql(f"ANALYZE {_quote(tables[0].table)}")  # creates the planner's table
         rows: list[tuple[str, str | None, str]] = [(each.table, None, str(each.rows)) for each in tables]
         for each in tables:
             rows += [
@@ -214,7 +218,7 @@ class SQLite:
         await connection.exec_driver_sql(f"ALTER TABLE {_quote(table)} ADD COLUMN {definition}")
 
     async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
-        """What is somebody else's is in nobody's way."""
+        """Do nothing: foreign objects do not hinder `replace_views`."""
 
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
@@ -227,10 +231,10 @@ class SQLite:
                 await connection.exec_driver_sql(f"CREATE VIEW {_quote(name)} AS {text}")
 
     async def sweep(self, connection: AsyncConnection) -> None:
-        """What was replaced is gone; who reads it has a snapshot."""
+        """Do nothing: replaced views are dropped at once; readers have a snapshot."""
 
     async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:
-        # To drop a full table would hold the one write lock for seconds.
+        # Dropping a full table would hold the only write lock for seconds.
         quoted = _quote(table)
         some = f"SELECT rowid FROM {quoted} LIMIT {rows_max}"  # noqa: S608
         deleted = await connection.exec_driver_sql(f"DELETE FROM {quoted} WHERE rowid IN ({some})")  # noqa: S608
@@ -249,12 +253,12 @@ class SQLite:
             await connection.exec_driver_sql(f"CREATE TEMP VIEW {_quote(name)} AS {text}")
 
     async def insertion(self, rows: RowsByTable) -> Insertion:
-        made = []
+        insertions = []
         for (table, columns), some in rows.items():
             for statement in inserts(_quote(table), [*map(_quote, columns)], some):
-                made.append(statement)
+                insertions.append(statement)
                 await asyncio.sleep(0)
-        return made
+        return insertions
 
     async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
         with _rows_refused():
@@ -264,10 +268,10 @@ class SQLite:
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
     ) -> None:
         names = list(columns)[1:]
-        changes = ", ".join(f"{column} = change.column{place}" for place, column in enumerate(names, 2))
+        changes = ", ".join(f"{column} = change.column{index}" for index, column in enumerate(names, 2))
         update = f"UPDATE {table} SET {changes} FROM (VALUES "  # noqa: S608
         of = f") AS change WHERE {table}.id = change.column1"
-        statements = ((update + values + of, given) for values, given in bound(rows, len(columns)))
+        statements = ((update + values + of, parameters) for values, parameters in bound(rows, len(columns)))
         with _rows_refused():
             await (await _driver(connection)).execute_in_turn(statements)
 
@@ -282,6 +286,7 @@ class SQLite:
 
 _quote = make_dialect().identifier_preparer.quote
 _EVENTS_AT_ONCE = 250
+"""Bounds the events read as one row, and so the size of its payloads value."""
 _HEADS = msgspec.json.Decoder(list[tuple[int, str, int, int, int, int]])
 
 
@@ -292,12 +297,12 @@ def _parts_of(span: Span, events_max: int) -> Iterator[Span]:
 
 def _events(number: int, heads: str, payloads: bytes | None) -> Iterator[StoredEvent]:
     try:
-        found = _HEADS.decode(heads)
+        rows = _HEADS.decode(heads)
     except msgspec.DecodeError as error:
         raise DamageError(f"events of episode {number} are damaged: {error}") from None
     start = 0
-    payloads = payloads or b""  # None of no events, and of nothing but empty ones
-    for sequence, type_name, version, wall_ns, monotonic_ns, length in found:
+    payloads = payloads or b""  # NULL for no events, and for empty payloads only
+    for sequence, type_name, version, wall_ns, monotonic_ns, length in rows:
         end = start + length
         values = (number, sequence, type_name, version, wall_ns, monotonic_ns, payloads[start:end])
         yield make(StoredEvent, values)
@@ -305,7 +310,7 @@ def _events(number: int, heads: str, payloads: bytes | None) -> Iterator[StoredE
 
 
 async def _driver(connection: AsyncConnection) -> Connection:
-    """What is under it, for many statements in one visit to its thread; in a transaction that it is in or begins."""
+    """Return the driver's connection, to run many statements in one visit to its thread; begin a transaction."""
     if not connection.in_transaction():
         await connection.begin()
     driver = (await connection.get_raw_connection()).driver_connection

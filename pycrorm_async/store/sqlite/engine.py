@@ -1,7 +1,8 @@
-"""An engine for a SQLite file: durable at COMMIT, one writer at a time, readers that cannot write.
+"""Create an engine for a SQLite file: durable at COMMIT, one writer at a time, read-only readers.
 
-The driver's own BEGIN is switched off (it begins too late, and never for a SELECT or a CREATE) and ours is sent: a
-writing transaction takes the write lock at once, so it waits at the start or not at all; a reading one is a snapshot.
+The driver's own BEGIN is disabled, because it begins too late, and never for a SELECT or a CREATE. The engine sends its
+own: a writing transaction takes the write lock at its beginning, so it waits there or not at all; a reading one is a
+snapshot.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any, Self, TypeVar
 
 import aiosqlite
 from sqlalchemy import URL, event
-from sqlalchemy import Connection as Begun
+from sqlalchemy import Connection as SyncConnection
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 
 __all__ = ["make_engine", "BEGIN", "USE_WAL", "Connection"]
@@ -23,17 +24,17 @@ __all__ = ["make_engine", "BEGIN", "USE_WAL", "Connection"]
 _T = TypeVar("_T")
 
 BEGIN = "sqlite_begin"
-"""Execution option: the statement that begins a transaction, None for none at all."""
+"""Execution option: the statement that begins a transaction; None sends no statement."""
 
 _WRITE = "BEGIN IMMEDIATE"
 USE_WAL = "PRAGMA journal_mode = WAL"
-"""Kept in the file, so it is set once; outside a transaction, and never on a database that is not ours."""
+"""The file keeps the mode, so it is set once, outside a transaction, and never on a foreign database."""
 _IN_TURN = (_WRITE, USE_WAL)
-_LOOK_S = 0.001
-"""So often who waits for its turn to write looks whether it has come."""
+_POLL_S = 0.001
+"""Interval at which a connection tries again to get the write lock."""
 _ROWS_AT_ONCE = 64
-_STATEMENTS = 512
-"""Kept compiled: some ten for each table that is written."""
+_CACHED_STATEMENTS = 512
+"""Size of the cache of compiled statements: about ten per table that is written."""
 _WRITE_PRAGMAS = (
     "PRAGMA synchronous = FULL",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
     "PRAGMA wal_autocheckpoint = 4000",  # 16 MB: about every fourth full batch instead of every one
@@ -41,7 +42,7 @@ _WRITE_PRAGMAS = (
 
 
 def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncEngine:
-    """An engine for the file at this absolute path, which must exist: connecting never makes one."""
+    """Create an engine for the file at this absolute path; connecting never creates a missing file."""
     uri = f"{path.as_uri()}?mode={'ro' if read_only else 'rw'}"
     engine = create_async_engine(
         URL.create("sqlite+aiosqlite", database=str(path)),
@@ -57,14 +58,14 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
 
 
 class Connection(aiosqlite.Connection):
-    """Its thread is asked to end once, and whoever asks again waits for the same end.
+    """An aiosqlite connection whose `stop` may be called twice.
 
-    When a closing is cancelled SQLAlchemy asks the thread to end while the closing goes on to ask for itself: the
-    thread had ended by then, and the closing waited for ever, and `asyncio.run` for it.
+    When a close is cancelled, SQLAlchemy stops the thread while the close still runs and stops it again. The second
+    request would wait for ever for a thread that has ended, and `asyncio.run` with it; so it gets the first result.
     """
 
     patience_s = 0.0
-    """How long a transaction that writes waits for its turn."""
+    """Bounds the wait of a writing transaction for the write lock."""
     _end: tuple[asyncio.Future[Any] | None] | None = None
 
     def stop(self) -> asyncio.Future[Any] | None:
@@ -76,12 +77,12 @@ class Connection(aiosqlite.Connection):
         return Cursor(self)
 
     async def visit(self, work: Callable[[sqlite3.Connection], _T]) -> _T:
-        """Does this in the connection's thread."""
-        done: _T = await self._execute(work, self._conn)  # type: ignore[no-untyped-call]
-        return done
+        """Run a function in the connection's thread."""
+        result: _T = await self._execute(work, self._conn)  # type: ignore[no-untyped-call]
+        return result
 
     async def execute_in_turn(self, statements: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
-        """These statements, each made when its turn comes, in one visit to the thread. Raises as `sqlite3` does."""
+        """Execute statements, generated lazily, in one visit to the thread. Raises as `sqlite3` does."""
 
         def execute(connection: sqlite3.Connection) -> None:
             for statement, parameters in statements:
@@ -89,15 +90,20 @@ class Connection(aiosqlite.Connection):
 
         await self.visit(execute)
 
-    async def rows_in_turn(self, statement: str, asked: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-        """The one row that this statement gives for each of these parameters, in one visit to the thread. Raises so."""
+    async def rows_in_turn(self, statement: str, parameter_sets: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+        """Fetch one row of this statement per parameter set, in one visit to the thread. Raises as `sqlite3` does."""
 
-        return await self.visit(lambda connection: [connection.execute(statement, each).fetchone() for each in asked])
+        return await self.visit(
+            lambda connection: [connection.execute(statement, each).fetchone() for each in parameter_sets]
+        )
 
 
 class Cursor:
-    """What SQLAlchemy uses of a cursor. A statement and its first rows take one visit to the thread, which takes longer
-    than most statements do; with the driver's own they take four."""
+    """The part of a cursor that SQLAlchemy uses.
+
+    A statement and its first rows take one visit to the thread instead of the driver's four, because a visit takes
+    longer than most statements.
+    """
 
     arraysize = 1
 
@@ -106,7 +112,7 @@ class Cursor:
         self.rowcount = -1
         self.lastrowid: int | None = None
         self._connection = connection
-        self._cursor: sqlite3.Cursor | None = None  # while it has more rows than those here
+        self._cursor: sqlite3.Cursor | None = None  # set while it has more rows than `_rows`
         self._rows: list[Any] = []
 
     async def __aenter__(self) -> Self:
@@ -115,15 +121,17 @@ class Cursor:
     async def execute(self, statement: str, parameters: Any = ()) -> Self:
         def execute(connection: sqlite3.Connection) -> None:
             if statement in _IN_TURN:
-                self._keep(_wait_for_turn(connection, statement, self._connection.patience_s))
+                self._take_first_rows(_wait_for_turn(connection, statement, self._connection.patience_s))
             else:
-                self._keep(connection.execute(statement, parameters))
+                self._take_first_rows(connection.execute(statement, parameters))
 
         await self._connection.visit(execute)
         return self
 
     async def executemany(self, statement: str, parameters: Any) -> Self:
-        await self._connection.visit(lambda connection: self._keep(connection.executemany(statement, parameters)))
+        await self._connection.visit(
+            lambda connection: self._take_first_rows(connection.executemany(statement, parameters))
+        )
         return self
 
     async def fetchall(self) -> list[Any]:
@@ -148,7 +156,7 @@ class Cursor:
             self._cursor = None
             await self._connection.visit(lambda _: cursor.close())
 
-    def _keep(self, cursor: sqlite3.Cursor) -> None:
+    def _take_first_rows(self, cursor: sqlite3.Cursor) -> None:
         self._rows = cursor.fetchmany(_ROWS_AT_ONCE)
         self.description, self.rowcount, self.lastrowid = cursor.description, cursor.rowcount, cursor.lastrowid
         if len(self._rows) == _ROWS_AT_ONCE:
@@ -160,26 +168,28 @@ class Cursor:
 async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
     def connector() -> sqlite3.Connection:
         return sqlite3.connect(
-            uri, uri=True, isolation_level=None, timeout=busy_timeout_s, cached_statements=_STATEMENTS
+            uri, uri=True, isolation_level=None, timeout=busy_timeout_s, cached_statements=_CACHED_STATEMENTS
         )
 
     connection = Connection(connector, _ROWS_AT_ONCE)
     connection.patience_s = busy_timeout_s
-    thread = connection._thread  # noqa: SLF001 - as SQLAlchemy's own connecting does: there is no public way to it
+    thread = connection._thread  # noqa: SLF001 - as SQLAlchemy does; aiosqlite has no public attribute
     thread.daemon = True
     try:
         return await connection
     except BaseException:
-        # The thread reports its end to this loop; if the loop were gone by then, a traceback of it would be printed.
-        while thread.is_alive():  # noqa: ASYNC110 - a thread sets no event of ours
+        # The thread reports its end to this loop; if the loop were closed by then, it would print a traceback.
+        while thread.is_alive():  # noqa: ASYNC110 - the thread sets no event
             await asyncio.sleep(0.001)
         raise
 
 
 def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: float) -> sqlite3.Cursor:
-    """Does what others must not be at work for. To begin a transaction that writes SQLite itself would wait too, but
-    sleep longer with every time it looks: beside a process that folds all the time appending took 10.5 µs an event that
-    way, and 8.6 this way. To change the journal mode it does not wait for others who open the new file."""
+    """Execute a statement that needs the write lock, and poll until it is free.
+
+    SQLite's own wait sleeps longer after each attempt: beside a process that folds all the time, appending took 10.5 µs
+    an event that way and 8.6 this way. For a change of the journal mode SQLite does not wait at all.
+    """
     connection.execute("PRAGMA busy_timeout = 0")
     until_s = time.monotonic() + patience_s
     try:
@@ -187,15 +197,15 @@ def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: f
             try:
                 return connection.execute(statement)
             except sqlite3.OperationalError as error:
-                busy = error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY  # whatever keeps it busy
+                busy = error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY  # the primary code, without the detail
                 if not busy or time.monotonic() >= until_s:
                     raise
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_S)
     finally:
         connection.execute(f"PRAGMA busy_timeout = {int(patience_s * 1000)}")
 
 
-def _begin(connection: Begun) -> None:
+def _begin(connection: SyncConnection) -> None:
     statement = connection.get_execution_options()[BEGIN]
     if statement is not None:
         connection.exec_driver_sql(statement)
@@ -209,7 +219,7 @@ def _set_write_pragmas(connection: Any, _record: Any) -> None:
 
 
 def _roll_back(connection: Any, _record: Any, _fault: BaseException | None) -> None:
-    # When a task is cancelled in the middle of a statement its connection is thrown away. SQLite keeps a connection
-    # that is closed with a statement open until that is gone, together with its transaction and the write lock:
-    # nobody could write until the garbage collector came by.
+    # A task cancelled during a statement discards its connection. SQLite keeps a connection closed with an open
+    # statement alive until the statement is collected, with its transaction and the write lock: without this rollback
+    # no process could write until then.
     connection.rollback()

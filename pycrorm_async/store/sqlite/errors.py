@@ -1,4 +1,4 @@
-"""Which of our errors a fault of SQLite is: the way to the file, the wrong file, a damaged one, or us."""
+"""Translate errors of SQLite: an unreachable file, the wrong file, a damaged file, or our own defect."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pycrorm_async.errors import (
 
 __all__ = ["translate_error", "refusal"]
 
-_AWAY = {
+_UNAVAILABLE = {
     sqlite3.SQLITE_PERM,
     sqlite3.SQLITE_BUSY,
     sqlite3.SQLITE_LOCKED,
@@ -30,11 +30,11 @@ _AWAY = {
 
 
 def translate_error(fault: BaseException | None, database: str) -> PycrormError:
-    """The error to raise in place of the driver's."""
+    """Return the error of this package to raise instead of the driver's."""
     code = getattr(fault, "sqlite_errorcode", None)
     if isinstance(fault, UnicodeDecodeError) or (code is None and str(fault).startswith("Could not decode to UTF-8")):
         return DamageError(f"{database} is damaged: {fault}")
-    if code is None:  # raised by the driver between us and SQLite: a connection that is gone
+    if code is None:  # raised by the driver itself: the connection is closed
         return DatabaseUnavailable(f"{database}: {fault}")
     primary = code & 0xFF
     if primary == sqlite3.SQLITE_NOTADB:
@@ -44,17 +44,17 @@ def translate_error(fault: BaseException | None, database: str) -> PycrormError:
     if primary == sqlite3.SQLITE_CANTOPEN:
         return DatabaseUnavailable(
             f"{database} cannot be opened: the file must be readable and its folder writable,"
-            " for SQLite makes files beside it, also to read it"
+            " because SQLite creates files beside it, also for reading"
         )
-    if primary in _AWAY:
+    if primary in _UNAVAILABLE:
         return DatabaseUnavailable(f"{database}: {fault}")
     return InternalError(f"{database}: {fault}")
 
 
 def refusal(fault: BaseException | None) -> str | None:
-    """Why SQLite never makes a table or view of such a definition; None for a fault of another kind."""
+    """Return why SQLite can never create a table or view of this definition; None for any other error."""
     code = getattr(fault, "sqlite_errorcode", None)
     if code is None or code & 0xFF not in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_TOOBIG):
         return None
-    # A full disk ends the transaction, and the savepoint that was made for the attempt is gone with it.
+    # A full disk rolls back the transaction, and with it the savepoint of the attempt: a temporary error.
     return None if "savepoint" in str(fault) or "transaction" in str(fault) else str(fault)

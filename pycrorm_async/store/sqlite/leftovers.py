@@ -1,9 +1,9 @@
-"""Move away what SQLite left beside a database that was removed, before a new one is made under its name.
+"""Move away the files that SQLite left beside a removed database, before a new one of the same name is created.
 
-A write-ahead log and its index belong to one file, and their names to whatever file is there. A process that still has
-the removed file open shares the index with every process that opens the new one: both would take the pages of one for
-those of the other. And SQLite deletes a write-ahead log that it finds beside an empty database, with all transactions
-in it that only a crash kept out of the old file; here it is kept.
+A write-ahead log and its index belong to one file, but SQLite finds them by name. A process that still has the removed
+file open would share the index with every process that opens the new one, and both would read each other's pages.
+SQLite also deletes a write-ahead log beside an empty database, with transactions that a crash kept out of the old file;
+here it is kept.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ __all__ = ["move_leftovers"]
 _INDEX: Final = "-shm"
 _WITH_CONTENT: Final = ("-wal", "-journal")
 _ORPHANED: Final = ".orphaned"
-"""Added to the name of what is kept; the next one takes its place, so that there is one at most."""
-_TURN_S: Final = 10.0
-"""How long another process may take to do the same. It does so in a moment; another user may hold the lock for ever."""
-_TRY_AGAIN_S: Final = 0.001
+"""Suffix of a kept file; the next one replaces it, so that at most one is kept."""
+_LOCK_WAIT_S: Final = 10.0
+"""Bounds the wait for another process that does the same, which takes a moment; another user could hold the lock."""
+_RETRY_S: Final = 0.001
 
 _log = logging.getLogger("pycrorm_async")
 
 
 def move_leftovers(database: Path) -> None:
-    """Leave nothing beside a database that does not exist. Raises `OSError`.
+    """Move or delete the leftovers of a database that does not exist. Raises `OSError`.
 
-    Processes that make the same database at the same time take turns: a leftover is moved only while there is no
-    database, so it never belongs to one that another process has made and opened meanwhile.
+    Processes that create the same database take turns. A leftover is moved only while the database does not exist, so
+    it never belongs to one that another process has created and opened meanwhile.
     """
     leftovers = [database.with_name(database.name + suffix) for suffix in (*_WITH_CONTENT, _INDEX)]
     if not any(each.exists() for each in leftovers):
         return
     folder = os.open(database.parent, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        _await_turn(folder)
+        _lock_folder(folder)
         if database.exists():
             return
         for each in leftovers:
@@ -54,12 +54,12 @@ def move_leftovers(database: Path) -> None:
         os.close(folder)
 
 
-def _await_turn(folder: int) -> None:
-    until_s = time.monotonic() + _TURN_S
+def _lock_folder(folder: int) -> None:
+    until_s = time.monotonic() + _LOCK_WAIT_S
     while time.monotonic() < until_s:
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            time.sleep(_TRY_AGAIN_S)
+            time.sleep(_RETRY_S)
         else:
             return

@@ -1,4 +1,4 @@
-"""Many rows in few statements: their VALUES, and the parameters that are bound to them."""
+"""Insert or update many rows in few statements: generate VALUES lists and their parameters."""
 
 from __future__ import annotations
 
@@ -10,28 +10,31 @@ from typing import Any, Final
 __all__ = ["bound", "inserts"]
 
 _PARAMETERS_MAX: Final = 8_000
-"""In one statement. SQLite takes 32,766, but is a third slower with so many; with fewer, a busy plan is waited for more
-often."""
+"""Bounds the parameters of a statement. SQLite allows 32,766 but is a third slower with that many; with fewer, the
+writer waits for a busy plan more often."""
 _SHAPED_ROWS: Final = 64
-"""So many are worth a statement of their own."""
+"""Rows from which a statement with its own VALUES shape pays off."""
 _NOTHING: Final = bytearray()
+"""Stands for None, which NULLIF restores."""
 
 
 def inserts(table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, Any]]:
-    """The statements that insert these rows, with their parameters."""
+    """Generate the statements that insert these rows, with their parameters."""
     into = f"INSERT INTO {table} ({', '.join(columns)}) VALUES "  # noqa: S608
-    return ((into + values, given) for values, given in bound(rows, len(columns)))
+    return ((into + values, parameters) for values, parameters in bound(rows, len(columns)))
 
 
 def bound(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    """What follows VALUES, with its parameters, a few rows at a time. No value may be a blob."""
+    """Generate VALUES lists and their parameters, some rows at a time. No value may be a blob."""
     for part in _parts(rows, columns):
-        marks, some = _shaped(part) if len(part) >= _SHAPED_ROWS and _slow(part[0]) else (["?"] * columns, part)
-        yield ", ".join([f"({', '.join(marks)})"] * len(part)), tuple(chain.from_iterable(some))
+        marks, values_rows = (
+            _shaped(part) if len(part) >= _SHAPED_ROWS and _is_worth_shaping(part[0]) else (["?"] * columns, part)
+        )
+        yield ", ".join([f"({', '.join(marks)})"] * len(part)), tuple(chain.from_iterable(values_rows))
 
 
 def _parts(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[Sequence[tuple[Any, ...]]]:
-    """Powers of two, so that few different statements are ever made: to compile one takes longer than to run it."""
+    """Split rows into powers of two, so that few statements differ: compiling one takes longer than running it."""
     size, start = 1 << (_PARAMETERS_MAX // columns).bit_length() - 1, 0
     while start < len(rows):
         while size > len(rows) - start:
@@ -40,16 +43,16 @@ def _parts(rows: Sequence[tuple[Any, ...]], columns: int) -> Iterator[Sequence[t
         start += size
 
 
-def _slow(row: Sequence[Any]) -> bool:
-    """Whether rows like this one are worth their shape."""
+def _is_worth_shaping(row: Sequence[Any]) -> bool:
+    """Return whether rows like this one, with many None or booleans, gain from a shape of their own."""
     return sum(each is None or each is True or each is False for each in row) > 2
 
 
 def _shaped(rows: Sequence[tuple[Any, ...]]) -> tuple[list[str], Iterable[tuple[Any, ...]]]:
-    """What stands for each column in VALUES, and the rows of what is bound.
+    """Return the expression for each column in VALUES, and the rows of the values to bind.
 
-    To bind None or a boolean the driver looks whether anybody adapts it, which takes 0.28 µs: a number takes 0.04, and
-    NULLIF of an empty blob 0.12. Half of a node's row is None.
+    Binding None or a boolean takes 0.28 µs, because the driver looks for an adapter; a number takes 0.04 µs, and NULLIF
+    of an empty blob 0.12 µs. Half of a node's row is None.
     """
     marks: list[str] = []
     columns: list[Sequence[Any]] = []

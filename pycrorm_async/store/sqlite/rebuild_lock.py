@@ -1,4 +1,4 @@
-"""Who makes tables anew says so with a lock on a file beside the database, which is gone when it is done."""
+"""Lock out a second rebuild with a lock on a file beside the database, which is deleted at the end."""
 
 from __future__ import annotations
 
@@ -15,19 +15,18 @@ __all__ = ["claim"]
 
 @contextmanager
 def claim(database: Path) -> Iterator[bool]:
-    """Whether the file beside this database could be locked; it is until the context is left or the process dies.
+    """Lock the file beside this database until the context ends or the process dies; yields False if it is locked.
 
-    Its mode is the database's, so that a process of the same group can take over what a killed one left.
-
-    Raises `DatabaseUnavailable` where no file can be made.
+    The file gets the database's mode, so that a process of the same group can reuse one that a killed process left.
+    Raises `DatabaseUnavailable` if the file cannot be created.
     """
     path = database.with_name(f"{database.name}-rebuild")
     try:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        with suppress(PermissionError):  # another user made it
+        with suppress(PermissionError):  # another user created it
             os.fchmod(file, database.stat().st_mode & 0o666)
     except OSError as error:
-        raise DatabaseUnavailable(f"{path} cannot be made: {error.strerror}") from error
+        raise DatabaseUnavailable(f"{path} cannot be created: {error.strerror}") from error
     try:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -35,7 +34,7 @@ def claim(database: Path) -> Iterator[bool]:
             yield False
             return
         if not (path.exists() and path.stat().st_ino == os.fstat(file).st_ino):
-            yield False  # who had it took it away between our two steps
+            yield False  # its last holder deleted it after we had opened it
             return
         try:
             yield True

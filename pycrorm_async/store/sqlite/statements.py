@@ -1,12 +1,12 @@
-"""What the log says to SQLite. A batch is one statement a table.
+"""Define the log's SQL for SQLite. A batch is one statement per table.
 
-A statement that takes a batch gets it as one JSON array or as many rows of values, not row by row: `executemany` gives
-up the interpreter's lock at every row and waits up to 5 ms to get it back beside a busy plan. So does who fetches many
-rows: events are read as one row a few hundred, their payloads as one blob, so that no escaping comes between the bytes
-of the log and those of the queue.
+A statement takes a batch as one JSON array or as many rows of VALUES, not row by row: `executemany` releases the
+interpreter lock at every row and waits up to 5 ms to get it back beside a busy plan. Fetching many rows costs the same,
+so events are read as one row per few hundred, with their payloads as one blob. A blob needs no escaping, so the
+payloads keep the bytes of the queue.
 """
 
-# ruff: noqa: S608 - what is put together here are lists of columns; every value is a parameter
+# ruff: noqa: S608 - the SQL is composed of column lists only; every value is a parameter
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ SELECT_LONG = f"SELECT {_EPISODE} FROM episode WHERE head >= ? AND ended_wall_ns
 
 SELECT_EVENTS = f"SELECT {_EVENT} FROM event WHERE episode = ? AND sequence > ? ORDER BY sequence LIMIT ?"
 
-# In the order of the only index that leads there. The columns sequence to monotonic_ns, the length of the payload.
+# Ordered by the primary key, the only usable index. Selects sequence to monotonic_ns and the payload's length.
 SELECT_SPAN = """
 SELECT json_group_array(json_array(sequence, type, version, wall_ns, monotonic_ns, length(CAST(payload AS BLOB)))),
        CAST(group_concat(payload, '') AS BLOB)

@@ -1,4 +1,4 @@
-"""The log's tables on SQLite, as numbered migrations: format N is what the first N of them make."""
+"""Define the log's tables on SQLite as numbered migrations; the first N of them create format N."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ CREATE TABLE episode (
     parked TEXT
 ) STRICT"""
 
-# What is asked at every poll: a few rows, however many episodes there are.
+# Read at every poll: contains few rows, whatever the number of episodes.
 _BEHIND = "CREATE INDEX episode_behind ON episode (number) WHERE folded < head AND parked IS NULL"
 _STOPPED = "CREATE INDEX episode_stopped ON episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
 
-# With a rowid: these rows are longer than what a WITHOUT ROWID table is good at; it appended a third slower.
+# With a rowid, because the rows are too long for WITHOUT ROWID, which appended a third slower.
 _EVENT = """
 CREATE TABLE event (
     episode INTEGER NOT NULL,
@@ -84,7 +84,7 @@ CREATE TABLE IF NOT EXISTS pycrorm_incarnation (
     noticed_by TEXT NOT NULL,
     reason TEXT NOT NULL
 ) STRICT"""
-"""Made when a log is first found to have gone back, and no part of its format: older programs read and write it."""
+"""Created when a log is first found to have gone back. Not part of the format: older programs still use the log."""
 
 TABLE_NAMES = (
     "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
