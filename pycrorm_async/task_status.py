@@ -18,6 +18,6 @@ class TaskStatus(Enum):
     """Any other exception was raised."""
     CANCELLED = "CANCELLED"
     INTERRUPTED = "INTERRUPTED"
-    """By a monitor."""
+    """Interrupted by a monitor."""
     LOST = "LOST"
-    """Nobody saw it end: its process died, or its episode ended while it was running. Never seen by a plan."""
+    """No end was recorded: the process died, or the episode ended while the node was running. A plan never sees it."""

@@ -15,15 +15,17 @@ from __future__ import annotations
 import functools
 import io
 import logging
+import os
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from rich.logging import RichHandler
 
-from pycrorm_async.cli.output import problem, stderr
+from pycrorm_async import __version__
+from pycrorm_async.cli.output import problem, stderr, stdout
 from pycrorm_async.errors import (
     CallerError,
     DamageError,
@@ -72,6 +74,12 @@ def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
     return run
 
 
+def _print_version(requested: bool) -> None:  # noqa: FBT001  typer passes it by position
+    if requested:
+        stdout.print(f"pycrorm {__version__}", markup=False, highlight=False)
+        raise typer.Exit
+
+
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
 _VERBS = ("demo", "run", "episodes", "show", "events", "copy", "writer", "status", "rebuild", "verify", "learn")
 _GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
@@ -94,11 +102,10 @@ def app(requested: str | None = None) -> typer.Typer:
         name="pycrorm",
         help=_HELP,
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
-    command.callback()(lambda: None)  # without a callback, typer would make a single verb the command itself
+    command.callback()(_options)  # without a callback, typer would make a single verb the command itself
     for verb in (each for each in _VERBS if each in chosen):
         command.command(verb)(_load_verb(verb, verb))
     for group, (text, verbs) in _GROUPS.items():
@@ -110,8 +117,21 @@ def app(requested: str | None = None) -> typer.Typer:
     return command
 
 
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Parse the options of the command itself."""
+
+
 def _load_verb(module: str, name: str) -> Callable[..., None]:
     return _with_exit_code(getattr(import_module(f"pycrorm_async.cli.{module}"), name))
+
+
+def _words() -> list[str]:
+    """Return the words of the command line; for a shell's completion, those typed so far."""
+    return os.environ["COMP_WORDS"].split() if "_PYCRORM_COMPLETE" in os.environ else sys.argv
 
 
 def main() -> None:
@@ -124,7 +144,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        command = app(next(iter(sys.argv[1:]), None))
+        command = app(next(iter(_words()[1:]), None))
     except KeyboardInterrupt:  # while the verb's module was being loaded
         problem("interrupted before the command started")
         sys.exit(130)

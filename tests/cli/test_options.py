@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import typer
 from typer.core import TyperGroup
 
+import pycrorm_async
 from pycrorm_async.cli.main import app
 from tests.cli.note_plan import NOTES_PLAN
-from tests.commands import answer, pycrorm
+from tests.commands import answer, environment, pycrorm
 
 
 def test_every_verb_that_opens_a_database_takes_its_spool_too() -> None:
@@ -19,6 +22,25 @@ def test_every_verb_that_opens_a_database_takes_its_spool_too() -> None:
     options = {name: {option for each in verb.params for option in each.opts} for name, verb in group.commands.items()}
     assert {name for name, known in options.items() if "--url" in known and "--spool" not in known} == set()
     assert {"verify", "rebuild", "episodes"} <= {name for name, known in options.items() if "--url" in known}
+
+
+def test_the_command_prints_its_version(tmp_path: Path) -> None:
+    done = pycrorm("--version", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, f"pycrorm {pycrorm_async.__version__}\n")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [("pycrorm reb", "rebuild"), ("pycrorm run --wr", "--writer"), ("pycrorm spool rep", "repair")],
+)
+def test_a_shell_completes_verbs_and_their_options(tmp_path: Path, words: str, completed: str) -> None:
+    typed = {"_PYCRORM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}
+    script = Path(sys.executable).with_name("pycrorm")
+    done = subprocess.run(
+        [script], cwd=tmp_path, env=environment() | typed, capture_output=True, text=True, check=False
+    )
+    assert (done.stdout.strip(), done.stderr) == (completed, "")
 
 
 @pytest.mark.slow
