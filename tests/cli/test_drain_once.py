@@ -14,7 +14,8 @@ from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 RECORDER, EPISODE = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
 FULL = (

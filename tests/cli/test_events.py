@@ -16,7 +16,8 @@ from tests.projections.event_script import Script
 from tests.store.factories import episode, run_of
 from tests.test_table_comparison import episode as hand_written
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 URL = "sqlite:///pycrorm.db"
 IDENTITY = "00000000-0000-7000-8000-000000000001"

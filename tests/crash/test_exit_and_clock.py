@@ -18,7 +18,8 @@ from tests.crash.forked_processes import Forked
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 SMALL = Settings(
     sync_interval_ms=5,

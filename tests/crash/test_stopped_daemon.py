@@ -20,7 +20,8 @@ from tests.commands import one_line_of, pycrorm
 from tests.crash.robot_processes import Lab
 from tests.databases import Server, ask
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 
 def stop_in_its_tracks(lab: Lab) -> None:

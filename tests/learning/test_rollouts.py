@@ -231,6 +231,7 @@ async def test_rollouts_that_were_done_twice_count_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.soak  # test_experiment learns from a memory too
 async def test_a_policy_is_learned_from_the_memory_and_does_better(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         default = await rolled_out(1_500)

@@ -21,6 +21,9 @@ from tests.queue.factories import Author, ended, episode, node, started
 from tests.queue.forged_segments import change_a_frame
 from tests.writer.writer_threads import until
 
+pytestmark = pytest.mark.soak_on("postgresql")
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+
 STORED = "SELECT count(*) FROM event"
 
 

@@ -21,7 +21,8 @@ from tests.memory.note_actions import NoteActionPerformable
 from tests.queue.factories import WALL_NS, Author, episode, overwrite, started
 from tests.writer.writer_threads import until
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 STORED = "SELECT max(sequence), count(*) FROM event"
 MISSING = "position 13 is missing"

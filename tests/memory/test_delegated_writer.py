@@ -34,7 +34,8 @@ from tests.databases import ask, ask_to_change
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 
 @pytest.fixture

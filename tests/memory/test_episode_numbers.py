@@ -20,7 +20,8 @@ from tests.databases import ask, ask_to_change
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.store.factories import episode, run_of
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 
 def take_numbers_up_to(url: str, last: int) -> None:

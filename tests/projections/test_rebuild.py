@@ -113,7 +113,7 @@ FAILED = 'SELECT * FROM "Failed" ORDER BY id'
         (100, {0, 1}, 0.4, [2]),
         (100, {0, 1}, 1.0, []),
         (100, {0}, 0.0, []),
-        (100, {0, 1, 2, 3}, 2.4, [2]),
+        pytest.param(100, {0, 1, 2, 3}, 2.4, [2], marks=pytest.mark.soak),
     ],
 )
 async def test_large_logs_are_remade_by_two_processes_where_two_cores_are_idle(

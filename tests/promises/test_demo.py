@@ -35,7 +35,8 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from tests.commands import answer
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 THESIS_TREE = """
 root

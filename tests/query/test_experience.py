@@ -31,7 +31,8 @@ from tests.databases import Server
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, name_of
 from tests.projections.sql_queries import stored_and_folded
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
+"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 
 def tried(
