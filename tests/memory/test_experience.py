@@ -83,7 +83,7 @@ async def test_a_memory_that_is_closed_is_no_longer_asked(tmp_path: Path) -> Non
         task = asyncio.create_task(later())
         await asyncio.sleep(0)
     closed.set()
-    with pytest.raises(CallerError, match="is closed: ask while it is open"):
+    with pytest.raises(CallerError, match="the memory is closed, so its experience cannot be read"):
         await task
     with pytest.raises(CallerError, match="queried from a memory"):
         await asked()

@@ -112,7 +112,7 @@ def test_code_construction() -> None:
     assert isinstance(code, Designator)
     assert plan.operands[1] is code
     assert (code.function, code.arguments) == ("math.hypot", {})
-    with pytest.raises(NotALanguageExpression, match="Code calls a function, not 3"):
+    with pytest.raises(NotALanguageExpression, match="Code needs a function, got 3"):
         Code(3)  # type: ignore[arg-type]  # what is refused
 
 
@@ -140,13 +140,13 @@ def test_monitor_construction() -> None:
 
 
 def test_monitor_construction_error() -> None:
-    with pytest.raises(NotALanguageExpression, match="this Monitor watches nothing"):
+    with pytest.raises(NotALanguageExpression, match="this Monitor has no operand"):
         Monitor(lambda: True) >> Monitor(lambda: False)
-    with pytest.raises(NotALanguageExpression, match=r"Monitor asks a callable or an asyncio\.Event, not bool"):
+    with pytest.raises(NotALanguageExpression, match=r"Monitor needs a callable or an asyncio\.Event, got bool"):
         Monitor(True)  # type: ignore[arg-type]  # what is refused
-    with pytest.raises(NotALanguageExpression, match="only a Monitor can stand on the right of >>"):
+    with pytest.raises(NotALanguageExpression, match="the right operand of >> must be a Monitor"):
         navigate() >> park()
-    with pytest.raises(NotALanguageExpression, match="this Monitor watches something already"):
+    with pytest.raises(NotALanguageExpression, match="this Monitor has an operand already"):
         navigate() >> (park() >> Monitor(lambda: True))
 
 
@@ -166,9 +166,9 @@ def test_repeat_construction_reverse() -> None:
 
 @pytest.mark.parametrize("times", [1.5, "2", -1, True, None])
 def test_repeat_construction_error(times: int) -> None:
-    with pytest.raises(NotALanguageExpression, match="a plan is repeated a whole number of times, not"):
+    with pytest.raises(NotALanguageExpression, match="Repeat needs an integer times >= 0, got"):
         navigate() * times
-    with pytest.raises(NotALanguageExpression, match="a plan is repeated a whole number of times, not"):
+    with pytest.raises(NotALanguageExpression, match="Repeat needs an integer times >= 0, got"):
         times * navigate()
 
 

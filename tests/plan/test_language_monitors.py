@@ -327,7 +327,7 @@ async def test_a_node_in_a_task_of_the_plan_interrupts_the_plan() -> None:
 
 
 async def test_a_monitor_of_nothing_cannot_be_performed() -> None:
-    with pytest.raises(NotALanguageExpression, match="this Monitor watches nothing: write plan >> Monitor"):
+    with pytest.raises(NotALanguageExpression, match="this Monitor has no operand: write plan >> Monitor"):
         await Monitor(lambda: True).perform()
     with pytest.raises(NotALanguageExpression, match="so Parallel cannot perform it"):
         Step("a") | Monitor(lambda: True)
@@ -335,7 +335,7 @@ async def test_a_monitor_of_nothing_cannot_be_performed() -> None:
 
 @pytest.mark.parametrize("interval_s", [0, -1, float("inf"), float("nan"), "1", True, None])
 def test_an_interval_that_is_no_time_is_refused(interval_s: float) -> None:
-    with pytest.raises(NotALanguageExpression, match="Monitor asks every so many seconds, not every"):
+    with pytest.raises(NotALanguageExpression, match="Monitor needs a finite interval_s > 0, got"):
         Monitor(lambda: True, interval_s)
 
 

@@ -212,7 +212,7 @@ def test_what_is_no_operand_is_refused_on_either_side(operand: Any, named: str) 
     ):
         with pytest.raises(NotALanguageExpression) as caught:
             make()
-        assert str(caught.value) == f"{name} performs designators and descriptions of actions, not {named}"
+        assert str(caught.value) == f"{name} needs designators or descriptions of actions, got {named}"
 
 
 @pytest.mark.parametrize("kind", [Sequential, TryInOrder, Parallel, TryAll])
@@ -305,7 +305,7 @@ async def test_no_alternative_at_all_is_a_failure() -> None:
 
 @pytest.mark.parametrize("tries", [0, -1, 1.5, None, True])
 def test_fewer_tries_than_one_are_refused(tries: int) -> None:
-    with pytest.raises(NotALanguageExpression, match="Retry tries a whole number of times from 1, not"):
+    with pytest.raises(NotALanguageExpression, match="Retry needs an integer max_tries >= 1, got"):
         Retry(Step("a"), tries)
 
 

@@ -131,5 +131,5 @@ async def test_a_condition_that_is_cancelled_interrupts_as_whatever_it_raises(as
 
 
 def test_the_wait_of_an_event_is_refused_and_the_event_asked_for() -> None:
-    with pytest.raises(NotALanguageExpression, match="give it the Event itself, not its wait"):
+    with pytest.raises(NotALanguageExpression, match="pass the Event itself, not its wait"):
         Monitor(asyncio.Event().wait)

@@ -45,20 +45,20 @@ class PlanningActionPerformable(ActionAbstract):
 
 
 WRONG: dict[str, tuple[Callable[[], Any], str]] = {
-    "a number on the right": (lambda: well + 7, "Sequential performs designators and descriptions of actions, not 7"),
+    "a number on the right": (lambda: well + 7, "Sequential needs designators or descriptions of actions, got 7"),
     "a text on the left": (
         lambda: "milk" - well,
-        "TryInOrder performs designators and descriptions of actions, not 'milk'",
+        "TryInOrder needs designators or descriptions of actions, got 'milk'",
     ),
     "a class and no instance": (lambda: well | NavigateActionPerformable, "make an instance"),
     "a function": (lambda: well | print, "wrap it in Code"),
-    "half a repetition": (lambda: well * 1.5, "a whole number of times"),
-    "repeated less than never": (lambda: Repeat(well, -1), "a whole number of times"),
+    "half a repetition": (lambda: well * 1.5, "an integer times >= 0"),
+    "repeated less than never": (lambda: Repeat(well, -1), "an integer times >= 0"),
     "a monitor that asks nobody": (lambda: well >> Monitor(nothing), "a callable or an asyncio.Event"),
-    "a monitor of nothing": (lambda: well + Monitor(lambda: True), "watches nothing"),
-    "watched by an action": (lambda: well >> well, "only a Monitor"),
-    "a call of nothing": (lambda: Code(nothing), "calls a function"),
-    "tried less than once": (lambda: Retry(well, max_tries=0), "whole number of times from 1"),
+    "a monitor of nothing": (lambda: well + Monitor(lambda: True), "has no operand"),
+    "watched by an action": (lambda: well >> well, "must be a Monitor"),
+    "a call of nothing": (lambda: Code(nothing), "needs a function"),
+    "tried less than once": (lambda: Retry(well, max_tries=0), "an integer max_tries >= 1"),
 }
 
 

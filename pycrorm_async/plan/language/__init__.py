@@ -1,1 +1,1 @@
-"""The plan language: expressions of actions, their outcomes, monitors and resources."""
+"""Combine designators to plans: expressions, outcomes, monitors, retries and resources."""

@@ -1,13 +1,13 @@
-"""How actions and motions make a plan: one after the other, one instead of the other, at once, again.
+"""Expressions combine actions and motions to plans: in sequence, as alternatives, in parallel, repeatedly.
 
-    plan = NavigateAction([there]) + (PickUpAction(milk, [Arms.LEFT], [Grasp.FRONT]) - tell_somebody)
+    plan = NavigateAction([place]) + (PickUpAction(milk, [Arms.LEFT], [Grasp.FRONT]) - call_operator)
     outcome = await plan.perform()
 
-An expression is performed like an action: it is a node of the task tree, with its operands' nodes below. It
-raises when it fails, so that failures are seen at every level, and returns an `Outcome` otherwise. Only plan
-failures count as outcomes: any other exception ends the whole expression. Descriptions are resolved when it is
-their turn. Branches that run at once take turns where they need the same part of the robot (`Designator.resources`).
-`Monitor` is in `plan.monitoring`, `Retry` in `plan.retrying`.
+An expression is performed like an action: it is a node of the task tree, and its operands' nodes are its children. It
+returns an `Outcome`, or raises when it fails, so that a failure is visible at every level. Only plan failures count as
+outcomes; any other exception ends the whole expression. A description is resolved immediately before it is performed.
+Parallel branches that need the same part of the robot (`Designator.resources`) take turns. `Monitor` is in
+`language.monitor`, `Retry` in `language.retry`.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ Operand: TypeAlias = Designator | ActionDescription[Any]
 
 
 class Expression(Designator):
-    """What expressions have in common. Operands are never changed: the same one may stand in several places.
+    """Base of expressions. Operands are never modified, so one operand may occur in several places.
 
     Attributes:
-        operands: in the order they were written, as they were given: descriptions are resolved when performed.
+        operands: in the order in which they were written; descriptions stay unresolved until they are performed.
 
     Raises:
-        NotALanguageExpression: an operand is none, or there is none.
+        NotALanguageExpression: an operand is not performable, or there is no operand.
     """
 
     kind: ClassVar[NodeKind] = "language"
@@ -52,18 +52,18 @@ class Expression(Designator):
         self.hold(self._flat(operands))
 
     def hold(self, operands: Iterable[Composable]) -> None:
-        """These are its operands, once they are checked."""
+        """Check the operands and store them."""
         self.operands = tuple(_check_operand(each, type(self).__name__) for each in operands)
         if not self.operands:
             raise NotALanguageExpression(f"{type(self).__name__} needs something to perform")
 
     @property
     def is_complete(self) -> bool:
-        """Whether it can be an operand: a `Monitor` that watches nothing is not."""
+        """Whether it can be an operand; False for a `Monitor` without an operand."""
         return True
 
     def simplify(self) -> Self:
-        """The same: `a + (b + c)` is `Sequential(a, b, c)` from the start."""
+        """Return the expression itself: nested expressions such as `a + (b + c)` are flattened when they are built."""
         return self
 
     def __repr__(self) -> str:
@@ -78,7 +78,7 @@ class Expression(Designator):
 
 
 class Sequential(Expression):
-    """`a + b`: one after the other. Raises the first failure; what would come after it is not performed."""
+    """`a + b`: performs the operands in sequence. Raises the first failure and skips the operands after it."""
 
     async def perform(self) -> Outcome:
         results = [await perform_operand(operand) for operand in self.operands]
@@ -86,7 +86,7 @@ class Sequential(Expression):
 
 
 class TryInOrder(Expression):
-    """`a - b`: one after the other, until one succeeds. If none does, raises all failures together."""
+    """`a - b`: performs the operands in sequence until one succeeds. If none does, raises all failures as a group."""
 
     async def perform(self) -> Outcome:
         failures: list[Exception] = []
@@ -101,7 +101,7 @@ class TryInOrder(Expression):
 
 
 class Parallel(Expression):
-    """`a | b`: all at once, each in a task of its own, all to their end. Raises the failures together, if any."""
+    """`a | b`: performs the operands in parallel tasks and waits for all. Raises the failures, if any, as a group."""
 
     async def perform(self) -> Outcome:
         attempts = await _run_branches(self)
@@ -114,7 +114,7 @@ class Parallel(Expression):
 
 
 class TryAll(Expression):
-    """`a ^ b`: all at once, all to their end; one must succeed. If none does, raises all failures together."""
+    """`a ^ b`: performs the operands in parallel, waits for all. If none succeeds, raises all failures as a group."""
 
     async def perform(self) -> Outcome:
         attempts = await _run_branches(self)
@@ -128,13 +128,13 @@ class TryAll(Expression):
 
 @dataclass(init=False, repr=False, eq=False)
 class Repeat(Expression):
-    """`a * 3`: so many times. A round that fails does not keep the others from being tried.
+    """`a * 3`: performs the operand `times` times, also after a round that failed.
 
-    Raises the failures together in the end, if any; which rounds they were is in the message, or if there is one
-    failure alone in its notes.
+    Raises the failures, if any, as a group after the last round. The message names the failed rounds; a single failure
+    is raised itself, with its round as a note.
 
     Raises:
-        NotALanguageExpression: `times` is no whole number from 0.
+        NotALanguageExpression: `times` is not an integer >= 0.
     """
 
     times: int
@@ -145,7 +145,7 @@ class Repeat(Expression):
         except TypeError:
             self.times = -1
         if isinstance(times, bool) or self.times < 0:
-            raise NotALanguageExpression(f"a plan is repeated a whole number of times, not {times!r}", repr(times))
+            raise NotALanguageExpression(f"Repeat needs an integer times >= 0, got {times!r}", repr(times))
         self.hold([operand])
 
     async def perform(self) -> Outcome:
@@ -173,16 +173,16 @@ class Repeat(Expression):
 
 @dataclass(init=False, repr=False, eq=False)
 class Code(Designator):
-    """Calls a function, sync or async, when it is its turn; returns what that returns, and is a node of its own.
+    """Calls a sync or async function as a node of its own and returns its result.
 
-    A sync function runs in the plan's own loop, so it must be quick.
+    A sync function runs in the plan's event loop, so it must be quick.
 
     Attributes:
-        function: its qualified name.
-        arguments: what it is called with, each as a short text of when it was written down.
+        function: the function's qualified name.
+        arguments: its arguments, each as a short repr of the moment when the `Code` was built.
 
     Raises:
-        NotALanguageExpression: it cannot be called.
+        NotALanguageExpression: the function is not callable.
     """
 
     kind: ClassVar[NodeKind] = "language"
@@ -192,7 +192,7 @@ class Code(Designator):
 
     def __init__(self, function: Callable[..., Any], /, **arguments: Any) -> None:
         if not callable(function):
-            raise NotALanguageExpression(f"Code calls a function, not {_short(function)}", _short(function))
+            raise NotALanguageExpression(f"Code needs a function, got {_short(function)}", _short(function))
         self.function = name_of(function)
         self.arguments = {name: _short(value) for name, value in arguments.items()}
         self._call = functools.partial(function, **arguments)
@@ -206,13 +206,13 @@ class Code(Designator):
 
 
 async def perform_operand(operand: Operand) -> Any:
-    """Perform it; a description is resolved now."""
+    """Perform an operand; resolve it first if it is a description."""
     designator = operand if isinstance(operand, Designator) else operand.resolve()
     return await _check_operand(designator, "an expression").perform()
 
 
 def name_of(value: Any) -> str:
-    """What an operand, a function or a condition is called."""
+    """Return the name of an operand, a function or a condition."""
     if isinstance(value, functools.partial):
         return name_of(value.func)
     if isinstance(value, Designator):
@@ -225,13 +225,16 @@ def name_of(value: Any) -> str:
 
 
 async def _run_branches(expression: Expression) -> list[Attempt]:
-    """All operands as tasks, in order of the operands; what needs the same part of the robot takes turns."""
-    around = execution_context.get() or ExecutionContext()
-    if around.arbiter is None or around.arbiter.loop is not asyncio.get_running_loop():
-        around = ExecutionContext(around.watches, Arbiter())
+    """Perform all operands in tasks of their own and return the attempts in the order of the operands.
+
+    Nested parallel expressions share the arbiter of the outermost one, so that all branches take turns with each other.
+    """
+    context = execution_context.get() or ExecutionContext()
+    if context.arbiter is None or context.arbiter.loop is not asyncio.get_running_loop():
+        context = ExecutionContext(context.watches, Arbiter())
 
     async def branch(operand: Operand) -> Attempt:
-        execution_context.set(around)
+        execution_context.set(context)
         return await attempt(functools.partial(perform_operand, operand))
 
     tasks = [
@@ -243,15 +246,15 @@ async def _run_branches(expression: Expression) -> list[Attempt]:
         raise_errors(tasks, outside)
         return [task.result() for task in tasks]
     finally:
-        # The traceback of an exception holds this frame: no cycle for the collector.
+        # The traceback of a raised exception holds this frame: break the reference cycle.
         del tasks, outside
 
 
 def _check_operand(operand: Any, where: str) -> Any:
-    """The operand. Raises `NotALanguageExpression` if it is none."""
+    """Return the operand. Raises `NotALanguageExpression` if it is not performable."""
     if isinstance(operand, Expression) and not operand.is_complete:
         raise NotALanguageExpression(
-            f"this Monitor watches nothing, so {where} cannot perform it: write plan >> Monitor(condition)"
+            f"this Monitor has no operand, so {where} cannot perform it: write plan >> Monitor(condition)"
         )
     if isinstance(operand, Designator | ActionDescription):
         return operand
@@ -259,12 +262,12 @@ def _check_operand(operand: Any, where: str) -> Any:
     if callable(operand):
         advice = ": make an instance" if isinstance(operand, type) else ": wrap it in Code(…)"
     raise NotALanguageExpression(
-        f"{where} performs designators and descriptions of actions, not {_short(operand)}{advice}", _short(operand)
+        f"{where} needs designators or descriptions of actions, got {_short(operand)}{advice}", _short(operand)
     )
 
 
 def _short(value: Any) -> str:
-    """A cut repr. Never raises."""
+    """Return a repr of at most 100 characters. Never raises."""
     try:
         text = repr(value)
     except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything

@@ -1,6 +1,6 @@
-"""A plan that is interrupted when something happens: `plan >> Monitor(condition)`.
+"""Monitors interrupt a plan as soon as a condition holds: `plan >> Monitor(condition)`.
 
->>> outcome = await (NavigateAction([there]) + look >> Monitor(milk_is_seen)).perform()
+>>> outcome = await (NavigateAction([place]) + look >> Monitor(milk_is_visible)).perform()
 >>> outcome.interrupted
 True
 """
@@ -28,42 +28,43 @@ __all__ = ["Monitor", "watch_operand"]
 
 @dataclass(init=False, repr=False, eq=False)
 class Monitor(Expression):
-    """Performs what it watches until that is done, or until its condition holds: then it is interrupted, all of it.
+    """Performs its operand until that ends, or interrupts it as soon as the condition holds.
 
-    Nodes that are interrupted have the status INTERRUPTED, so has the monitor's own. An interruption that was
-    asked for is no failure: what comes after the monitor goes on. What a plan does in `finally` is performed.
+    Interrupted nodes and the monitor's own node end with the status INTERRUPTED. An interruption is not a failure: the
+    plan continues after the monitor. The operand's `finally` blocks run.
 
     Args:
-        condition: asked in the plan's own loop, so it must be quick; an async one is awaited before each node, so it
-            must be quick too. What it raises interrupts, and is raised. An `asyncio.Event` interrupts when it is set.
-        interval_s: how often it is asked; it is asked before each node that starts inside besides.
+        condition: evaluated in the plan's event loop, so it must be quick; an async one is awaited before each node, so
+            it must be quick too. An exception of the condition interrupts the operand, and the monitor raises it. An
+            `asyncio.Event` interrupts when it is set.
+        interval_s: time between evaluations, s; the condition is also evaluated before each node inside starts.
 
     Attributes:
-        condition: its name.
+        condition: the condition's name.
 
     Raises:
-        NotALanguageExpression: the condition cannot be asked, or the interval is no time.
+        NotALanguageExpression: the condition is neither callable nor an Event, or the interval is not finite and > 0.
     """
 
     condition: str
     interval_s: float
 
     def __init__(self, condition: Condition, interval_s: float = 0.1) -> None:
-        given: object = condition
-        if not (callable(given) or isinstance(given, asyncio.Event)):
+        checked: object = condition
+        if not (callable(checked) or isinstance(checked, asyncio.Event)):
             raise NotALanguageExpression(
-                f"Monitor asks a callable or an asyncio.Event, not {type(given).__name__}: write a function that"
-                " tells whether to interrupt",
-                repr(given),
+                f"Monitor needs a callable or an asyncio.Event, got {type(checked).__name__}: write a function that"
+                " returns whether to interrupt",
+                repr(checked),
             )
-        if isinstance(getattr(given, "__self__", None), asyncio.Event) and name_of(given).endswith("Event.wait"):
+        if isinstance(getattr(checked, "__self__", None), asyncio.Event) and name_of(checked).endswith("Event.wait"):
             raise NotALanguageExpression(
-                "Monitor asks its condition before each node, so one that waits keeps the plan from starting: give it"
+                "Monitor evaluates its condition before each node, so one that waits keeps the plan from starting: pass"
                 " the Event itself, not its wait",
-                repr(given),
+                repr(checked),
             )
         if isinstance(interval_s, bool) or not isinstance(interval_s, Real) or not 0 < interval_s < math.inf:
-            raise NotALanguageExpression(f"Monitor asks every so many seconds, not every {interval_s!r}", interval_s)
+            raise NotALanguageExpression(f"Monitor needs a finite interval_s > 0, got {interval_s!r}", interval_s)
         self.condition = name_of(condition)
         self.interval_s = float(interval_s)
         self._condition: Condition = condition
@@ -73,18 +74,18 @@ class Monitor(Expression):
         return bool(self.operands)
 
     async def perform(self) -> Outcome:
-        """Returns an `Outcome` with one result, or one that says `interrupted`. Raises what the operand raises."""
+        """Return an `Outcome` with one result, or one with `interrupted` set. Raises the operand's exceptions."""
         if not self.operands:
-            raise NotALanguageExpression("this Monitor watches nothing: write plan >> Monitor(condition)")
+            raise NotALanguageExpression("this Monitor has no operand: write plan >> Monitor(condition)")
         watch = Watch(self._condition)
         task = asyncio.create_task(self._perform_watched(watch), name=f"watched by {self.condition}")
-        watch.of(task)
-        asking = asyncio.create_task(watch.poll(self.interval_s), name=f"asks {self.condition}")
+        watch.set_task(task)
+        polling = asyncio.create_task(watch.poll(self.interval_s), name=f"asks {self.condition}")
         try:
             outside = await join_tasks([task])
         finally:
-            asking.cancel()
-        outside = await join_tasks([asking]) or outside
+            polling.cancel()
+        outside = await join_tasks([polling]) or outside
         try:
             if outside is None and watch.error is not None:
                 raise watch.error
@@ -97,22 +98,22 @@ class Monitor(Expression):
             node.status = TaskStatus.INTERRUPTED
             return Outcome(results=(None,), interrupted=True)
         finally:
-            # The traceback of an exception holds this frame: no cycle for the collector.
-            del outside, task, watch, asking
+            # The traceback of a raised exception holds this frame: break the reference cycle.
+            del outside, task, watch, polling
 
     async def _perform_watched(self, watch: Watch) -> Any:
-        execution_context.set(watch.inside())
+        execution_context.set(watch.inner_context())
         return await perform_operand(self.operands[0])
 
 
 def watch_operand(operand: Composable, monitor: Composable) -> Monitor:
-    """`operand >> monitor`: a monitor like this one, which watches the operand. Raises `NotALanguageExpression`."""
+    """Implement `operand >> monitor`: copy the monitor and give it this operand. Raises `NotALanguageExpression`."""
     if not isinstance(monitor, Monitor):
         raise NotALanguageExpression(
-            f"only a Monitor can stand on the right of >>, not {name_of(monitor)}", name_of(monitor)
+            f"the right operand of >> must be a Monitor, got {name_of(monitor)}", name_of(monitor)
         )
     if monitor.operands:
-        raise NotALanguageExpression("this Monitor watches something already: make one of its own for this plan")
-    made = copy.copy(monitor)
-    made.hold([operand])
-    return made
+        raise NotALanguageExpression("this Monitor has an operand already: create another Monitor for this plan")
+    monitor_copy = copy.copy(monitor)
+    monitor_copy.hold([operand])
+    return monitor_copy

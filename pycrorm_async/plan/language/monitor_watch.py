@@ -1,7 +1,7 @@
-"""When a monitor interrupts: its condition is asked every so often, and before every node that starts inside.
+"""A watch evaluates a monitor's condition at intervals and before every node inside, and interrupts the monitored task.
 
-The second is for plans that never suspend, which no other task could interrupt. A watch fires once: what is
-performed while the interrupted plan cleans up is left alone.
+The evaluation before each node is necessary for plans that never suspend, because no other task could interrupt them. A
+watch fires once, so that the cleanup of the interrupted plan is not interrupted again.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ Condition: TypeAlias = Callable[[], bool | Awaitable[bool]] | asyncio.Event
 
 
 class Watch:
-    """One monitor at work, from now on; made where the monitor's own node is current.
+    """The watch of one running monitor; create it while the monitor's own node is current.
 
     Attributes:
         fired: whether it has interrupted the task that performs the monitor's operand.
-        error: what the condition raised, if that is why.
+        error: the exception of the condition, if that caused the interruption.
     """
 
     def __init__(self, condition: Condition) -> None:
@@ -35,27 +35,27 @@ class Watch:
         self._context = copy_context()
         self._task: asyncio.Task[Any] | None = None
 
-    def of(self, task: asyncio.Task[Any]) -> None:
-        """This task is to be interrupted."""
+    def set_task(self, task: asyncio.Task[Any]) -> None:
+        """Set the task to interrupt."""
         self._task = task
 
-    def inside(self) -> ExecutionContext:
-        """The surroundings of what it watches."""
+    def inner_context(self) -> ExecutionContext:
+        """Return the execution context for the monitor's operand."""
         outside = self._context.get(execution_context) or ExecutionContext()
         return ExecutionContext((*outside.watches, self), outside.arbiter, outside.claim)
 
     async def check(self) -> None:
-        """Raise `CancelledError` if the condition holds, and interrupt the task that is watched."""
+        """If the condition holds, interrupt the task and raise `CancelledError`."""
         holds, error = await self._evaluate()
         if holds and self._fire(error):
             raise asyncio.CancelledError("interrupted by a monitor")
 
     async def poll(self, interval_s: float) -> None:
-        """Interrupt the task as soon as the condition holds. Ends then, or when it is cancelled or the task is over."""
+        """Evaluate the condition at intervals and interrupt the task when it holds; ends then or with the task."""
         assert self._task is not None
         if isinstance(self._condition, asyncio.Event):
             await self._condition.wait()
-        # A condition may swallow the cancellation with which the monitor ends the asking.
+        # A condition may swallow the cancellation with which the monitor ends this task: check the task as well.
         while not (self.fired or self._task.done()):
             holds, error = await self._evaluate()
             if holds:
@@ -64,21 +64,22 @@ class Watch:
                 await asyncio.sleep(interval_s)
 
     async def _evaluate(self) -> tuple[bool, BaseException | None]:
-        """Whether to interrupt, and what the condition raised, if that is why: the monitor raises it."""
+        """Return whether to interrupt, and the condition's exception if that is the cause; the monitor raises it."""
         try:
             return await self._holds(), None
         except asyncio.CancelledError as raised:
-            asking = asyncio.current_task()
-            if asking is None or asking.cancelling():
+            task = asyncio.current_task()
+            if task is None or task.cancelling():
                 raise
             return True, raised
         except Exception as raised:  # noqa: BLE001  the monitor raises it
             return True, raised
 
     async def _holds(self) -> bool:
-        """Ask the condition, where the monitor is: what it performs belongs to that, and is not watched by it.
+        """Evaluate the condition in the monitor's own context.
 
-        What is asked while the plan only thinks is asked about what really happens.
+        Nodes that the condition performs belong to the monitor's node and are not watched by it. A monitor outside a
+        simulation evaluates its condition outside it too, also when a node inside the simulation starts.
         """
         if isinstance(self._condition, asyncio.Event):
             return self._condition.is_set()
@@ -89,12 +90,12 @@ class Watch:
         return bool(await _InContext(context, answer))
 
     def _fire(self, error: BaseException | None) -> bool:
-        """Whether it interrupts: only once, and not what is over already."""
+        """Interrupt the task and return True; return False if the watch has fired or the task has ended."""
         task = self._task
         if self.fired or task is None or task.done():
             return False
         self.fired, self.error = True, error
-        if asyncio.get_running_loop() is not task.get_loop():  # a thread with a loop of its own, in this context
+        if asyncio.get_running_loop() is not task.get_loop():  # called from another thread's loop
             task.get_loop().call_soon_threadsafe(task.cancel)
         elif asyncio.current_task() is not task:
             task.cancel()
@@ -102,7 +103,7 @@ class Watch:
 
 
 class _InContext:
-    """Awaits in the same task, but in another context."""
+    """Awaits an awaitable in the same task, but in another context."""
 
     def __init__(self, context: Context, awaitable: Awaitable[Any]) -> None:
         self._context = context
@@ -113,16 +114,16 @@ class _InContext:
         step: Callable[[], Any] = functools.partial(next, steps)
         try:
             while True:
-                wanted = self._context.run(step)
+                future = self._context.run(step)
                 try:
-                    yield wanted
+                    yield future
                     step = functools.partial(next, steps)
-                except BaseException as raised:  # noqa: BLE001  a cancellation, say, is for the one that is awaited
+                except BaseException as raised:  # noqa: BLE001  passed to the awaitable, for example a cancellation
                     step = functools.partial(_throw, steps, raised)
         except StopIteration as done:
             return done.value
         finally:
-            # The traceback of what was thrown holds this frame: no cycle for the collector.
+            # The traceback of a thrown exception holds this frame: break the reference cycle.
             del step
 
 

@@ -1,7 +1,7 @@
-"""The operators with which plans are put together: `a + b`, `a - b`, `a | b`, `a ^ b`, `a * 3`, `a >> Monitor(…)`.
+"""Operators that combine plans: `a + b`, `a - b`, `a | b`, `a ^ b`, `a * 3`, `a >> Monitor(…)`.
 
-Whatever can be performed has them, descriptions too. Each makes an expression of `plan.language`; what cannot
-stand in one is refused at once, and the message says what it is.
+Designators and descriptions have them. Each operator creates an expression of `plan.language`, which refuses an operand
+that is not performable immediately and names it.
 """
 
 from __future__ import annotations
@@ -16,40 +16,40 @@ __all__ = ["Composable"]
 
 
 class Composable:
-    """What can be an operand.
+    """Base of everything that can be an operand.
 
-    The other operand may be anything at run time; what is none raises `NotALanguageExpression`.
+    At run time the other operand may be any object; one that is not performable raises `NotALanguageExpression`.
     """
 
     __slots__ = ()
-    __array_ufunc__ = None  # an array of numbers times a plan would be an array of plans
+    __array_ufunc__ = None  # numpy would otherwise turn an array times a plan into an array of plans
 
     def __add__(self, other: Composable) -> Sequential:
-        """This one, then the other."""
+        """Perform this one, then the other."""
         from pycrorm_async.plan.language.expressions import Sequential
 
         return Sequential(self, other)
 
     def __sub__(self, other: Composable) -> TryInOrder:
-        """This one, and the other only if it fails."""
+        """Perform this one, and the other only if it fails."""
         from pycrorm_async.plan.language.expressions import TryInOrder
 
         return TryInOrder(self, other)
 
     def __or__(self, other: Composable) -> Parallel:
-        """Both at once; both must succeed."""
+        """Perform both in parallel; both must succeed."""
         from pycrorm_async.plan.language.expressions import Parallel
 
         return Parallel(self, other)
 
     def __xor__(self, other: Composable) -> TryAll:
-        """Both at once; one must succeed."""
+        """Perform both in parallel; one must succeed."""
         from pycrorm_async.plan.language.expressions import TryAll
 
         return TryAll(self, other)
 
     def __mul__(self, times: int) -> Repeat:
-        """So many times."""
+        """Perform this one `times` times."""
         from pycrorm_async.plan.language.expressions import Repeat
 
         return Repeat(self, times)
@@ -57,12 +57,12 @@ class Composable:
     __rmul__ = __mul__
 
     def __rshift__(self, monitor: Monitor) -> Monitor:
-        """Until it is done, or until the monitor's condition holds."""
+        """Perform this one until it ends or the monitor's condition holds."""
         from pycrorm_async.plan.language.monitor import watch_operand
 
         return watch_operand(self, monitor)
 
-    # The left operand has none of these operators, so it is no operand; the classes say so.
+    # Python calls these only if the left operand lacks the operator, so it is not performable: the constructors raise.
 
     def __radd__(self, other: Composable) -> Sequential:
         return Composable.__add__(other, self)

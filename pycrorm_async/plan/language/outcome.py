@@ -1,4 +1,4 @@
-"""What an expression of the plan language returns when it succeeds, and how its operands are tried."""
+"""The result of an expression of the plan language, and functions that try operands and combine their failures."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ __all__ = ["Attempt", "Outcome", "attempt", "combine_failures"]
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Outcome:
-    """How an expression went; a memory keeps `in_brief()` as the result of its node.
+    """The outcome of an expression; a memory records `in_brief()` as the result of its node.
 
     Attributes:
-        results: what the operands returned, in order as written; of `Repeat` what its rounds returned. None for one
-            that failed, was not tried, or was interrupted.
-        succeeded: which operands, or rounds, succeeded, by position from 0.
-        failures: of the others, in the order they failed.
-        rounds: of `Repeat`, how many there were.
-        interrupted: of `Monitor`, whether its condition held before the operand was done.
+        results: the operands' results in the order of the operands, for `Repeat` the rounds' results. None for one that
+            failed, was not tried, or was interrupted.
+        succeeded: positions, from 0, of the operands or rounds that succeeded.
+        failures: failures of the others, in the order in which they occurred.
+        rounds: number of rounds of a `Repeat`.
+        interrupted: for a `Monitor`, whether its condition held before the operand ended.
     """
 
     results: tuple[Any, ...] = ()
@@ -31,11 +31,11 @@ class Outcome:
     interrupted: bool | None = None
 
     def __repr__(self) -> str:
-        told = ((each.name, getattr(self, each.name)) for each in fields(self))
-        return f"Outcome({', '.join(f'{name}={value!r}' for name, value in told if value not in ((), None))})"
+        values = ((each.name, getattr(self, each.name)) for each in fields(self))
+        return f"Outcome({', '.join(f'{name}={value!r}' for name, value in values if value not in ((), None))})"
 
     def in_brief(self) -> dict[str, Any]:
-        """As plain values. What the operands returned is at their own nodes.
+        """Return the outcome as plain values, without the operands' results, which are at their own nodes.
 
         >>> Outcome(results=(None, 3), succeeded=(1,), failures=(ObjectLost("gone"),)).in_brief()
         {'succeeded': [1], 'failures': ['ObjectLost: gone']}
@@ -51,14 +51,14 @@ class Outcome:
 
 
 class Attempt(NamedTuple):
-    """A result, or the plan failure there is instead."""
+    """A result, or the plan failure that was raised instead."""
 
     result: Any = None
     failure: Exception | None = None
 
 
 async def attempt(perform: Callable[[], Any]) -> Attempt:
-    """What performing it gives. Whatever is raised that is no plan failure passes through."""
+    """Perform and return the result or the plan failure; any other exception propagates."""
     try:
         return Attempt(await perform())
     except Exception as error:
@@ -68,10 +68,10 @@ async def attempt(perform: Callable[[], Any]) -> Attempt:
 
 
 def combine_failures(failures: list[Exception], summary: str) -> Exception:
-    """The only failure itself, or all of them as `PlanFailures`, to be raised.
+    """Return a single failure itself, or several as `PlanFailures`, for the caller to raise.
 
-    Takes them out of the list: the traceback of a failure holds the frame that raises it, and so what is in its
-    variables; no cycle for the collector.
+    Empties the list, because the failure's traceback holds the caller's frame and its variables: this breaks the
+    reference cycle.
     """
     error = (
         failures[0] if len(failures) == 1 else PlanFailures(f"{summary}: {_list_failures(failures)}", tuple(failures))

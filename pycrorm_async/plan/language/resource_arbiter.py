@@ -1,8 +1,27 @@
-"""Who may use which part of the robot, and who waits: the turns that branches of a parallel expression take.
+"""Arbitrate the parts of the robot between the branches of a parallel expression.
 
-A node takes all it needs at once, or waits, before it starts; it holds it until it ends. What a node holds,
-those inside it may use, but of two that run at once inside it only one. First come, first served, except that
-nobody queues behind one who waits for the end of what he is part of. A wait that can never end is refused.
+Theory of operation
+-------------------
+
+The outermost parallel expression creates an `Arbiter`; every node inside it that declares `resources` makes a `Claim`
+before it starts. A part is a pair of world and resource, so branches in different worlds do not compete. A claim is in
+one of three states: waiting, holding, or released. It gets all its parts together or none, and holds them until its
+node ends. Claims form a tree through `parent`, which is the claim of the nearest ancestor node.
+
+A claim can be granted if no claim other than its ancestors holds one of its parts: a node may use the parts of its
+ancestors, but two nodes that run in parallel inside one holder exclude each other. Grants follow the order of
+arrival for each part. There is one exception: a claim does not queue behind an earlier one that itself waits for the
+end of one of this claim's ancestors, because that earlier one cannot proceed before this claim has ended.
+
+A deadlock needs a holder that waits, directly or through the claims that wait inside it, for an ancestor of the new
+claim, while the new claim waits for that holder. `_check_deadlock` searches this chain before a claim waits and raises
+`ResourceDeadlock` instead of waiting forever. Every claim is checked once, when it arrives: a chain that closes later
+is closed by a later claim, which is checked in its turn.
+
+All methods run in the thread of one event loop, and only `await claim.granted` suspends, so the two lists change
+between awaits only and need no lock. A waiting task can be cancelled at any time, also after its claim was granted but
+before it resumed; `_withdraw` therefore removes the claim from whichever list holds it. A branch that runs in another
+event loop (a thread of the plan's own) makes no claim.
 """
 
 from __future__ import annotations
@@ -23,11 +42,11 @@ if TYPE_CHECKING:
 __all__ = ["Arbiter", "Claim"]
 
 Part: TypeAlias = tuple[Any, Resource]
-"""A part of the robot of one world: branches in different worlds are not in each other's way."""
+"""A part of the robot of one world."""
 
 
 class Claim:
-    """What a node needs, or holds."""
+    """The parts of the robot that a node waits for or holds."""
 
     __slots__ = ("_arbiter", "_token", "designator", "granted", "parent", "parts")
 
@@ -36,47 +55,50 @@ class Claim:
         self.parts = parts
         self.parent = parent
         self.granted: asyncio.Future[None] | None = None
-        """Only while it waits."""
+        """Set while the claim waits; resolved when it is granted."""
         self._arbiter = arbiter
         self._token: Token[ExecutionContext | None] | None = None
 
     def above(self) -> Iterator[Claim]:
-        """Those of the nodes it is inside of."""
+        """Yield the claims of the ancestor nodes, nearest first."""
         each = self.parent
         while each is not None:
             yield each
             each = each.parent
 
-    def enter(self, around: ExecutionContext) -> None:
-        """From now on what starts in this context is inside."""
-        self._token = execution_context.set(ExecutionContext(around.watches, self._arbiter, self))
+    def enter(self, context: ExecutionContext) -> None:
+        """Make this claim the parent of claims made later in this context."""
+        self._token = execution_context.set(ExecutionContext(context.watches, self._arbiter, self))
 
     def release(self) -> None:
-        """The node ended: the next ones may go on."""
+        """Release the parts after the node has ended, and grant waiting claims."""
         self._arbiter.release(self)
         assert self._token is not None
         try:
             execution_context.reset(self._token)
         except ValueError:
-            # A dropped plan is closed in another context, whose surroundings are not ours to change.
+            # A dropped plan is closed in another context, whose execution context must not change.
             return
 
 
 class Arbiter:
-    """Settles the claims of all that runs inside one parallel expression; belongs to one event loop."""
+    """Grants the claims of all nodes inside one parallel expression; belongs to one event loop."""
 
     def __init__(self) -> None:
         self.loop = asyncio.get_running_loop()
         self._holding: list[Claim] = []
         self._waiting: list[Claim] = []
 
-    async def claim(self, designator: Designator, around: ExecutionContext) -> Claim | None:
-        """What the designator needs is its own; None if it needs nothing. Raises `ResourceDeadlock`."""
-        wanted = designator.resources()
-        if not wanted or asyncio.get_running_loop() is not self.loop:
+    async def claim(self, designator: Designator, context: ExecutionContext) -> Claim | None:
+        """Wait until the designator's parts are free and hold them; None if it needs none.
+
+        Raises `ResourceDeadlock` if the wait would never end.
+        """
+        resources = designator.resources()
+        if not resources or asyncio.get_running_loop() is not self.loop:
             return None
         world = current_world.get()
-        claim = Claim(self, designator, frozenset((world, resource) for resource in wanted), around.claim)
+        claim = Claim(self, designator, frozenset((world, resource) for resource in resources), context.claim)
         self._check_deadlock(claim)
         self._waiting.append(claim)
         self._grant()
@@ -87,23 +109,26 @@ class Arbiter:
             except BaseException:
                 self._withdraw(claim)
                 raise
-        claim.enter(around)
+        claim.enter(context)
         return claim
 
     def release(self, claim: Claim) -> None:
-        """What it held is free, but for those above it."""
+        """Release the claim's parts; its ancestors may still hold them."""
         self._holding.remove(claim)
         self._grant()
 
-    # --- inside -----------------------------------------------------------------------------------------------
+    # --- granting and deadlock detection ----------------------------------------------------------------------
 
     def _withdraw(self, claim: Claim) -> None:
-        """The wait was cancelled, perhaps just after it was over."""
+        """Remove a claim whose wait was cancelled, possibly just after it was granted."""
         (self._holding if claim in self._holding else self._waiting).remove(claim)
         self._grant()
 
     def _grant(self) -> None:
-        """Let all go on that can, in the order they came; one that does may let an earlier one pass another."""
+        """Grant every claim that can be granted, in the order of arrival.
+
+        Repeat until nothing changes, because a grant may free an earlier claim from queueing behind another.
+        """
         granted = True
         while granted:
             granted = False
@@ -116,22 +141,22 @@ class Arbiter:
                         claim.granted.set_result(None)
 
     def _holders(self, claim: Claim) -> list[Claim]:
-        """Those in its way: they hold a part it needs, and it is not inside of them."""
+        """Return the claims that hold a part it needs, except its ancestors."""
         above = set(claim.above())
         return [each for each in self._holding if each not in above and each.parts & claim.parts]
 
     def _must_queue(self, claim: Claim) -> bool:
-        """Whether one who came earlier goes first."""
+        """Return whether an earlier claim goes first."""
         above = set(claim.above())
         return any(not self._waits_for(earlier, above) for earlier in self._earlier_rivals(claim))
 
     def _earlier_rivals(self, claim: Claim) -> list[Claim]:
-        """Those before it in the queue that need some of the same."""
-        before = self._waiting[: self._waiting.index(claim)]
-        return [each for each in before if each.parts & claim.parts]
+        """Return the earlier waiting claims that need some of the same parts."""
+        earlier = self._waiting[: self._waiting.index(claim)]
+        return [each for each in earlier if each.parts & claim.parts]
 
     def _waits_for(self, waiter: Claim, ends: set[Claim]) -> bool:
-        """Whether its turn comes, or may come, only after one of these has ended."""
+        """Return whether `waiter` can be granted, or may be, only after one of `ends` has ended."""
         ahead, seen = [waiter], set()
         while ahead:
             each = ahead.pop()
@@ -146,11 +171,11 @@ class Arbiter:
         return False
 
     def _waiting_in(self, holder: Claim) -> list[Claim]:
-        """Those it cannot end before: they wait inside of it."""
+        """Return the claims that wait inside the holder, which cannot end before they do."""
         return [each for each in self._waiting if holder in each.above()]
 
     def _check_deadlock(self, claim: Claim) -> None:
-        """Raise `ResourceDeadlock` if one that is in the way waits, in the end, for what the claim is inside of."""
+        """Raise `ResourceDeadlock` if a holder waits, directly or indirectly, for an ancestor of the claim."""
         ends = set(claim.above())
         for first in self._holders(claim):
             ahead, seen = [first], set()

@@ -1,8 +1,8 @@
-"""Which parts of the robot a designator needs for itself while it runs, so that parallel branches take turns.
+"""Parts of the robot that a designator uses exclusively while it runs, so that parallel branches take turns.
 
-A part is needed also when it must only hold still: an arm that reaches for a place in the map needs the base
-and the torso. Looking somewhere does not need the base, so a robot may look around while it drives. Who waits
-for whom is settled in `plan.claims`.
+A part is also needed if it only must not move: an arm that reaches for a place in the map needs the base and the torso.
+Looking does not need the base, so a robot may turn its head while it drives. `language.resource_arbiter` decides which
+designator waits.
 
 >>> PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).resources() == reaching(Arms.LEFT)
 True
@@ -23,7 +23,7 @@ __all__ = ["NOTHING", "Resource", "arms", "moving", "reaching"]
 
 
 class Resource(Enum):
-    """A part of the robot that one activity at a time can use."""
+    """A part of the robot that one designator at a time can use."""
 
     LEFT_ARM = "LEFT_ARM"
     RIGHT_ARM = "RIGHT_ARM"
@@ -42,17 +42,17 @@ _STANDING = frozenset({Resource.BASE, Resource.TORSO})
 
 
 def arms(arm: Arms) -> frozenset[Resource]:
-    """The arm, or both, with its gripper."""
+    """Return the arm, or both, with its gripper."""
     return _ARMS[arm]
 
 
 def reaching(arm: Arms) -> frozenset[Resource]:
-    """What an arm needs that reaches for a place in the map: itself, and base and torso, which hold still."""
+    """Return the parts for reaching a place in the map: the arm, and base and torso, which must not move."""
     return _ARMS[arm] | _STANDING
 
 
 def moving(joints: Iterable[str], robot: RobotDescription) -> frozenset[Resource]:
-    """The parts these joints belong to; none for a joint that is in none of them."""
+    """Return the parts that these joints belong to; a joint of no part is ignored."""
     parts = {robot.torso_joint: Resource.TORSO}
     parts |= dict.fromkeys((robot.head_pan_joint, robot.head_tilt_joint), Resource.HEAD)
     for arm, description in robot.arms.items():

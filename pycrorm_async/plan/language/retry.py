@@ -1,4 +1,4 @@
-"""An action that may fail is tried again: with the next alternative of its description, or as it is."""
+"""Retry an operand that failed: with the next alternative of a description, or the same designator again."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ __all__ = ["Retry"]
 
 @dataclass(init=False, repr=False, eq=False)
 class Retry(Expression):
-    """Performs the alternatives of a description in turn, or a designator again and again, until one succeeds.
+    """Performs the alternatives of a description in turn, or a designator repeatedly, until one succeeds.
 
     >>> await Retry(PickUpAction(milk, [Arms.LEFT, Arms.RIGHT], [Grasp.FRONT, Grasp.TOP]), max_tries=4).perform()
 
     Args:
-        max_tries: at most so many; fewer if there are fewer alternatives.
+        max_tries: greatest number of tries; a description may have fewer alternatives.
 
     Raises:
-        NotALanguageExpression: it cannot be performed, or `max_tries` is no whole number from 1.
+        NotALanguageExpression: the operand is not performable, or `max_tries` is not an integer >= 1.
     """
 
     max_tries: int
@@ -39,11 +39,11 @@ class Retry(Expression):
         except TypeError:
             self.max_tries = 0
         if isinstance(max_tries, bool) or self.max_tries < 1:
-            raise NotALanguageExpression(f"Retry tries a whole number of times from 1, not {max_tries!r}")
+            raise NotALanguageExpression(f"Retry needs an integer max_tries >= 1, got {max_tries!r}")
         self.hold([operand])
 
     async def perform(self) -> Any:
-        """Returns what the first success returns. Raises the last failure, with the earlier ones as notes."""
+        """Return the result of the first success, or raise the last failure with the earlier ones as notes."""
         failures: list[Exception] = []
         notes: list[str] = []
         for number, performable in enumerate(itertools.islice(self._alternatives(), self.max_tries), start=1):

@@ -1,7 +1,7 @@
-"""Tasks that run at once and end together: whatever happens, none of them outlives the one that waits for them.
+"""Wait for parallel tasks, so that none of them outlives its caller.
 
-Not an `asyncio.TaskGroup`, which takes a branch that was cancelled for one that ended well, and cancels its own
-caller to wake up; cancellations from outside and from inside are to be told apart here.
+An `asyncio.TaskGroup` is not suitable: it treats a cancelled branch as one that ended normally, and it cancels its own
+caller to wake it up, whereas the plan language must distinguish cancellations from outside and from inside.
 """
 
 from __future__ import annotations
@@ -14,30 +14,31 @@ __all__ = ["join_tasks", "raise_errors"]
 
 
 async def join_tasks(tasks: Sequence[asyncio.Task[Any]]) -> asyncio.CancelledError | None:
-    """All have ended; as soon as one was cancelled or raised, the others are cancelled.
+    """Wait until all tasks have ended; cancel the others as soon as one was cancelled or raised.
 
-    They are cancelled as often as this is, and at least once if one broke: a branch that cleans up is left alone.
+    The tasks are cancelled once for each cancellation of the caller, and at least once if one of them broke. A branch
+    is not cancelled again while it cleans up, unless the caller is.
 
     Returns:
-        The cancellation that came from outside meanwhile and was passed on to them, if one did. Raise it again.
+        The last cancellation of the caller, which was passed on to the tasks; the caller must raise it again.
     """
     outside: asyncio.CancelledError | None = None
-    asked = told = 0
+    cancellations_due = cancellations_sent = 0
     pending = set(tasks)
     while pending:
         try:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError as cancelled:
             outside = cancelled
-            asked += 1
-        except BaseException:  # a dropped plan is closed: nothing can be awaited any more
+            cancellations_due += 1
+        except BaseException:  # the coroutine of a dropped plan is closed and cannot await any more
             _cancel(pending)
             raise
         else:
             if any(each.cancelled() or each.exception() is not None for each in done):
-                asked = max(asked, 1)
-        if asked > told:
-            told = asked
+                cancellations_due = max(cancellations_due, 1)
+        if cancellations_due > cancellations_sent:
+            cancellations_sent = cancellations_due
             _cancel(pending)
     try:
         return outside
@@ -46,9 +47,9 @@ async def join_tasks(tasks: Sequence[asyncio.Task[Any]]) -> asyncio.CancelledErr
 
 
 def raise_errors(tasks: Sequence[asyncio.Task[Any]], outside: asyncio.CancelledError | None) -> None:
-    """Raise what a task raised, all of it if there were several; else the cancellation, if there was one.
+    """Raise the exceptions of the tasks, several as a group; without one, raise the cancellation, if there was one.
 
-    An exception goes before a cancellation, as one that is raised while a plan is cleaned up does.
+    An exception takes precedence over a cancellation, like one that is raised while a plan cleans up.
     """
     raised = [each.exception() for each in tasks if not each.cancelled()]
     errors = [each for each in raised if each is not None]
@@ -58,7 +59,7 @@ def raise_errors(tasks: Sequence[asyncio.Task[Any]], outside: asyncio.CancelledE
         if error is not None:
             raise error
     finally:
-        # The traceback of an exception holds this frame: no cycle for the collector.
+        # The traceback of a raised exception holds this frame: break the reference cycle.
         del error, errors, raised, cancelled, outside, tasks
 
 
