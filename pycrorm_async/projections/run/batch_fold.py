@@ -10,7 +10,7 @@ every event is folded exactly once, and rows and checkpoints never disagree.
 A declaration that the generation has no tables for makes the write transaction exclusive and grows the tables first
 (`growth`). If the database creates only some of them, the growth is committed, the batch is not, and it is folded
 again for the tables that exist now. An event that cannot be folded parks its episode at this event: the events before
-it are written, later ones are not read, and all other episodes continue. If the database refuses a row, the batch is
+it are written, later ones are not folded, and all other episodes continue. If the database refuses a row, the batch is
 written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
 
 `FoldTarget` is the generation and its checkpoints: the visible one (`projector`) or one beside it (`catch_up`).

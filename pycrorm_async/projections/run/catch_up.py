@@ -1,12 +1,12 @@
 """Fold into generations that have their own checkpoint table: one that a rebuild fills, and those of projections.
 
 Theory of operation. The checkpoints of the visible built-in tables are `episode.folded`. Every other generation has a
-table with one row for each episode (`checkpoints`), which is dropped together with it. `SideTarget` finds the
-generation under its key in every transaction and fails if another one has taken its place, so a rebuild that was
-replaced, or a projection that was rebuilt elsewhere, is never written to. On a server `CatchUp` prepares the next batch
-while the current one is written; the prepared batch is used only if the current one was written whole, because it was
-read as continuing that one. Several workers may fill one generation, each its `Share` of the episodes, so that no two
-of them advance one checkpoint.
+table with one row for each episode (`checkpoints`), which is dropped together with it. `SideTarget` reads the
+generation under its key in every transaction. For a rebuild another number is an error. For a projection it means that
+another process has rebuilt it: a batch folded for the old tables is folded again for the new ones, unless their version
+differs, which is an error. On a server `CatchUp` prepares the next batch while the current one is written; the prepared
+batch is used only if the current one was written whole, because it was read as continuing that one. Several workers may
+fill one generation, each its `Share` of the episodes, so that no two of them advance one checkpoint.
 """
 
 from __future__ import annotations

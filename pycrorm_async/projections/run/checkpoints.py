@@ -70,7 +70,7 @@ AND number % :many = :part {begun} ORDER BY number LIMIT :limit"""),  # noqa: S6
 
 
 async def late(connection: AsyncConnection, place: str, *, seen: str, limit: int) -> list[EpisodeRow]:
-    """Return the episodes of which the visible tables have more than this generation; `head` is what those have.
+    """Return the episodes of which the visible tables have more events than this generation, with theirs as `head`.
 
     `seen`: SQL for the checkpoints of the visible tables, `SEEN` or `folded` of another generation.
     """
