@@ -179,5 +179,5 @@ async def test_a_server_reads_the_latest_from_the_end_and_does_not_sort_them_out
 async def test_a_closed_memory_is_not_asked(log: EventLog) -> None:
     asked = PickUpExperience(Reading(log))
     asked.is_closed = True
-    with pytest.raises(CallerError, match="is closed: ask while it is open"):
+    with pytest.raises(CallerError, match="the memory is closed, so its experience cannot be read"):
         await asked.successes(ObjectType.MILK, arm=None)
