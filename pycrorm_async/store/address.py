@@ -82,7 +82,7 @@ class DatabaseAddress:
 
     @property
     def is_private(self) -> bool:
-        """Whether this is `sqlite://`."""
+        """True if this is `sqlite://`."""
         return self.is_sqlite and self._url.database is None
 
     @property

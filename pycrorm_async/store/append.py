@@ -48,9 +48,9 @@ __all__ = ["Appending"]
 
 
 class _Plan(NamedTuple):
-    """The changes that the batch makes to episodes whose rows are `known`."""
+    """The changes that the batch makes to episodes whose rows are `known_rows`."""
 
-    known: Mapping[EpisodeId, EpisodeRow]
+    known_rows: Mapping[EpisodeId, EpisodeRow]
     steps: Mapping[EpisodeId, EpisodeStep]
     insertion: Insertion
 
@@ -83,11 +83,11 @@ class Appending:
         if not batch.episodes:
             await dialect.force_durable_commit(connection)  # all declarations may be repeats
             return Stored({}, {})
-        known, refusals = await self._read_or_create_rows(connection)
+        known_rows, refusals = await self._read_or_create_rows(connection)
         plan = self._plan
-        if plan is None or plan.known != known:
-            plan = await self._make_plan(known)
-        changed = [each.after for identity, each in plan.steps.items() if each.after != known[identity]]
+        if plan is None or plan.known_rows != known_rows:
+            plan = await self._make_plan(known_rows)
+        changed = [each.after for identity, each in plan.steps.items() if each.after != known_rows[identity]]
         if changed:
             await dialect.upsert_episodes(connection, changed)
             self.warnings = warnings_of(changed)
@@ -102,10 +102,10 @@ class Appending:
         refusals |= {each: reason for each, reason in stopped.items() if reason is not None}
         return Stored(refusals, {each: change.after for each, change in plan.steps.items()})
 
-    async def _make_plan(self, known: Mapping[EpisodeId, EpisodeRow]) -> _Plan:
-        steps = {each: step(self._batch.episodes[each], row) for each, row in known.items()}
+    async def _make_plan(self, known_rows: Mapping[EpisodeId, EpisodeRow]) -> _Plan:
+        steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}
         rows = [row for each in steps.values() for row in _rows(each)]
-        return _Plan(known, steps, await self._dialect.event_insertion(rows))
+        return _Plan(known_rows, steps, await self._dialect.event_insertion(rows))
 
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""

@@ -68,12 +68,12 @@ def sort(records: Iterable[Record]) -> SortedBatch:
     return SortedBatch(declarations, episodes)
 
 
-def step(records: Sequence[Record], known: EpisodeRow) -> EpisodeStep:
+def step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
     """Compute the effect of these records, all of one episode, on its row."""
     first = records[0].sequence
-    if first == known.head + 1 and _consecutive(records) and _sound(records):
-        return EpisodeStep(_advanced(known, records, refused=None), list(records))
-    return _careful_step(records, known)
+    if first == row.head + 1 and _consecutive(records) and _sound(records):
+        return EpisodeStep(_advanced(row, records, refused=None), list(records))
+    return _careful_step(records, row)
 
 
 def new_episode(episode: EpisodeId, first: Record, number: int) -> EpisodeRow:
@@ -93,18 +93,18 @@ def _same(record: Record, stored: StoredEvent | None) -> bool:
     return stored is not None and tuple(record[3:]) == tuple(stored[2:])
 
 
-def _careful_step(records: Sequence[Record], known: EpisodeRow) -> EpisodeStep:
+def _careful_step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
     fresh: list[Record] = []
     again: list[Record] = []
     refused: str | None = None
     skipped_ends = 0
-    expected = known.head + 1
+    expected = row.head + 1
     for record in records:
         if record.sequence < expected:
             if not is_computed_end(record):
                 again.append(record)
                 continue
-            if known.ended_wall_ns is not None or known.refused is not None:
+            if row.ended_wall_ns is not None or row.refused is not None:
                 skipped_ends += 1
                 continue
             record = record._replace(sequence=expected)
@@ -113,7 +113,7 @@ def _careful_step(records: Sequence[Record], known: EpisodeRow) -> EpisodeStep:
             break
         fresh.append(record)
         expected += 1
-    return EpisodeStep(_advanced(known, fresh, refused=refused), fresh, again, skipped_ends)
+    return EpisodeStep(_advanced(row, fresh, refused=refused), fresh, again, skipped_ends)
 
 
 def _refusal(record: Record, expected: int) -> str | None:
@@ -129,12 +129,12 @@ def _refusal(record: Record, expected: int) -> str | None:
     return None
 
 
-def _advanced(known: EpisodeRow, fresh: Sequence[Record], *, refused: str | None) -> EpisodeRow:
+def _advanced(row: EpisodeRow, fresh: Sequence[Record], *, refused: str | None) -> EpisodeRow:
     if not fresh:  # repeats alone do not end an earlier refusal
-        return known._replace(refused=known.refused or refused)
+        return row._replace(refused=row.refused or refused)
     last = fresh[-1]
-    ended = last.wall_ns if last.type == "EpisodeEnded" else known.ended_wall_ns
-    return known._replace(head=last.sequence, ended_wall_ns=ended, refused=refused)
+    ended = last.wall_ns if last.type == "EpisodeEnded" else row.ended_wall_ns
+    return row._replace(head=last.sequence, ended_wall_ns=ended, refused=refused)
 
 
 def _consecutive(records: Sequence[Record]) -> bool:

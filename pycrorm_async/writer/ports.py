@@ -97,7 +97,7 @@ class ClaimedSource(Source, Protocol):
 
     @property
     def is_alive(self) -> bool:
-        """Whether the recorder lives in another process and may record more."""
+        """True if the recorder lives in another process and may record more."""
         ...
 
     def finish(self) -> None:
@@ -206,7 +206,7 @@ class OfferedQueue(Protocol):
 
     @property
     def is_drained(self) -> bool:
-        """Whether a process drains the queue now."""
+        """True if a process drains the queue now."""
         ...
 
     @property

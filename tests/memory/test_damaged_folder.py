@@ -52,7 +52,7 @@ async def test_the_daemon_tells_it_once_and_stores_what_a_repair_keeps_of_the_re
 ) -> None:
     running = Daemon(database_url, spool)
     await running.says("is dead: recovering")
-    await running.says(f"{MISSING}, and .* retrying with pauses$")
+    await running.says(f"{MISSING}, although .* retrying with pauses$")
     await running.leaves()
     assert ask(database_url, STORED) == [(12, 12)]
     assert len([line for line in running.said if MISSING in line]) == 1

@@ -39,7 +39,7 @@ class Notifier:
 
     @property
     def awaited(self) -> bool:
-        """Whether a coroutine or a thread waits now."""
+        """True if a coroutine or a thread waits now."""
         return bool(self._tickets)
 
     async def until(self, reached: Callable[[], bool]) -> None:

@@ -97,7 +97,7 @@ class RecorderQueue(QueueFiles):
 
     @property
     def full(self) -> bool:
-        """Whether an ordinary event as large as the largest refused one would be refused now."""
+        """True if an ordinary event as large as the largest refused one would be refused now."""
         return not self._appender.admits_again(reserved=False)
 
     async def room(self) -> None:
@@ -149,7 +149,7 @@ class RecorderQueue(QueueFiles):
 
     @property
     def is_drained(self) -> bool:
-        """Whether this or another process drains the queue now."""
+        """True if this or another process drains the queue now."""
         with wrap_os_errors(self.folder):
             return self._consumer.drains or is_locked(self.folder / DRAIN)
 

@@ -60,7 +60,7 @@ class Home(NamedTuple):
 
     @property
     def is_in_place(self) -> bool:
-        """Whether the folder still has its name."""
+        """True if the folder still has its name."""
         return self.identity.is_at(self.place.folder)
 
 

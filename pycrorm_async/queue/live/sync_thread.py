@@ -38,7 +38,7 @@ class SyncThread:
 
     @property
     def is_this_thread(self) -> bool:
-        """Whether the caller runs in this thread; a finalizer here must not wait for this thread's own work."""
+        """True if the caller runs in this thread; a finalizer here must not wait for this thread's own work."""
         return threading.current_thread() is self._thread
 
     def wake(self) -> None:

@@ -105,12 +105,12 @@ class RecoveredQueue:
 
     @property
     def all_stored(self) -> bool:
-        """Whether all records and computed ends are supplied and acknowledged."""
+        """True if all records and computed ends are supplied and acknowledged."""
         return self._scanner.finished and self.stored == self._confirmed
 
     @property
     def holds_refused(self) -> bool:
-        """Whether this is a folder of dead letters."""
+        """True if this is a folder of dead letters."""
         return parse_folder_name(self.name).episode is not None
 
     @property

@@ -166,13 +166,13 @@ class LiveQueue:
 
     @property
     def is_alive(self) -> bool:
-        """Whether the recorder lives and has not deleted its folder. Raises `SpoolUnavailable`."""
+        """True if the recorder lives and has not deleted its folder. Raises `SpoolUnavailable`."""
         with wrap_os_errors(self.folder):
             return is_locked(self.folder / ALIVE)
 
     @property
     def is_closed(self) -> bool:
-        """Whether the recorder has closed its queue."""
+        """True if the recorder has closed its queue."""
         return self._progress.recorded().closed
 
     def release(self) -> None:

@@ -59,10 +59,10 @@ class PostgreSQL:
             if names & {"episode", "event", "pycrorm_declaration"} == set():
                 raise DatabaseForeign(f"{name} has a schema {LOG_SCHEMA!r} of another program: it has no pycrorm_log")
             raise DatabaseUnavailable(f"{name}: the table pycrorm_log is missing: {_RESTORING}")
-        found = (await connection.exec_driver_sql(tables.READ_LOG)).one_or_none()
-        if found is None:
+        row = (await connection.exec_driver_sql(tables.READ_LOG)).one_or_none()
+        if row is None:
             raise DatabaseUnavailable(f"{name}: the table pycrorm_log is empty: {_RESTORING}")
-        return LogIdentity._make(found)
+        return LogIdentity._make(row)
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
         # One message, bypassing SQLAlchemy, in the transaction that an earlier statement through SQLAlchemy began.
@@ -185,8 +185,8 @@ class PostgreSQL:
 
     async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
         # Bypasses SQLAlchemy, which processes every row twice.
-        found = await (await _driver(connection)).fetch(sql.SELECT_SPANS, *_arrays(spans, 3))
-        return [make(StoredEvent, row) for row in found]
+        rows = await (await _driver(connection)).fetch(sql.SELECT_SPANS, *_arrays(spans, 3))
+        return [make(StoredEvent, row) for row in rows]
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
@@ -226,14 +226,14 @@ class PostgreSQL:
         await connection.exec_driver_sql(f"CREATE SCHEMA IF NOT EXISTS {TABLES_SCHEMA}")
 
     async def has_table(self, connection: AsyncConnection, name: str) -> bool:
-        found, stranger, login = tuple((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).one())
+        exists, stranger, login = tuple((await connection.exec_driver_sql(tables.HAS_TABLE, (name,))).one())
         if stranger is not None:
             raise TablesUntrusted(
                 f"the tables belong to {stranger}, whose members could run their code with the rights of {login}:"
                 f" fold with a login that is a member of {stranger} and has no right to the log, read with one of"
                 " pycrorm_reader"
             )
-        return bool(found)
+        return bool(exists)
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
         """Do nothing: the server gathers statistics itself."""
@@ -248,8 +248,8 @@ class PostgreSQL:
         await connection.exec_driver_sql(tables.WAIT_AS_EVER)
 
     async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
-        found = await connection.exec_driver_sql(tables.IN_VIEWS_SCHEMA, (list(known),))
-        strangers = list(found.scalars())
+        names = await connection.exec_driver_sql(tables.IN_VIEWS_SCHEMA, (list(known),))
+        strangers = list(names.scalars())
         if strangers:
             raise DatabaseError(
                 f"{VIEWS_SCHEMA}.{strangers[0]} does not belong to the memory, which replaces the schema {VIEWS_SCHEMA}"
