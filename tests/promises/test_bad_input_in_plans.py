@@ -204,7 +204,7 @@ CASES = {
     "too high for the torso": Case(
         lambda _: resolved(MoveTorsoAction([1.5])),
         "TorsoGoalUnreachable",
-        "'pr2': torso_lift_joint cannot be 1.5; its limits are 0 to 0.33",
+        "'pr2': torso_lift_joint cannot be set to 1.5; its limits are 0 to 0.33",
         [1.5],
         ("MoveTorsoAction", "MoveJointsMotion"),
     ),
@@ -372,7 +372,7 @@ async def test_a_plan_outside_any_world_or_robot_is_told_what_to_do_and_remember
     async with remembered(tmp_path):
         with pytest.raises(CallerError, match="with simulated_robot:"):
             await NavigateActionPerformable(Pose()).perform()
-        with pytest.raises(CallerError, match=r"act inside `with BulletWorld\(\) as world:`"):
+        with pytest.raises(CallerError, match=r"call it inside `with BulletWorld\(\) as world:`"):
             await resolved(MoveTorsoAction([0.1]))
         with BulletWorld(), pytest.raises(CallerError, match="add one"):
             await resolved(MoveTorsoAction([0.1]))
