@@ -9,6 +9,8 @@ from bench.__main__ import RUNS, _lines, _note
 from bench.reporting.budgets import BUDGETS, Verdict, judged
 from bench.reporting.page import page, rows_of
 
+pytestmark = pytest.mark.slow
+
 ABOUT: dict[str, Any] = {
     "command": "python -m bench.x",
     "took_s": 1.5,
@@ -94,7 +96,6 @@ def test_every_figure_is_on_the_page_with_its_path_and_a_spread_is_one() -> None
     ]
 
 
-@pytest.mark.slow
 def test_what_is_measured_again_replaces_its_line_and_nothing_else(tmp_path: Path) -> None:
     _note(tmp_path, "plan", plan(0.04, 0.0)["plan"])
     _note(tmp_path, "hook", {"bench": "hook", **ABOUT})

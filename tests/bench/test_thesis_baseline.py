@@ -18,6 +18,8 @@ from bench.material.spooled import spool_tree
 from pycrorm_async.operations.recovery import recover
 from tests.databases import ask
 
+pytestmark = pytest.mark.slow
+
 ROOT_ROWS = 2
 """The root's own node, and the episode's metadata."""
 
@@ -71,7 +73,6 @@ def test_one_navigation_is_eleven_inserts_over_eight_tables(file: str, engine: E
     assert statements.sent == ROOT_ROWS + 11
 
 
-@pytest.mark.slow
 def test_rows_with_a_key_of_their_own_take_a_statement_each_on_sqlite(file: str, engine: Engine) -> None:
     made = tree(1_000, seed=1)
     statements = Statements(engine)
@@ -84,7 +85,6 @@ def test_rows_with_a_key_of_their_own_take_a_statement_each_on_sqlite(file: str,
     assert (sum(own.values()) + sum(found.values())) / made.nodes == pytest.approx(9.05, abs=0.05)
 
 
-@pytest.mark.slow
 @pytest.mark.soak
 def test_fifty_thousand_rollouts_have_the_number_of_nodes_of_the_thesis() -> None:
     assert tree(THESIS_NODES, seed=69).nodes == 488_043

@@ -15,6 +15,8 @@ from pycrorm_async.cli.main import app
 from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, environment, pycrorm
 
+pytestmark = pytest.mark.slow
+
 
 def test_every_verb_that_opens_a_database_takes_its_spool_too() -> None:
     group = typer.main.get_command(app())
@@ -29,7 +31,6 @@ def test_the_command_prints_its_version(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (0, f"pycrorm {pycrorm_async.__version__}\n")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "completed"),
     [("pycrorm reb", "rebuild"), ("pycrorm run --wr", "--writer"), ("pycrorm spool rep", "repair")],
@@ -43,7 +44,6 @@ def test_a_shell_completes_verbs_and_their_options(tmp_path: Path, words: str, c
     assert (done.stdout.strip(), done.stderr) == (completed, "")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["verify", "rebuild"])
 def test_verify_and_rebuild_name_the_events_that_wait_in_the_spool(tmp_path: Path, verb: str) -> None:
     (tmp_path / "notes.py").write_text(NOTES_PLAN)

@@ -9,6 +9,8 @@ import pytest
 
 from tests.commands import pycrorm
 
+pytestmark = pytest.mark.slow
+
 PLAN = """
 import asyncio
 import sys
@@ -58,7 +60,6 @@ def test_a_missing_resolve_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in ran.stderr
 
 
-@pytest.mark.slow
 def test_a_plan_that_ends_itself_is_said_to_have_done_so(tmp_path: Path) -> None:
     (tmp_path / "plan.py").write_text(PLAN)
     for name, line in (("leaving", 16), ("leaving_in_a_task", 20)):

@@ -6,6 +6,8 @@ import pytest
 
 from tests.commands import one_line_of, pycrorm
 
+pytestmark = pytest.mark.slow
+
 PLAN = """
 from dataclasses import dataclass
 from pycrorm_async.plan import ActionAbstract

@@ -28,6 +28,8 @@ from pycrorm_async.queue import RecorderQueue, RecoveredQueue
 from pycrorm_async.store.log import EventLog
 from tests.backups import Backup
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 FAULTS = [
     "kill -9 of a recorder",
@@ -103,7 +105,6 @@ def test_the_list_of_faults_is_whole() -> None:
     assert re.findall(r'^ +Fault\("(.+?)"', (ROOT / "bench/faults.py").read_text(), re.MULTILINE) == FAULTS
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [
@@ -122,7 +123,6 @@ def test_the_quick_version_makes_every_fault_and_costs_nothing(names: list[str])
     assert all(each["told"] > 0 for each in outcomes if each["fault"] == "flipped bit")
 
 
-@pytest.mark.slow
 @pytest.mark.soak
 def test_a_run_goes_on_from_its_report_and_a_loss_in_it_is_a_problem(tmp_path: Path) -> None:
     arguments = ("--only", "clock", "--seed", "7", "--report", tmp_path / "faults.md")

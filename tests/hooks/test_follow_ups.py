@@ -38,6 +38,8 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.hooks.fakes import CarryActionPerformable, ListSink, NoteActionPerformable, Rig, findings, rigged
 
+pytestmark = pytest.mark.slow
+
 MAX = 100
 SMALL = Settings(episode_events_max=MAX)
 
@@ -310,7 +312,6 @@ async def test_a_world_with_more_objects_than_an_episode_has_events_is_not_conti
     assert rig.emitter.faults.total == 0
 
 
-@pytest.mark.slow
 def test_how_many_events_an_episode_may_have_is_checked() -> None:
     assert Settings().episode_events_max == SEQUENCE_MAX
     for wrong in (0, 99, SEQUENCE_MAX + 1, 150.5):

@@ -16,6 +16,8 @@ from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.world.enums import Arms
 from tests.learning.geometric_rollouts import frame_of
 
+pytestmark = pytest.mark.slow
+
 LEFT = Evidence(arms=frozenset({Arms.LEFT}))
 SQUARE = Rectangle(0.0, 1.0, 0.0, 1.0)
 BESIDE = Evidence(region=Region((SQUARE,)), height=(-0.1, 0.1))
@@ -32,7 +34,6 @@ def learned(choices: list[PickUpChoice]) -> Policy:
     return learn(frame_of(choices).assign(height=heights), min_samples_leaf=2)
 
 
-@pytest.mark.slow
 def test_a_tree_has_more_leaves_than_python_nests_calls(learned: Policy, choices: list[PickUpChoice]) -> None:
     assert len(learned.leaves) > sys.getrecursionlimit()
     assert learned.coverage(choices) == 1.0

@@ -33,6 +33,8 @@ from pycrorm_async.world import Grasp, ObjectType
 from pycrorm_async.world.robots.robot_description import Limits
 from tests.learning.geometric_rollouts import works
 
+pytestmark = pytest.mark.slow
+
 PATIENT = Settings(flush_timeout_s=60)
 
 
@@ -50,7 +52,6 @@ async def frame_of(memory: Memory, *, seed: int = 69, policy: Policy | None = No
     )
 
 
-@pytest.mark.slow
 async def test_default_rollouts_succeed_as_often_as_in_the_thesis_and_never_from_the_top() -> None:
     """15.77 % there; two standard errors of 5,000 are one percent."""
     tried: Counter[Grasp] = Counter()
@@ -72,13 +73,11 @@ async def test_default_rollouts_succeed_as_often_as_in_the_thesis_and_never_from
         assert 0.18 < done[grasp] / tried[grasp] < 0.25
 
 
-@pytest.mark.slow
 async def test_within_hard_limits_twice_as_many_succeed() -> None:
     tally = await rolled_out(2_000, scene=Scene(limits=Limits.HARD))
     assert 0.27 < tally.success_rate < 0.33
 
 
-@pytest.mark.slow
 async def test_every_rollout_ends_as_geometry_and_inverse_kinematics_alone_say() -> None:
     ends: list[int] = []
     await rolled_out(400, seed=7, tell=lambda tally: ends.append(tally.successes))
@@ -86,7 +85,6 @@ async def test_every_rollout_ends_as_geometry_and_inverse_kinematics_alone_say()
     assert np.diff([0, *ends]).astype(bool).tolist() == expected
 
 
-@pytest.mark.slow
 async def test_seed_and_index_make_a_rollout_in_whatever_pieces_and_world_it_is_done() -> None:
     whole: list[int] = []
     await rolled_out(120, tell=lambda tally: whole.append(tally.successes))
@@ -103,7 +101,6 @@ async def test_seed_and_index_make_a_rollout_in_whatever_pieces_and_world_it_is_
     assert (await rolled_out(120, seed=70)).successes != 0
 
 
-@pytest.mark.slow
 async def test_what_is_remembered_is_what_was_counted_with_the_stage_each_failed_at(
     database_url: str, tmp_path: Path
 ) -> None:
@@ -221,7 +218,6 @@ async def test_what_is_interrupted_in_the_middle_does_not_count_and_is_done_agai
         assert [(each.first, each.count, each.seed) for each in batches] == [(0, 10, 69), (4, 6, 69)]
 
 
-@pytest.mark.slow
 async def test_rollouts_that_were_done_twice_count_once(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         for first, count in ((0, 20), (10, 20)):
@@ -230,7 +226,6 @@ async def test_rollouts_that_were_done_twice_count_once(tmp_path: Path) -> None:
         assert frame["index"].tolist() == list(range(30))
 
 
-@pytest.mark.slow
 @pytest.mark.soak  # test_experiment learns from a memory too
 async def test_a_policy_is_learned_from_the_memory_and_does_better(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:

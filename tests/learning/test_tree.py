@@ -23,6 +23,8 @@ from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.world.enums import Arms, Grasp
 from tests.learning.geometric_rollouts import frame_of, works
 
+pytestmark = pytest.mark.slow
+
 LEFT = Evidence(arms=frozenset({Arms.LEFT}))
 ALIKE = {"arm": ["LEFT"] * 30, "grasp": ["FRONT"] * 30, "object_x": [0.5] * 30, "object_y": [0.1] * 30}
 
@@ -90,7 +92,6 @@ def test_all_it_learned_from_is_possible_and_what_never_went_well_is_not(
         learned.condition(Evidence(grasps=frozenset({Grasp.TOP})))
 
 
-@pytest.mark.slow
 def test_likelihoods_are_those_of_pyjpt(learned: Policy, oracle: Any, successes: list[PickUpChoice]) -> None:
     choices = [*successes, *learned.sample(np.random.default_rng(2), 200)]
     coded = frame_of(choices).assign(
@@ -115,7 +116,6 @@ def test_the_leaves_are_those_of_pyjpt_in_the_same_order_and_to_the_digit(learne
     assert ours == theirs
 
 
-@pytest.mark.slow
 def test_probabilities_and_conditioned_ones_are_those_of_pyjpt(learned: Policy, oracle: Any) -> None:
     from jpt.base.intervals import ContinuousSet
 
@@ -131,7 +131,6 @@ def test_probabilities_and_conditioned_ones_are_those_of_pyjpt(learned: Policy, 
             assert ours.probability(known) == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-@pytest.mark.slow
 def test_a_hundred_generators_never_fail_and_repeat_themselves(learned: Policy) -> None:
     region = Region((Rectangle(-0.9, 0.0, -0.9, 0.9), Rectangle(0.0, 0.9, 0.2, 0.9)))
     conditioned = learned.condition(Evidence(frozenset({Arms.RIGHT}), frozenset({Grasp.LEFT, Grasp.FRONT}), region))
@@ -160,7 +159,6 @@ def test_learning_again_gives_the_same_policy(learned: Policy, successes: list[P
     assert learn(frame_of(successes)) == learned
 
 
-@pytest.mark.slow
 def test_what_was_learned_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
     from tests.learning.test_policy_file import ELSEWHERE
 
@@ -189,7 +187,6 @@ assert not changed, changed
 """
 
 
-@pytest.mark.slow
 def test_the_first_learning_of_a_process_changes_nothing_else_in_it() -> None:
     done = subprocess.run([sys.executable, "-c", FIRST_OF_ALL], check=False, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

@@ -38,6 +38,8 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Po
 from tests.promises.chronicle import joints_of_bullet, numbers
 from tests.promises.lab import WITHIN_REACH, FailingActionPerformable, lab, url_of
 
+pytestmark = pytest.mark.slow
+
 ARM = "l_gripper_tool_frame"
 
 

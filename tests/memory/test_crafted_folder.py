@@ -21,7 +21,7 @@ from tests.queue.factories import Author, ended, episode, node, started
 from tests.queue.forged_segments import change_a_frame
 from tests.writer.writer_threads import until
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
 
 STORED = "SELECT count(*) FROM event"
@@ -80,7 +80,6 @@ async def test_a_plan_that_starts_beside_them_adopts_the_next_folder(
     assert len([each for each in caplog.records if each.levelno >= logging.WARNING]) == 1
 
 
-@pytest.mark.slow
 def test_every_verb_says_it_in_one_line(tmp_path: Path, spool: Path, crafted: Author, whole: Author) -> None:
     (spool / os.fsdecode(b"\xff")).touch()
     crafted_folder, url = crafted.folder, f"sqlite:///{tmp_path / 'memory.db'}"
@@ -104,7 +103,6 @@ def test_every_verb_says_it_in_one_line(tmp_path: Path, spool: Path, crafted: Au
     assert ask(url, STORED) == [(2,)]
 
 
-@pytest.mark.slow
 async def test_an_episode_of_nonsense_is_stopped_and_the_one_beside_it_is_in_the_tables(
     database_url: str, spool: Path
 ) -> None:

@@ -21,12 +21,13 @@ from tests.databases import Server, ask
 from tests.memory.note_actions import NoteActionPerformable
 from tests.store.factories import episode, run_of
 
+pytestmark = pytest.mark.slow
+
 IMPATIENT = Settings(flush_timeout_s=0.3, connect_timeout_s=60)
 RECORDER = "0190a000-0000-7000-8000-000000000001"
 NOTES = "SELECT count(*) FROM event WHERE type = 'NodeEnded'"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("replaced", [False, True])
 async def test_a_file_deleted_or_replaced_during_a_run_is_named_and_all_events_come_into_the_new_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, *, replaced: bool
@@ -67,7 +68,6 @@ async def _logged(caplog: pytest.LogCaptureFixture, text: str) -> None:
             await asyncio.sleep(0.02)
 
 
-@pytest.mark.slow
 async def test_events_of_a_database_that_was_made_anew_are_stored_by_rebind_and_not_before(
     database_url: str, server: Server, tmp_path: Path
 ) -> None:

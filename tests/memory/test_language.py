@@ -38,6 +38,8 @@ from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.memory.note_actions import NoteActionPerformable, url_of
 
+pytestmark = pytest.mark.slow
+
 
 def note(text: str) -> NoteActionPerformable:
     return NoteActionPerformable(text)

@@ -19,6 +19,7 @@ from tests.commands import environment
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 
+@pytest.mark.slow
 async def test_a_private_memory_answers_and_leaves_nothing_behind() -> None:
     place = Path("/dev/shm")
     before = {path.name for path in place.glob("pycrorm-*/")}
@@ -63,6 +64,7 @@ async def test_an_exception_of_the_plan_leaves_the_memory_unchanged_and_is_recor
             assert metadata.failure_message == "spilled"
 
 
+@pytest.mark.slow
 async def test_a_cancelled_node_says_so(tmp_path: Path) -> None:
     @dataclass
     class WaitActionPerformable(ActionAbstract):

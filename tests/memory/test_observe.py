@@ -20,6 +20,8 @@ from pycrorm_async.plan import ActionAbstract, PlanFailure
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from tests.databases import ask
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass
 class SayActionPerformable(ActionAbstract):

@@ -28,6 +28,8 @@ from pycrorm_async.plan.execution.observer import recorder
 from tests.commands import answer
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
+pytestmark = pytest.mark.slow
+
 
 async def test_a_memory_that_is_not_open_says_how_to_open_it(tmp_path: Path) -> None:
     memory = Memory.open(url_of(tmp_path))
@@ -59,7 +61,6 @@ async def test_bad_addresses_are_refused_with_their_class(tmp_path: Path) -> Non
     assert recorder.get() is None
 
 
-@pytest.mark.slow
 async def test_a_spool_belongs_to_one_database_while_anything_is_in_it(tmp_path: Path) -> None:
     spool = tmp_path / "spool"
     async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=spool):
@@ -77,7 +78,6 @@ async def test_a_spool_belongs_to_one_database_while_anything_is_in_it(tmp_path:
         assert await texts(memory) == ["b"]
 
 
-@pytest.mark.slow
 async def test_a_flush_that_cannot_reach_the_database_gives_up_and_loses_nothing(tmp_path: Path) -> None:
     settings = Settings(flush_timeout_s=0.3)
     async with Memory.open(url_of(tmp_path), settings=settings) as memory:
@@ -102,7 +102,6 @@ async def flushed(memory: Memory) -> None:
                 return await memory.flush()
 
 
-@pytest.mark.slow
 async def test_a_type_that_contradicts_the_tables_parks_its_episode_with_both_types_named(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)):
         await NoteActionPerformable("text").perform()
@@ -127,7 +126,6 @@ async def test_a_type_that_contradicts_the_tables_parks_its_episode_with_both_ty
         assert await texts(memory) == ["text", "later"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
@@ -194,7 +192,6 @@ async def test_a_parked_episode_is_told_once(tmp_path: Path) -> None:
         assert memory.status.faults.total == 0
 
 
-@pytest.mark.slow
 async def test_a_table_of_the_users_own_in_the_way_is_named_and_parks_that_type_until_it_is_renamed(
     tmp_path: Path,
 ) -> None:
@@ -213,7 +210,6 @@ async def test_a_table_of_the_users_own_in_the_way_is_named_and_parks_that_type_
         assert await texts(memory) == ["a"]
 
 
-@pytest.mark.slow
 async def test_closing_logs_a_parked_episode_and_raises_nothing_over_a_plan_that_succeeded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -27,6 +27,8 @@ from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.commands import environment
 from tests.memory.note_actions import url_of
 
+pytestmark = pytest.mark.slow
+
 STEPS = 20
 SAMPLED = Settings(sample_interval_ms=2)
 
@@ -92,7 +94,6 @@ async def test_a_trajectory_is_remembered_with_its_values_and_times(tmp_path: Pa
         assert value in stations[max(0, so_far - 1) : so_far + 2]
 
 
-@pytest.mark.slow
 async def test_the_state_at_any_moment_is_what_was_written_last_of_each_channel(tmp_path: Path) -> None:
     """Over several motions and robots' parts: after each motion the samples up to its end say how the robot stood."""
     stood: list[dict[str, float]] = []
@@ -146,7 +147,6 @@ async def test_a_memory_that_is_closed_in_the_midst_of_a_motion_takes_its_thread
         assert require_robot().body.pose == Pose([1, 0, 0])
 
 
-@pytest.mark.slow
 def test_a_forked_child_goes_on_without_sampling_and_the_parent_with_it(tmp_path: Path) -> None:
     script = (
         "import asyncio, os, sys, threading, warnings\n"

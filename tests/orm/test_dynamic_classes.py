@@ -35,7 +35,7 @@ from tests.commands import environment
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 CAREFUL = declared(
@@ -230,7 +230,6 @@ async def test_two_memories_with_types_of_one_name_do_not_meet(log: EventLog, tm
         await other.close()
 
 
-@pytest.mark.slow
 async def test_disposed_classes_leave_nothing_behind(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     identities = dict(Designator.__mapper__.polymorphic_map)
@@ -311,7 +310,6 @@ configure_mappers()
 """
 
 
-@pytest.mark.slow
 def test_a_class_that_is_gone_before_anything_was_asked_is_in_nobodys_way() -> None:
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", IN_A_NEW_PROCESS]

@@ -15,6 +15,8 @@ from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 from pycrorm_async.store.log import EventLog
 from tests.projections.sql_queries import stored_and_folded
 
+pytestmark = pytest.mark.slow
+
 EXPRESSIONS = [Sequential, TryInOrder, Parallel, TryAll, Repeat, Monitor, Code, Retry]
 COLUMNS = {
     "Repeat": {"times"},

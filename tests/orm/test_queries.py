@@ -72,6 +72,8 @@ from tests.projections.event_script import (
 )
 from tests.projections.sql_queries import stored_and_folded
 
+pytestmark = pytest.mark.slow
+
 OPEN = declared("OpenAction", "open_action", field("object_designator", "object", 2), field("arm", "enum", 3))
 MOVE_JOINTS = declared(
     "MoveJointsMotion",

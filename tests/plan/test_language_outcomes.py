@@ -461,6 +461,7 @@ async def test_a_dropped_plan_cancels_its_branches() -> None:
     assert asyncio.all_tasks() == before
 
 
+@pytest.mark.slow
 async def test_failed_expressions_leave_nothing_for_the_garbage_collector() -> None:
     async def plan() -> None:
         fails = [Step("x", fails=ObjectLost("gone")), Step("y", fails=PlanFailure("no"))]

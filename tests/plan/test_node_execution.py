@@ -21,6 +21,8 @@ from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collected_tree, current_node
 from tests.plan.fake_observer import Recording
 
+pytestmark = pytest.mark.slow
+
 
 class Abort(BaseException):
     """Not an Exception."""
@@ -339,7 +341,6 @@ async def test_a_failed_perform_leaves_nothing_for_the_garbage_collector() -> No
         gc.enable()
 
 
-@pytest.mark.slow
 async def test_a_plan_of_a_hundred_thousand_performs_keeps_memory_flat() -> None:
     class Many(ActionAbstract):
         async def perform(self) -> None:

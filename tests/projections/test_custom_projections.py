@@ -33,7 +33,7 @@ from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, mixed, name_of, row
 from tests.projections.sql_queries import ask, names
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 _TRIES = table("grasp_try", column("arm"), column("status"))
@@ -104,7 +104,6 @@ async def rebuilt(log: EventLog, projection: Projection) -> None:
         assert await clear(log) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("batch_events", [1, 3, 10_000])
 async def test_its_rows_are_what_happened_however_many_events_are_folded_at_once(
     log: EventLog, batch_events: int
@@ -162,7 +161,6 @@ async def test_a_declaration_that_cannot_be_read_stops_nothing_else(log: EventLo
     assert await ask(log, "SELECT * FROM grasp_try ORDER BY id") == rows_of(1)
 
 
-@pytest.mark.slow
 async def test_two_that_fold_at_once_show_every_event_once(log: EventLog) -> None:
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 21)))]
     await folded(log, records)
@@ -184,7 +182,6 @@ class NoLeftHand(GraspRate):
             raise ZeroDivisionError("no right hand")
 
 
-@pytest.mark.slow
 async def test_a_fold_that_raises_stops_its_episode_there_and_nowhere_else(
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -241,7 +238,6 @@ async def test_rebuilt_it_is_what_it_was_live(log: EventLog) -> None:
     assert await shown(log) == [*rows_of(1), *rows_of(2), *rows_of(3)]
 
 
-@pytest.mark.slow
 async def test_a_rebuild_of_our_tables_leaves_it_as_it_is(log: EventLog) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2, simulated=True))], GraspRate())
     async with claimed(log):
@@ -251,7 +247,6 @@ async def test_a_rebuild_of_our_tables_leaves_it_as_it_is(log: EventLog) -> None
     assert await shown(log) == rows_of(1)
 
 
-@pytest.mark.slow
 async def test_a_rebuild_that_broke_off_is_taken_up(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], GraspRate())
     monkeypatch.setattr("pycrorm_async.projections.rebuild._BATCH_EVENTS", 5)
@@ -382,7 +377,6 @@ def test_a_projection_that_cannot_be_is_refused_at_once(attributes: dict[str, An
         Memory.open("sqlite://", projections=[kind()])
 
 
-@pytest.mark.slow
 async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -449,7 +443,6 @@ def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
         asyncio.run(fold())
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("rebuilding", [False, True])
 async def test_killed_in_the_middle_it_goes_on_where_it_was(
     log: EventLog, database_url: str, *, rebuilding: bool

@@ -11,6 +11,8 @@ from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.schema.layout import Layout, LayoutConflict, Leaf
 from tests.projections.event_script import PICK_UP, SAYING, declared, field
 
+pytestmark = pytest.mark.slow
+
 
 def layout_of(*types: DesignatorTypeDeclared) -> Layout:
     layout = Layout()

@@ -10,6 +10,8 @@ from pycrorm_async import Memory
 from pycrorm_async.operations.rebuild import rebuild_memory
 from tests.databases import Server, ask, ask_to_change
 
+pytestmark = pytest.mark.slow
+
 VIEW = 'SELECT arm, relative_x FROM "PickUpWithContextView" WHERE {}'
 
 

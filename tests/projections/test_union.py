@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import pytest
+
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.schema.layout import Layout, unite
 from tests.projections.event_script import declared, field, name_of
+
+pytestmark = pytest.mark.slow
 
 TEXT = declared("NoteAction", "note_action", field("text", "text", 2))
 NUMBER = declared("NoteAction", "note_action", field("text", "integer", 2), field("weight", "real", 3))

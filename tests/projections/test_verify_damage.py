@@ -29,7 +29,7 @@ from tests.projections.verify_cases import (
     shown,
 )
 
-pytestmark = pytest.mark.soak_on("postgresql")
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """On a server these take long; there they run in turns, and other modules show that it answers alike."""
 
 TRIGGERS = "SELECT name FROM sqlite_master WHERE type = 'trigger'"
@@ -79,7 +79,6 @@ ENDED = "UPDATE event SET (type, payload) = (SELECT type, payload FROM event WHE
 CANNOT = "is in the tables, and cannot be folded:"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "reasons"),
     [
@@ -160,7 +159,6 @@ async def test_another_value_in_a_payload_is_a_difference_of_the_tables(
     assert found.differences[1][4:] == ("camera", "world_state")
 
 
-@pytest.mark.slow
 async def test_declarations_that_were_swapped_or_changed_are_told(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -264,7 +262,6 @@ async def test_a_page_of_the_log_that_was_overwritten_is_told_by_episode_and_eve
     assert file.read_bytes() == image
 
 
-@pytest.mark.slow
 async def test_whatever_bytes_are_flipped_there_is_an_answer_and_never_a_traceback(file: Path, tmp_path: Path) -> None:
     dice = random.Random(7)
     whole = file.read_bytes()

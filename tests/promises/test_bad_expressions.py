@@ -29,6 +29,8 @@ from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.lab import lab, nodes_of, remembered, statuses
 
+pytestmark = pytest.mark.slow
+
 well: Any = NoteActionPerformable("well")
 nothing: Any = 7
 """Any, for what is written with them here a type checker would refuse."""
@@ -62,7 +64,6 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", WRONG)
 async def test_a_plan_put_together_wrongly_is_a_failure_that_says_why(tmp_path: Path, name: str) -> None:
     made, why = WRONG[name]
@@ -125,7 +126,6 @@ async def test_a_retry_goes_on_where_a_pose_is_out_of_reach(tmp_path: Path) -> N
         assert node.failure_arguments[1:3] == ["RIGHT", "r_gripper_tool_frame"]
 
 
-@pytest.mark.slow
 async def test_several_failures_at_once_are_remembered_with_each_of_them(tmp_path: Path) -> None:
     bowl = BelieveObject("bowl", ObjectType.BOWL, Pose([1, 0, 1]))
     async with remembered(tmp_path):

@@ -36,6 +36,8 @@ from tests.databases import ask, ask_to_change
 from tests.store.factories import declaration, episode, run_of
 from tests.table_comparison import differences, tables_of
 
+pytestmark = pytest.mark.slow
+
 GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
 
 
@@ -136,7 +138,6 @@ async def every_event(request: pytest.FixtureRequest, golden: str) -> str:
     return url
 
 
-@pytest.mark.slow
 async def test_a_memory_of_the_first_version_shows_what_it_held_and_its_spool_is_adopted(every_event: str) -> None:
     t0 = 1_700_000_000_000_000
     assert ask(every_event, "SELECT number, head, folded, parked, refused FROM episode ORDER BY 1") == [
@@ -223,7 +224,6 @@ async def test_who_has_the_log_open_goes_on_when_a_newer_program_brings_it_up_to
 # --- a designator whose fields changed ------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 async def test_a_field_that_was_added_is_null_in_old_rows_and_one_that_was_removed_in_new_ones(golden: str) -> None:
     greet = greeting(whom=str | None, language=str, loudness=float)  # `hand` is gone, `whom` is optional
     await performed(golden, greet(None, "en", 1.0))
@@ -260,7 +260,6 @@ async def test_a_class_that_keeps_its_dtype_keeps_its_rows(golden: str) -> None:
     assert await shown(golden, HelloActionPerformable, "whom") == expected
 
 
-@pytest.mark.slow
 async def test_a_class_with_an_alias_shows_what_was_recorded_under_either_name(golden: str) -> None:
     await performed(golden, WelcomeActionPerformable("Eve", Arms.BOTH, "en"))
     expected = [
@@ -344,7 +343,6 @@ REBUILD = (
 )
 
 
-@pytest.mark.slow
 async def test_while_tables_are_those_of_an_older_fold_events_are_recorded_and_shown_once_they_are_rebuilt(
     golden: str,
 ) -> None:

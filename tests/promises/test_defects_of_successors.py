@@ -49,6 +49,8 @@ from tests.promises.lab import (
     turned,
 )
 
+pytestmark = pytest.mark.slow
+
 DEFECTS = {
     "s1": "test_every_node_of_a_sequence_has_its_own_status_and_times",
     "s2": "test_the_state_after_an_action_is_not_the_state_before_it",
@@ -174,7 +176,6 @@ def play(world: BulletWorld, row: Any) -> None:
         world.object(row.name).set_pose(Pose(at(row.pose), turned(row.pose)))
 
 
-@pytest.mark.slow
 async def test_every_stored_node_can_be_read_back_as_what_it_was(tmp_path: Path) -> None:
     performed: list[Any] = [
         ParkArmsActionPerformable(Arms.BOTH),
@@ -264,7 +265,6 @@ async def test_expressions_have_times(tmp_path: Path) -> None:
         assert expression.start_time <= inside[0].start_time
 
 
-@pytest.mark.slow
 def test_what_is_imported_is_declared_and_nothing_is_generated() -> None:
     root = Path(pycrorm_async.__file__).parent
     project = tomllib.loads((root.parent / "pyproject.toml").read_text())["project"]

@@ -18,6 +18,8 @@ from pycrorm_async.world import Arms, Pose
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.lab import FailingActionPerformable, asked, lab, nodes_of, remembered, statuses
 
+pytestmark = pytest.mark.slow
+
 DEFECTS = {
     "a": "test_a_failure_deep_inside_an_expression_fails_all_of_it",
     "b": "test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested",

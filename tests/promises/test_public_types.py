@@ -10,6 +10,8 @@ import pytest
 
 from tests.commands import environment
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent.parent
 PROGRAM = """\
 from collections.abc import Sequence
@@ -75,7 +77,6 @@ def checked(folder: Path, program: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
 
 
-@pytest.mark.slow
 def test_a_program_of_a_user_is_typed_and_its_mistakes_are_found(tmp_path: Path) -> None:
     done = checked(tmp_path, PROGRAM)
     assert done.stdout.startswith("Success: no issues found in 1 source file"), done.stdout

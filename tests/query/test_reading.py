@@ -95,6 +95,7 @@ async def test_the_overview_has_a_line_for_every_episode(reading: Reading) -> No
     assert await reading.episodes() == [first, second]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "number"),
     [("1", 1), ("2", 2), ("last", 2), ("00000000-0000-7000-8000-000000000001", 1)],
@@ -141,6 +142,7 @@ async def test_a_task_tree_is_told_parents_first_with_depths_and_durations(readi
     assert await reading.tree(9) == []
 
 
+@pytest.mark.slow
 async def test_a_session_knows_classes_for_every_type_in_the_memory(reading: Reading) -> None:
     async with reading.session() as session:
         actions = (
@@ -248,6 +250,7 @@ async def test_without_pandas_the_extra_is_named(reading: Reading, monkeypatch: 
         await reading.dataframe(select(Pose))
 
 
+@pytest.mark.slow
 async def test_a_fresh_memory_has_no_episodes(log: EventLog) -> None:
     await Projector(log).open()
     async with Reading.open_address(log.address) as opened:

@@ -94,6 +94,7 @@ async def test_batches_keep_to_their_limits_computed_ends_included(author: Autho
 # --- torn ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("filling", [b"\0", b"\xff", b"\x01"])
 async def test_torn_at_any_byte_of_what_was_not_synced_keeps_all_whole_records_before(
     author: Author, filling: bytes

@@ -258,6 +258,7 @@ async def test_a_queue_that_is_closed_while_no_folder_can_be_made_ends_and_says_
     queue.release()
 
 
+@pytest.mark.slow
 async def test_threads_that_put_meanwhile_leave_no_gap_but_what_is_named(tmp_path: Path) -> None:
     queue = make(tmp_path / "spool", settings=replace(ROOMY, sync_interval_ms=1, spool_bytes_max=2**23))
     begin = threading.Barrier(3)

@@ -20,6 +20,8 @@ from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from pycrorm_async.settings import FileAccess
 from tests.memory.note_actions import NoteActionPerformable
 
+pytestmark = pytest.mark.slow
+
 EPISODE = parse_episode_id("0190a000-0000-7000-8000-000000000002")
 
 
@@ -68,7 +70,6 @@ async def test_every_file_has_the_mode_that_was_chosen(
             assert not segment.exists()
 
 
-@pytest.mark.slow
 async def test_an_older_spool_works_on_and_what_is_new_in_it_is_for_its_owner(tmp_path: Path) -> None:
     spool = tmp_path / "memory.db.spool"
     spool.mkdir()

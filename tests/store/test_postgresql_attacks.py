@@ -27,6 +27,8 @@ from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask
 
+pytestmark = pytest.mark.slow
+
 PAYLOAD = """
 CREATE FUNCTION memory_tables.payload() RETURNS void LANGUAGE plpgsql AS $$
 BEGIN

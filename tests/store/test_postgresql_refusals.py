@@ -149,6 +149,7 @@ async def test_a_user_without_rights(server: Server, guarded: str, caplog: pytes
         assert str(error).endswith("permission denied for schema pycrorm")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("create", [True, False])
 async def test_a_schema_of_another_program_is_left_alone(
     server: Server, create: bool, caplog: pytest.LogCaptureFixture

@@ -24,6 +24,8 @@ from pycrorm_async.store.schema import Birth, make_or_migrate
 from tests.databases import Server, ask
 from tests.store.factories import declaration, episode, record, run_of
 
+pytestmark = pytest.mark.slow
+
 TABLES = (
     "SELECT relname FROM pg_class WHERE relnamespace = 'pycrorm'::regnamespace AND relkind IN ('r', 'S') ORDER BY 1"
 )
@@ -131,7 +133,6 @@ asyncio.run(main())
 """
 
 
-@pytest.mark.slow
 def test_eight_processes_that_open_a_new_database_at_once_agree_on_one_log_and_one_set_of_tables(
     server: Server,
 ) -> None:
@@ -188,7 +189,6 @@ async def roles(server: Server, database_url: str) -> dict[str, str]:
 CANNOT = "permission denied"
 
 
-@pytest.mark.slow
 async def test_a_recorder_appends_and_cannot_fold(roles: dict[str, str], database_url: str) -> None:
     log = await EventLog.open(DatabaseAddress.parse(roles["recorder"]), create=True)
     new = [declaration(b'{"dtype":"A"}'), *run_of(episode(2), 1, 5)]
@@ -220,7 +220,6 @@ async def test_a_folder_appends_and_folds_also_what_another_folder_made(
             ask(roles["folder"], statement)
 
 
-@pytest.mark.slow
 async def test_a_reader_reads_log_tables_and_views_also_those_made_later_and_writes_nothing(
     roles: dict[str, str], database_url: str
 ) -> None:
@@ -241,7 +240,6 @@ async def test_a_reader_reads_log_tables_and_views_also_those_made_later_and_wri
     await log.close()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("role", ["recorder", "folder", "reader"])
 async def test_no_role_can_change_or_delete_what_was_appended(
     roles: dict[str, str], role: str, database_url: str
@@ -282,7 +280,6 @@ async def test_two_that_append_the_same_episode_at_once_store_it_once(database_u
         await each.close()
 
 
-@pytest.mark.slow
 async def test_sixteen_that_append_different_episodes_at_once_lose_nothing_and_share_no_number(
     database_url: str,
 ) -> None:
@@ -348,7 +345,6 @@ async def test_two_that_append_the_same_episodes_in_opposite_order_do_not_wait_i
     await log.close()
 
 
-@pytest.mark.slow
 async def test_nothing_is_skipped_when_an_earlier_number_is_committed_later(database_url: str) -> None:
     address = DatabaseAddress.parse(database_url)
     log = await EventLog.open(address, create=True)

@@ -83,6 +83,7 @@ async def test_a_parked_episode_is_not_behind_but_still_takes_events(log: EventL
     assert await log.stopped() == []
 
 
+@pytest.mark.slow
 async def test_an_episode_row_says_all_that_is_known(log: EventLog) -> None:
     await log.append([record(episode(1), 1, wall_ns=10), record(episode(1), 2, wall_ns=20, kind="EpisodeEnded")])
     assert await log.episodes() == [EpisodeRow(1, "00000000-0000-0000-0000-000000000001", 2, 0, 10, 20, None, None)]

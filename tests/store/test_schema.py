@@ -17,6 +17,8 @@ from pycrorm_async.store.sqlite.tables import MIGRATIONS
 from tests.databases import ask
 from tests.store.factories import declaration, episode, run_of
 
+pytestmark = pytest.mark.slow
+
 ALL_OF_IT = "SELECT type, name, sql FROM sqlite_master ORDER BY type, name"
 
 
@@ -168,7 +170,6 @@ async def test_reading_does_not_bring_an_older_log_up_to_date(address: DatabaseA
     await engine.dispose()
 
 
-@pytest.mark.slow
 def test_many_processes_that_open_a_new_log_at_once_agree_on_one(tmp_path: Path) -> None:
     script = """
 import asyncio, sys
@@ -210,7 +211,6 @@ async def test_whoever_opens_a_new_log_waits_for_another_who_does(address: Datab
     assert ask(address.path, "PRAGMA journal_mode") == [("wal",)]
 
 
-@pytest.mark.slow
 async def test_logs_that_four_open_at_once_are_there_for_all_of_them(tmp_path: Path) -> None:
     for number in range(100):
         address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/{number}.db")

@@ -103,6 +103,7 @@ def test_a_folder_without_a_mark_is_swept_only_while_it_is_empty(tmp_path: Path)
         assert not (tmp_path / f"{prefix}empty").exists()
 
 
+@pytest.mark.slow
 def test_many_processes_that_make_and_sweep_at_once_each_have_a_folder(tmp_path: Path) -> None:
     script = """
 import sys

@@ -36,6 +36,8 @@ from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.robots.robot_description import PR2
 from tests.plan.conftest import Scene
 
+pytestmark = pytest.mark.slow
+
 LEFT_TOOL = "l_gripper_tool_frame"
 MILK = ObjectDesignatorDescription(["milk"])
 

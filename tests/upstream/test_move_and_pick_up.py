@@ -11,6 +11,8 @@ from pycrorm_async.learning import Evidence, MoveAndPickUp, PickUpChoice, Rectan
 from pycrorm_async.plan import PlanFailure, Retry
 from tests.plan.conftest import Scene
 
+pytestmark = pytest.mark.slow
+
 
 def test_create_model() -> None:
     """Nothing is where the object stands; four variables."""

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from pycrorm_async.plan import ObjectDesignatorDescription
 from pycrorm_async.world import ObjectType, Pose
 from tests.plan.conftest import Scene
+
+pytestmark = pytest.mark.slow
 
 
 def test_object_grounding(scene: Scene) -> None:

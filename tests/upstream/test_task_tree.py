@@ -37,6 +37,7 @@ async def test_tree_creation(scene: Scene) -> None:
     assert {node.status for node in tree} == {TaskStatus.SUCCEEDED}
 
 
+@pytest.mark.slow
 async def test_exception(tmp_path: Path) -> None:
     with pytest.raises(PlanFailure):
         async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
@@ -76,6 +77,7 @@ async def test_simulated_tree(scene: Scene) -> None:
     assert scene.robot.joint_position("torso_lift_joint") == 0.0
 
 
+@pytest.mark.slow
 async def test_to_sql(tmp_path: Path) -> None:
     """Every node of the tree has its row, which says the same of it."""
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():

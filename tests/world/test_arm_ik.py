@@ -47,6 +47,7 @@ def model(tmp_path: Path) -> Iterator[LoadedModel]:
     loaded.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limits", Limits)
 @pytest.mark.parametrize("arm", ARMS)
 def test_whatever_a_posture_within_limits_reaches_is_solved_exactly_within_limits(arm: Arms, limits: Limits) -> None:
@@ -297,6 +298,7 @@ def picked_up(limits: Limits, *, attempts: int) -> tuple[float, dict[Grasp, floa
     return 100 * done.total() / attempts, {grasp: 100 * done[grasp] / tried[grasp] for grasp in Grasp}
 
 
+@pytest.mark.slow
 def test_hard_limits_double_the_default_policys_success_and_allow_grasps_from_above() -> None:
     soft, soft_by_grasp = picked_up(Limits.SOFT, attempts=2000)
     hard, hard_by_grasp = picked_up(Limits.HARD, attempts=2000)
