@@ -1,4 +1,4 @@
-"""How far a node of the task tree got: the word that plans, tables and questions share."""
+"""Status of a node of the task tree: one enumeration for plans, tables and queries."""
 
 from __future__ import annotations
 

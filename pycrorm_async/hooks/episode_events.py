@@ -21,8 +21,8 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.hooks.values.texts import clean
 from pycrorm_async.hooks.values.value_snapshot import References, pose_value
+from pycrorm_async.plan.exceptions import is_plan_failure
 from pycrorm_async.plan.execution.observer import Candidate, Seen
-from pycrorm_async.plan.failures import is_plan_failure
 from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["EpisodeOpening", "episode_started", "location_resolved", "object_detected", "end_statuses"]

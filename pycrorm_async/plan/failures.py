@@ -21,8 +21,6 @@ from pycrorm_async.world.pose import Pose
 __all__ = [
     "PlanFailure",
     "PlanFailures",
-    "is_plan_failure",
-    "describe_error",
     "IKError",
     "ResourceDeadlock",
     "NotALanguageExpression",
@@ -127,32 +125,6 @@ class PlanFailures(PlanFailure, ExceptionGroup[Exception]):
         return PlanFailures(self.message, failures)
 
 
-def describe_error(error: BaseException) -> str:
-    """Describe an exception by class and message in one short line. Never raises.
-
-    >>> describe_error(ObjectLost("the gripper is empty"))
-    'ObjectLost: the gripper is empty'
-    """
-    name = type(error).__name__
-    try:
-        message = " ".join(str(error).split())
-    except Exception:  # noqa: BLE001  a user's __str__ may raise anything
-        return name
-    if len(message) > _DESCRIPTION_LENGTH_MAX:
-        message = f"{message[: _DESCRIPTION_LENGTH_MAX - 1]}…"
-    return f"{name}: {message}" if message else name
-
-
-_DESCRIPTION_LENGTH_MAX = 200
-
-
-def is_plan_failure(error: BaseException) -> bool:
-    """Return whether it is a plan failure, or a group of plan failures only (as a `TaskGroup` raises)."""
-    if isinstance(error, ExceptionGroup):
-        return all(map(is_plan_failure, error.exceptions))
-    return isinstance(error, PlanFailure)
-
-
 class IKError(PlanFailure):
     """The arm cannot bring its tool frame to the pose from the current pose of the base.
 
@@ -194,9 +166,6 @@ class ResourceDeadlock(PlanFailure):
         self.held_by = held_by
         self.wanted_by = wanted_by
         self.waits_for = waits_for
-
-
-# --- diagnoses ----------------------------------------------------------------------------------------------
 
 
 class NotALanguageExpression(PlanFailure):

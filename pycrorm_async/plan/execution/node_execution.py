@@ -41,10 +41,10 @@ from typing import TYPE_CHECKING, Any
 from weakref import ref
 
 from pycrorm_async.clock import monotonic_ns
+from pycrorm_async.plan.exceptions import is_plan_failure
 from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import Unstarted, called_performs
-from pycrorm_async.plan.failures import is_plan_failure
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collecting, current_node
 
 if TYPE_CHECKING:

@@ -22,8 +22,9 @@ from typing import Any, ClassVar, Self, TypeAlias
 
 from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.exceptions import describe_error
 from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
-from pycrorm_async.plan.failures import NotALanguageExpression, describe_error
+from pycrorm_async.plan.failures import NotALanguageExpression
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import Attempt, Outcome, attempt, combine_failures
 from pycrorm_async.plan.language.resource_arbiter import Arbiter

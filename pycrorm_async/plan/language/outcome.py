@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-from pycrorm_async.plan.failures import PlanFailures, describe_error, is_plan_failure
+from pycrorm_async.plan.exceptions import describe_error, is_plan_failure
+from pycrorm_async.plan.failures import PlanFailures
 
 __all__ = ["Attempt", "Outcome", "attempt", "combine_failures"]
 

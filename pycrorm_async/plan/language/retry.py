@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.failures import IllPosedGoalFailure, NotALanguageExpression, describe_error
+from pycrorm_async.plan.exceptions import describe_error
+from pycrorm_async.plan.failures import IllPosedGoalFailure, NotALanguageExpression
 from pycrorm_async.plan.language.expressions import Expression, perform_operand
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import attempt, combine_failures

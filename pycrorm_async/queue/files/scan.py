@@ -1,4 +1,4 @@
-"""Scan a dead recorder's segments: keep every record up to the first hole, and tell a torn tail from damage.
+"""Scan a dead recorder's segments: keep every record up to the first hole, and distinguish a torn tail from damage.
 
 **Theory of operation.** The scanning process holds `alive` and `drain`, so no segment changes during a scan, except
 where a report examines a living recorder. `SegmentScanner` reads one segment per step, the oldest first, and checks

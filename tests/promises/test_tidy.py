@@ -1,0 +1,75 @@
+"""Style as a test: sizes of files and folders, the first words of docstrings, and words that the glossary replaces."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent.parent / "pycrorm_async"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+LINES_MAX = 400
+MODULES_MAX = 12
+OPENINGS = ("What", "Who", "Where", "How", "Which", "Whether")
+REPLACED = re.compile(
+    r"\b(tells?|told|telling|hears?|heard|mends?|anew|lets? go|gives? up|gave up|puts? aside|goes on|went on"
+    r"|looks? round|whoever|nobody|somebody|things?)\b",
+    re.IGNORECASE,
+)
+"""Words of a private dialect: the glossary in the package's README has one word of the field for each concept."""
+
+
+def texts_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Docstrings, also those of constants, and messages: every string that is read as prose, with its line."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))):
+                yield node.lineno, text
+            case ast.Raise() | ast.Call():
+                for part in ast.walk(node):
+                    if isinstance(part, ast.Constant) and isinstance(part.value, str) and " " in part.value:
+                        yield part.lineno, part.value
+
+
+def without_code(text: str) -> str:
+    """The text without what is quoted as code, examples, and the names of arguments."""
+    text = re.sub(r"(?m)^\s*(>>>|\.\.\.).*$|^ +\w+(, \w+)*:", "", text)
+    return re.sub(r"``[^`]*``|`[^`]*`", "", text)
+
+
+def names_of(paths: list[Path]) -> list[str]:
+    return [str(each.relative_to(PACKAGE)) for each in paths]
+
+
+def test_no_file_is_longer_than_four_hundred_lines() -> None:
+    assert names_of([path for path in MODULES if len(path.read_text().splitlines()) > LINES_MAX]) == []
+
+
+def test_no_folder_but_that_of_the_verbs_has_more_than_twelve_modules() -> None:
+    folders = sorted({path.parent for path in MODULES} - {PACKAGE / "cli"})
+    crowded = [
+        folder
+        for folder in folders
+        if len([each for each in folder.glob("*.py") if each.stem[:2] != "__"]) > MODULES_MAX
+    ]
+    assert names_of(crowded) == []
+
+
+def test_every_module_has_a_docstring_that_opens_with_a_sentence() -> None:
+    openings = {path: (ast.get_docstring(ast.parse(path.read_text())) or "nothing").split()[0] for path in MODULES}
+    assert names_of([path for path, word in openings.items() if word in (*OPENINGS, "nothing")]) == []
+
+
+@pytest.mark.parametrize("folder", sorted({each.relative_to(PACKAGE).parts[0] for each in MODULES}))
+def test_prose_uses_the_words_of_the_glossary(folder: str) -> None:
+    replaced = [
+        f"{path.relative_to(PACKAGE)}:{line}: {match.group()}"
+        for path in MODULES
+        if path.relative_to(PACKAGE).parts[0] == folder
+        for line, text in texts_of(ast.parse(path.read_text()))
+        for match in REPLACED.finditer(without_code(text))
+    ]
+    assert sorted(set(replaced)) == []
