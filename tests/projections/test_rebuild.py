@@ -419,7 +419,7 @@ async def test_a_table_of_somebody_in_the_schema_of_the_views_is_one_line_and_st
     await store(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE TABLE memory.mine (a int)")
     for _ in range(2):
-        with pytest.raises(DatabaseError, match=r"memory\.mine is not of the memory.*: move it to another schema"):
+        with pytest.raises(DatabaseError, match=r"memory\.mine does not belong to the memory.*: move it to"):
             await rebuild_memory(
                 url, report_progress=lambda _what, done, _total: pytest.fail(f"told after {done} events")
             )
