@@ -34,7 +34,8 @@ async def drained_by(writer: Writer, url: str, spool: Path) -> AsyncIterator[Non
 async def until_noticed(memory: Memory) -> None:
     """The queue has moved; who waited for a sync meanwhile was told."""
     async with asyncio.timeout(60):
-        while "goes on in" not in (memory.status.spool_fault or ""):
+        while "continues in" not in (memory.status.spool_fault or ""):
+            await asyncio.sleep(0)  # `synced` need not suspend, and then no timeout could end this
             with suppress(SpoolUnavailable):
                 await memory.synced()
 
