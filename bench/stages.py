@@ -37,7 +37,7 @@ from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.plan_recorder import current_episode
-from pycrorm_async.hooks.values.value_snapshot import written
+from pycrorm_async.hooks.values.value_snapshot import encode_parameter
 from pycrorm_async.plan import BaseMotion
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.task_tree import TaskTreeNode
@@ -158,7 +158,7 @@ def _parts(action: NothingActionPerformable, queue: RecorderQueue) -> dict[str, 
     values = [(field, enum, getattr(action, field.name)) for field, _, enum in declared.fields]
 
     def parameters() -> dict[str, Any]:
-        return {field.name: written(field, enum, value, episode) for field, enum, value in values}
+        return {field.name: encode_parameter(field, enum, value, episode) for field, enum, value in values}
 
     start = NodeStarted("action", 2, declared.fingerprint, parameters(), world.robot())
     payload = encode(start)

@@ -67,5 +67,5 @@ def set_inside(variable: ConnectedVar[Any] | ContextVar[Any], value: object) -> 
         if variable.get() is value:
             with suppress(ValueError):
                 variable.reset(token)
-            if getattr(before, "over", False):
+            if getattr(before, "is_closed", False):
                 variable.set(None)

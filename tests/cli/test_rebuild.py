@@ -103,7 +103,9 @@ def test_interrupted_it_leaves_with_130_and_the_next_one_goes_on(tmp_path: Path,
     blocker = sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=60)
     while not ask(url, "SELECT 1 FROM pycrorm_generation WHERE projection = 'tables/making'"):
         time.sleep(0.001)
-    blocker.execute("BEGIN IMMEDIATE")  # nobody gets any further
+    blocker.execute("BEGIN IMMEDIATE")  # no process gets further now
+    # On a busy machine the rebuild may have made generation 2 visible before this lock; then the next one makes 3.
+    unfinished = ask(url, "SELECT generation FROM pycrorm_generation WHERE projection = 'tables/making'")
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the workers too
     output, errors = process.communicate(timeout=120)
     blocker.execute("ROLLBACK")
@@ -111,6 +113,6 @@ def test_interrupted_it_leaves_with_130_and_the_next_one_goes_on(tmp_path: Path,
     assert (process.returncode, output) == (130, ""), errors
     assert errors == "pycrorm: interrupted; all events recorded so far are kept\n"
     assert differences(before, tables_of(url)) == []
-    assert answer("rebuild", cwd=tmp_path)["generation"] == 2
+    assert answer("rebuild", cwd=tmp_path)["generation"] == (2 if unfinished else 3)
     assert differences(before, tables_of(url)) == []
     assert traces(url) == []
