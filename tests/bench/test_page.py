@@ -1,5 +1,7 @@
 """The page of all figures says what was measured, and whether it holds what the design promises."""
 
+import ast
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -116,3 +118,15 @@ def test_the_readme_shows_the_budgets_as_they_were_measured() -> None:
     budgets = measured[measured.index("| what | budget |") :].split("\n\n")[0]
     assert len(budgets.splitlines()) == 2 + len(BUDGETS)
     assert budgets in (ROOT / "bench" / "README.md").read_text()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "bench").rglob("*.py")), ids=lambda each: each.stem)
+def test_every_module_of_the_bench_imports_what_the_package_still_has(path: Path) -> None:
+    """Most scripts run on demand only, so a name that moved would be noticed by the next who measures."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("pycrorm_async"):
+            module = import_module(node.module)
+            for each in node.names:
+                if not hasattr(module, each.name):
+                    import_module(f"{node.module}.{each.name}")  # a module, or it is gone

@@ -114,7 +114,12 @@ class Progress:
             descriptor = os.open(folder / PROGRESS, flags)
         except (FileNotFoundError, NotADirectoryError):
             return None
-        if os.pread(descriptor, len(_MAGIC), 0) != _MAGIC or os.fstat(descriptor).st_size < _FILE_BYTES:
+        try:
+            is_ours = os.pread(descriptor, len(_MAGIC), 0) == _MAGIC and os.fstat(descriptor).st_size >= _FILE_BYTES
+        except OSError:
+            os.close(descriptor)
+            raise
+        if not is_ours:
             os.close(descriptor)
             return None
         return cls(descriptor)
