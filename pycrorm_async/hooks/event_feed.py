@@ -31,7 +31,7 @@ __all__ = ["BUFFER_EVENTS", "EventFeed", "EventStream", "Observation", "Recorded
 
 _log = logging.getLogger("pycrorm_async")
 BUFFER_EVENTS: Final = 10_000
-"""Bounds the events that wait for one observer: a second of the fastest plan, some 10 MB."""
+"""Bounds the events that wait for one observer: a second of a plan that records 10,000 events a second."""
 _LAST_EVENTS_S: Final = 5.0
 """Bounds how long closing a memory waits for a callback to process its buffer."""
 
