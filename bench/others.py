@@ -105,7 +105,7 @@ async def _drained(spool: Path, url: str) -> float:
         began = time.perf_counter()
         queue = open_dead(folder.path)
         assert queue is not None
-        await Drain(queue, destination, settings=settings).run()
+        await Drain(queue, destination.append, settings=settings).run()
         took = time.perf_counter() - began
         queue.release()
     return took

@@ -28,7 +28,7 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask
 from tests.store.factories import episode, run_of
-from tests.writer.fakes import CountingFold, KeptSource
+from tests.writer.fakes import KeptSource
 
 __all__ = [
     "lost_replies",
@@ -108,7 +108,7 @@ def cut_connections(server: Server) -> Callable[[int, random.Random, Path, Step]
             log = await EventLog.open(_through(proxy, url), create=True, busy_timeout_s=2.0)
             source = KeptSource(records, closed=True)
             settings = Settings(batch_events_max=_BATCH)
-            drain = Drain(source, CountingFold(log), settings=settings, backoff=_QUICKLY)
+            drain = Drain(source, log.append, settings=settings, backoff=_QUICKLY)
             running = asyncio.create_task(drain.run())
             for _ in range(rounds):
                 retries = drain.state.retries
@@ -154,7 +154,7 @@ def ended_servers(server: Server, *, killed: bool) -> Callable[[int, random.Rand
     async def drained(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> int:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True, busy_timeout_s=2.0)
         source = KeptSource(records, closed=True)
-        drain = Drain(source, CountingFold(log), settings=Settings(batch_events_max=_BATCH), backoff=_QUICKLY)
+        drain = Drain(source, log.append, settings=Settings(batch_events_max=_BATCH), backoff=_QUICKLY)
         running = asyncio.create_task(drain.run())
         forgotten = 0
         for round_ in range(1, rounds + 1):
@@ -194,7 +194,7 @@ def locked_files(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
         log = await EventLog.open(DatabaseAddress.parse(url), create=True, busy_timeout_s=0.005)
         drain = Drain(
             KeptSource(records, closed=True),
-            CountingFold(log),
+            log.append,
             settings=Settings(batch_events_max=_BATCH),
             backoff=_QUICKLY,
         )
@@ -232,7 +232,7 @@ def full_disks(rounds: int, rng: random.Random, folder: Path, step: Step) -> Out
         log = await EventLog.open(DatabaseAddress.parse(url), create=True)
         drain = Drain(
             KeptSource(records, closed=True),
-            CountingFold(log),
+            log.append,
             settings=Settings(batch_events_max=_BATCH),
             backoff=_QUICKLY,
         )

@@ -147,7 +147,7 @@ async def _drained(folder: Path, log: EventLog, rng: random.Random) -> None:
         if rng.random() < 0.5:
             recovered.check()
         settings = Settings(batch_events_max=rng.choice((1, 5, 100)))
-        drain = Drain(recovered, _Faulty(log, rng), settings=settings, backoff=_AT_ONCE)
+        drain = Drain(recovered, _Faulty(log, rng).append, settings=settings, backoff=_AT_ONCE)
         running = asyncio.create_task(drain.run())
         if attempt < 29 and rng.random() < 0.5:
             for _ in range(rng.randrange(40)):

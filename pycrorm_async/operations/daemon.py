@@ -89,7 +89,7 @@ async def serve(
             FoldWorkers(fold_workers, assignment, settings=settings, say=say, note=note, forked=forked)
         )
         tables: Tables = FoldWorkerTables(destination, workers) if fold_workers else destination
-        return await Daemon(tables, folders, settings=settings, say=say).run(leave)
+        return await Daemon(destination, tables, folders, settings=settings, say=say).run(leave)
 
 
 class _Note:

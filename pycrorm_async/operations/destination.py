@@ -35,7 +35,7 @@ _log = logging.getLogger("pycrorm_async")
 
 
 class LogAndTables:
-    """The log and the tables folded from it. Implements the writer's `Destination` and `Tables`.
+    """The log and the tables folded from it. Implements the writer's `Log`, `Destination` and `Tables`.
 
     While this process cannot use the tables, it appends events and folding raises `TablesForeign`.
     """

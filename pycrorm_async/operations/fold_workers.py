@@ -25,15 +25,13 @@ pid is never hit.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Literal, Self
 
 import msgspec
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError, DatabaseUnavailable
-from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.operations.fold_process import FoldProcess
 from pycrorm_async.operations.fold_worker import Assignment, Failure, FoldRest, Prepare, Request, Write
@@ -340,15 +338,6 @@ class FoldWorkerTables(Tables):
         self._pipeline = FoldPipeline(destination.log)
         self._has_news = True
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self._destination.append(records)
-
-    async def confirm(self) -> None:
-        await self._destination.confirm()
-
-    async def fold(self) -> int:
-        return await self._destination.fold()
-
     async def fold_next_batch(self) -> bool:
         if not self._workers.are_wanted:  # start processes only when there are events, to keep an idle daemon small
             self._workers.want(await self._pipeline.size())
@@ -364,9 +353,3 @@ class FoldWorkerTables(Tables):
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True
         return self._has_news
-
-    async def behind(self) -> Mapping[str, int]:
-        return await self._destination.behind()
-
-    async def stopped(self) -> Mapping[str, str]:
-        return await self._destination.stopped()

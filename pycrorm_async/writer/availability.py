@@ -1,16 +1,13 @@
-"""Report when a database becomes unavailable and available again, for a destination that forwards every call."""
+"""Report when a database becomes unavailable and available again."""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.writer.ports import Tables
 
-__all__ = ["AvailabilityMonitor", "is_notable"]
+__all__ = ["Availability", "is_notable"]
 
 _T = TypeVar("_T")
 _NOTABLE_S = 1.0
@@ -26,58 +23,35 @@ def is_notable(unanswered_s: float) -> bool:
     return unanswered_s >= _NOTABLE_S
 
 
-class AvailabilityMonitor(Tables):
-    """Calls `on_away` with the reason when the database is unavailable, `on_back` with the seconds when it is back."""
+class Availability:
+    """Calls `on_lost` with the reason when the database is unavailable, `on_back` with the seconds when it is back."""
 
     def __init__(
-        self,
-        destination: Tables,
-        *,
-        now_s: Callable[[], float],
-        on_away: Callable[[str], None],
-        on_back: Callable[[float], None],
+        self, *, now_s: Callable[[], float], on_lost: Callable[[str], None], on_back: Callable[[float], None]
     ) -> None:
-        self._destination = destination
         self._now_s = now_s
-        self._on_away = on_away
+        self._on_lost = on_lost
         self._on_back = on_back
         self._unanswered_since_s: float | None = None
         self._reported = False
 
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        return await self._observe(self._destination.append(records))
-
-    async def confirm(self) -> None:
-        await self._observe(self._destination.confirm())
-
-    async def fold(self) -> int:
-        return await self._observe(self._destination.fold())
-
-    async def fold_next_batch(self) -> bool:
-        return await self._observe(self._destination.fold_next_batch())
-
-    async def behind(self) -> Mapping[str, int]:
-        return await self._observe(self._destination.behind())
-
-    async def stopped(self) -> Mapping[str, str]:
-        return await self._observe(self._destination.stopped())
-
-    async def _observe(self, call: Awaitable[_T]) -> _T:
+    async def observe(self, call: Awaitable[_T]) -> _T:
+        """Await a call of the database, and note whether it answered."""
         called_s = self._now_s()
         try:
             result = await call
         except DatabaseUnavailable as error:
-            self._note_away(called_s, str(error))
+            self._note_failure(called_s, str(error))
             raise
         self._note_success(called_s)
         return result
 
-    def _note_away(self, called_s: float, reason: str) -> None:
+    def _note_failure(self, called_s: float, reason: str) -> None:
         if self._unanswered_since_s is None:
             self._unanswered_since_s = called_s
         if not self._reported and is_notable(self._now_s() - self._unanswered_since_s):
             self._reported = True
-            self._on_away(reason)
+            self._on_lost(reason)
 
     def _note_success(self, called_s: float) -> None:
         since_s = self._unanswered_since_s

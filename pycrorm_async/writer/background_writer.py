@@ -9,10 +9,11 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeVar
 
 from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
+from pycrorm_async.events.envelope import Record
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Drain, DrainState, run_to_completion
 from pycrorm_async.writer.patience import Patience
@@ -60,7 +61,7 @@ class LiveWriter:
         self._settings = settings
         self._randomness = randomness
         self._appended_events = asyncio.Event()
-        self._drain = Drain(source, destination, settings=settings, on_append=self._appended_events.set)
+        self._drain = Drain(source, destination.append, settings=settings, on_append=self._note_append)
         self._adopted: list[Drain] = []
         self._adoption_errors: list[str] = []
         self._not_adopted: list[str] = []
@@ -168,6 +169,9 @@ class LiveWriter:
         self._fold_error = None
         return result
 
+    def _note_append(self, _: Sequence[Record]) -> None:
+        self._appended_events.set()
+
     def _note_away(self, error: DatabaseUnavailable) -> None:
         self._fold_error = str(error)
 
@@ -205,9 +209,9 @@ class LiveWriter:
     async def _drain_adopted(self, source: Source) -> None:
         drain = Drain(
             source,
-            self._destination,
+            self._destination.append,
             settings=self._settings,
-            on_append=self._appended_events.set,
+            on_append=self._note_append,
             say=self._not_adopted.append,
         )
         self._adopted.append(drain)

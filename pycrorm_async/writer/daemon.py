@@ -9,7 +9,7 @@ A recorder's name is in `_serving` from its claim to the release of its folder, 
 waits for its next attempt. The scan excludes both, so each folder has at most one drain task. Processes exclude each
 other by the folders' `drain` locks.
 
-No task waits for another one's database call. `AvailabilityMonitor` observes every call; while the database is
+No task waits for another one's database call. `Availability` observes every call; while the database is
 unavailable each task retries with pauses, and the recorders keep their events on disk. An error in one recorder's
 folder ends only its drain task; an error in a fold is reported and retried while appending continues.
 
@@ -24,15 +24,17 @@ from __future__ import annotations
 import asyncio
 import math
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.availability import AvailabilityMonitor
+from pycrorm_async.writer.availability import Availability
 from pycrorm_async.writer.drain import run_to_completion
-from pycrorm_async.writer.ports import ClaimedSource, ScanResult, SourceScanner, Tables
+from pycrorm_async.writer.ports import ClaimedSource, Log, ScanResult, SourceScanner, Tables
 from pycrorm_async.writer.retry import PATIENT, Backoff
 from pycrorm_async.writer.visibility import VisibilityTracker
 
@@ -60,16 +62,17 @@ class Daemon:
 
     def __init__(
         self,
-        destination: Tables,
+        log: Log,
+        tables: Tables,
         scan: SourceScanner,
         *,
         settings: Settings,
         say: Callable[[str], None],
         randomness: Callable[[], float] = random.random,
     ) -> None:
-        self._destination = AvailabilityMonitor(
-            destination, now_s=self._now_s, on_away=self._note_away, on_back=self._note_back
-        )
+        self._log = log
+        self._tables = tables
+        self._availability = Availability(now_s=self._now_s, on_lost=self._note_lost, on_back=self._note_back)
         self._scan = scan
         self._settings = settings
         self._say = say
@@ -159,7 +162,7 @@ class Daemon:
         name = source.name
         tracker = VisibilityTracker(
             source,
-            self._destination,
+            self._append,
             settings=self._settings,
             on_append=self._appended_events.set,
             say=lambda line: self._say_if_new(line, name),
@@ -177,8 +180,11 @@ class Daemon:
         finally:
             await run_to_completion(self._release(tracker, fault))
 
+    async def _append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        return await self._availability.observe(self._log.append(records))
+
     async def _release(self, tracker: VisibilityTracker, fault: str | None) -> None:
-        name, state, retried = tracker.name, tracker.state, True
+        name, state, retried = tracker.source.name, tracker.state, True
         try:
             outcome = await asyncio.to_thread(tracker.source.release_folder)
             retried = outcome.again
@@ -209,7 +215,7 @@ class Daemon:
             await self._appended_events.wait()
             self._appended_events.clear()
             try:
-                while await self._destination.fold_next_batch():
+                while await self._availability.observe(self._tables.fold_next_batch()):
                     await self._publish_visibility()
                 await self._publish_visibility()
             except Exception as error:  # noqa: BLE001 - reported and retried; appending continues
@@ -226,7 +232,7 @@ class Daemon:
         """Detect and refill a log that went back, also while no recorder appends."""
         while True:
             try:
-                await self._destination.confirm()
+                await self._availability.observe(self._log.confirm())
                 self._last_lines.pop("confirm", None)
             except Exception as error:  # noqa: BLE001 - reported and retried
                 if not isinstance(error, DatabaseUnavailable):
@@ -235,16 +241,17 @@ class Daemon:
 
     async def _publish_visibility(self) -> None:
         before = [(each, each.appended) for each in self._serving.values()]
-        behind, stopped = await self._destination.behind(), await self._destination.stopped()
+        behind = await self._availability.observe(self._log.behind())
+        stopped = await self._availability.observe(self._log.stopped())
         for tracker, appended in before:
             try:
                 tracker.note(appended, behind, stopped)
             except FilesError as error:  # the drain meets the same disk error and reports it
-                self._say(f"recorder {tracker.name}: {error}")
+                self._say(f"recorder {tracker.source.name}: {error}")
 
     # --- reports --------------------------------------------------------------------------------------
 
-    def _note_away(self, reason: str) -> None:
+    def _note_lost(self, reason: str) -> None:
         self._away = reason
         self._say(f"the database is unavailable: {reason}; retrying")
         self._publish_availability()
@@ -259,7 +266,7 @@ class Daemon:
             try:
                 tracker.source.mark_unavailable(self._away)
             except FilesError as error:
-                self._say(f"recorder {tracker.name}: {error}")
+                self._say(f"recorder {tracker.source.name}: {error}")
 
     def _say_if_new(self, line: str, about: str) -> None:
         """Say a line unless it was the last one about this subject."""

@@ -16,19 +16,21 @@ import logging
 import random
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, FilesError
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.ports import Destination, Source
+from pycrorm_async.writer.ports import Source
 from pycrorm_async.writer.retry import PATIENT, Backoff, retry
 
-__all__ = ["Drain", "DrainState", "run_to_completion"]
+__all__ = ["Append", "Drain", "DrainState", "run_to_completion"]
 
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
+Append: TypeAlias = Callable[[Sequence[Record]], Coroutine[Any, Any, Mapping[EpisodeId, str]]]
+"""`Log.append`, or a function that calls it."""
 
 
 class DrainState(NamedTuple):
@@ -58,22 +60,25 @@ class DrainState(NamedTuple):
 
 
 class Drain:
-    """A drain of one source into one log. Belongs to the loop that runs it; `state` is readable from any thread."""
+    """A drain of one source into one log. Belongs to the loop that runs it; `state` is readable from any thread.
+
+    Calls `append` with each batch, and `on_append` when the batch is acknowledged.
+    """
 
     def __init__(
         self,
         source: Source,
-        destination: Destination,
+        append: Append,
         *,
         settings: Settings,
         backoff: Backoff = PATIENT,
-        on_append: Callable[[], None] = lambda: None,
+        on_append: Callable[[Sequence[Record]], None] = lambda _: None,
         say: Callable[[str], None] = _log.error,
         randomness: Callable[[], float] = random.random,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
         self._source = source
-        self._destination = destination
+        self._append_records = append
         self._settings = settings
         self._backoff = backoff
         self._on_append = on_append
@@ -108,7 +113,7 @@ class Drain:
                 await self._acknowledge(await self._safe_position(batch, refusals))
                 self._batches += 1
                 self._appended = batch[-1].position
-                self._on_append()
+                self._on_append(batch)
                 await self._notify()
         except Exception as error:
             self._source.fail(_failure_reason(error))
@@ -150,7 +155,7 @@ class Drain:
 
     async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
         refusals = await retry(
-            lambda: run_to_completion(self._destination.append(batch)),
+            lambda: run_to_completion(self._append_records(batch)),
             backoff=self._backoff,
             on_away=self._note_away,
             randomness=self._randomness,

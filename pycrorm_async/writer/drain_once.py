@@ -39,7 +39,7 @@ async def drain_once(sources: Iterable[Source], destination: Destination, *, set
     drained: list[DrainState] = []
     failed: dict[str, PycrormError] = {}
     for source in sources:
-        drain = Drain(source, destination, settings=settings, backoff=BRIEF)
+        drain = Drain(source, destination.append, settings=settings, backoff=BRIEF)
         try:
             await drain.run()
         except DatabaseError:

@@ -1,6 +1,6 @@
-"""Define the writer's two ends: a source of synced records, and a log that stores and folds them.
+"""Define the writer's two ends: a source of synced records, and a log that stores them with the tables behind it.
 
-A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource` and `Tables`.
+A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource`, `Log` and `Tables`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pycrorm_async.events.ids import EpisodeId
 
 __all__ = [
     "Source",
+    "Log",
     "Destination",
     "ClaimedSource",
     "ReleaseOutcome",
@@ -59,8 +60,8 @@ class Source(Protocol):
         ...
 
 
-class Destination(Protocol):
-    """The log in a database, and the tables behind it."""
+class Log(Protocol):
+    """The log in a database."""
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         """Append records, durable on return. Records stored before with the same bytes are stored once.
@@ -80,6 +81,18 @@ class Destination(Protocol):
         """Number of committed writing transactions; grows while the database makes progress."""
         return 0
 
+    async def behind(self) -> Mapping[str, int]:
+        """Return the folded sequence, by id, of each episode with events that are not visible yet."""
+        ...
+
+    async def stopped(self) -> Mapping[str, str]:
+        """Return the refused and parked episodes by id, with reasons, at a cost independent of the others."""
+        ...
+
+
+class Destination(Log, Protocol):
+    """A log and the tables behind it, for a writer that folds to the end."""
+
     async def fold(self) -> int:
         """Fold all events of the log that are not folded yet; return their number.
 
@@ -87,8 +100,12 @@ class Destination(Protocol):
         """
         ...
 
-    async def stopped(self) -> Mapping[str, str]:
-        """Return the refused and parked episodes by id, with reasons, at a cost independent of the others."""
+
+class Tables(Protocol):
+    """The tables behind a log, for a daemon that folds in steps while it appends."""
+
+    async def fold_next_batch(self) -> bool:
+        """Fold one batch of events that are not visible yet; False if there was none. Raises as `fold` does."""
         ...
 
 
@@ -139,18 +156,6 @@ class SourceScanner(Protocol):
     """Claim every recorder's folder that can be drained, except those of these names. Reads files: blocks."""
 
     def __call__(self, but: Collection[str]) -> ScanResult: ...
-
-
-class Tables(Destination, Protocol):
-    """A destination that folds in steps, so that appending continues meanwhile, and reports what is visible."""
-
-    async def fold_next_batch(self) -> bool:
-        """Fold one batch of events that are not visible yet; False if there was none. Raises as `fold` does."""
-        ...
-
-    async def behind(self) -> Mapping[str, int]:
-        """Return the folded sequence, by id, of each episode with events that are not visible yet."""
-        ...
 
 
 class DrainRemarks(Protocol):

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.drain import Drain, DrainState
-from pycrorm_async.writer.ports import ClaimedSource, Destination, Source
+from pycrorm_async.writer.drain import Append, Drain, DrainState
+from pycrorm_async.writer.ports import ClaimedSource
 
 __all__ = ["VisibilityTracker"]
 
@@ -18,8 +18,8 @@ _BATCHES_MAX = 256
 """Bounds the batches tracked separately, so that memory stays flat while the tables lag; later ones are merged."""
 
 
-class VisibilityTracker(Source):
-    """A source that forwards to the claimed one and notes the batches, so that it can publish their visibility.
+class VisibilityTracker:
+    """Drains a claimed source and notes the batches, so that it can publish their visibility.
 
     Visibility comes from the log, per episode, so it does not matter which process folded.
     """
@@ -27,14 +27,15 @@ class VisibilityTracker(Source):
     def __init__(
         self,
         source: ClaimedSource,
-        destination: Destination,
+        append: Append,
         *,
         settings: Settings,
         on_append: Callable[[], None],
         say: Callable[[str], None],
     ) -> None:
         self.source = source
-        self._drain = Drain(self, destination, settings=settings, on_append=on_append, say=say)
+        self._drain = Drain(source, append, settings=settings, on_append=self._track, say=say)
+        self._on_append = on_append
         self._invisible: deque[tuple[int, dict[str, int]]] = (
             deque()
         )  # position, and each episode's last sequence up to it
@@ -77,30 +78,11 @@ class VisibilityTracker(Source):
             self.source.mark_visible(visible_to, self._stopped)
             self._updated.set()
 
-    # --- as a source ------------------------------------------------------------------------------------------
-
-    @property
-    def name(self) -> str:
-        return self.source.name
-
-    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
-        batch = await self.source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
-        if batch:
-            lasts = {each.episode: each.sequence for each in batch if each.episode is not None}
-            self._track(batch[-1].position, {episode_text(episode): last for episode, last in lasts.items()})
-        return batch
-
-    async def acknowledge(self, position: int) -> None:
-        await self.source.acknowledge(position)
-
-    def dead_letter(self, records: Sequence[Record]) -> bool:
-        return self.source.dead_letter(records)
-
-    def fail(self, reason: str) -> None:
-        self.source.fail(reason)
-
-    def _track(self, position: int, lasts: dict[str, int]) -> None:
+    def _track(self, batch: Sequence[Record]) -> None:
+        lasts = {each.episode: each.sequence for each in batch if each.episode is not None}
+        lasts_by_id = {episode_text(episode): last for episode, last in lasts.items()}
         if len(self._invisible) >= _BATCHES_MAX:
             _, before = self._invisible.pop()
-            lasts = before | lasts
-        self._invisible.append((position, lasts))
+            lasts_by_id = before | lasts_by_id
+        self._invisible.append((batch[-1].position, lasts_by_id))
+        self._on_append()

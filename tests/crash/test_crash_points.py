@@ -27,7 +27,6 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
 from tests.databases import ask
 from tests.queue.factories import RECORDER, SMALL, STILL, Author, ended, episode, node, started
-from tests.writer.fakes import CountingFold
 
 pytestmark = pytest.mark.slow
 
@@ -101,7 +100,7 @@ def _say(pipe: int, *words: object) -> None:
 async def drained(url: str, queue: Any) -> None:
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     settings = Settings(batch_events_max=4)
-    await Drain(queue, CountingFold(log), settings=settings).run()
+    await Drain(queue, log.append, settings=settings).run()
     await log.close()
 
 
@@ -205,7 +204,7 @@ def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
     async def both() -> None:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True)
         settings = Settings(batch_events_max=4)
-        drain = asyncio.create_task(Drain(queue, CountingFold(log), settings=settings).run())
+        drain = asyncio.create_task(Drain(queue, log.append, settings=settings).run())
         for number in (1, 2):
             say("put", number, queue.put_nowait(started(number), b"{}"))
         for index in range(14):

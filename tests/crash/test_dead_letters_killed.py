@@ -19,7 +19,6 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
 from tests.crash.test_crash_points import LIVE, _made, drained, in_a_child, stored
 from tests.queue.factories import RECORDER, STILL, drain, ended, episode, node, started
-from tests.writer.fakes import CountingFold
 
 pytestmark = pytest.mark.soak
 """Each test starts many processes anew."""
@@ -33,7 +32,7 @@ def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
 
     async def both() -> None:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-        task = asyncio.create_task(Drain(queue, CountingFold(log), settings=Settings(batch_events_max=4)).run())
+        task = asyncio.create_task(Drain(queue, log.append, settings=Settings(batch_events_max=4)).run())
         for number in (1, 2):
             say("put", number, queue.put_nowait(started(number), b"{}"))
         for index in range(6):

@@ -20,7 +20,7 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import ask
 from tests.store.factories import episode, record
-from tests.writer.fakes import CountingFold, KeptSource
+from tests.writer.fakes import KeptSource
 
 
 class SmallDisk:
@@ -76,7 +76,7 @@ async def test_a_database_on_a_full_disk_is_away_and_everything_is_stored_once_w
     small_disk.limit(log.engine)
     source = KeptSource(records, closed=True)
     backoff = Backoff(first_s=0.005, longest_s=0.02)
-    drain = Drain(source, CountingFold(log), settings=Settings(batch_events_max=50), backoff=backoff)
+    drain = Drain(source, log.append, settings=Settings(batch_events_max=50), backoff=backoff)
     running = asyncio.create_task(drain.run())
     while drain.state.retries < 5:  # noqa: ASYNC110
         await asyncio.sleep(0.001)

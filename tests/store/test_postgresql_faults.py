@@ -28,7 +28,7 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask, server_in
 from tests.store.factories import declaration, episode, run_of
-from tests.writer.fakes import CountingFold, KeptSource
+from tests.writer.fakes import KeptSource
 
 pytestmark = pytest.mark.slow
 
@@ -98,7 +98,7 @@ async def drained(
     """Drains all of it while something else happens; told of nothing but a database that is away."""
     log = await EventLog.open(address, create=True, busy_timeout_s=2.0)
     source = KeptSource(records, closed=True)
-    drain = Drain(source, CountingFold(log), settings=SETTINGS, backoff=QUICKLY)
+    drain = Drain(source, log.append, settings=SETTINGS, backoff=QUICKLY)
     try:
         async with asyncio.timeout(60), asyncio.TaskGroup() as both:
             both.create_task(drain.run())

@@ -22,7 +22,7 @@ from pycrorm_async.writer.retry import Backoff
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask
 from tests.store.factories import declaration, episode, run_of
-from tests.writer.fakes import CountingFold, KeptSource
+from tests.writer.fakes import KeptSource
 
 pytestmark = pytest.mark.slow
 
@@ -77,7 +77,7 @@ async def test_a_writer_waits_while_its_tables_are_dropped_and_put_back_step_by_
     rest = [declaration(b'{"dtype":"B"}', position=22), *run_of(episode(1), 21, 40, position=23)]
     rest += run_of(episode(2), 1, 10, position=43)
     source = KeptSource(first)
-    drain = Drain(source, CountingFold(log), settings=SETTINGS, backoff=QUICKLY)
+    drain = Drain(source, log.append, settings=SETTINGS, backoff=QUICKLY)
     async with asyncio.timeout(60), asyncio.TaskGroup() as tasks:
         tasks.create_task(drain.run())
         await drain.reached(first[-1].position)

@@ -35,7 +35,7 @@ async def at_once(_: float) -> None:
 
 async def test_everything_is_stored_and_then_forgotten_by_the_source(log: EventLog) -> None:
     source = KeptSource(run_of(episode(1), 1, 25), closed=True)
-    drain = Drain(source, CountingFold(log), settings=TENS)
+    drain = Drain(source, log.append, settings=TENS)
     await drain.run()
     assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
     assert source.acknowledgements == [10, 20, 25]
@@ -59,7 +59,7 @@ async def test_a_batch_is_acknowledged_after_it_is_committed_and_before_the_next
             await super().acknowledge(position)
 
     source = Watching(run_of(episode(1), 1, 20), closed=True)
-    await Drain(source, Watched(CountingFold(log)), settings=TENS).run()
+    await Drain(source, Watched(CountingFold(log)).append, settings=TENS).run()
     assert seen == [
         "append to 10 with [] acknowledged",
         "acknowledge 10 with 10 stored",
@@ -70,7 +70,7 @@ async def test_a_batch_is_acknowledged_after_it_is_committed_and_before_the_next
 
 async def test_a_commit_whose_reply_is_lost_is_stored_once(log: EventLog) -> None:
     source = KeptSource(run_of(episode(1), 1, 25), closed=True)
-    drain = Drain(source, LosesReplies(CountingFold(log)), settings=TENS, sleep=at_once)
+    drain = Drain(source, LosesReplies(CountingFold(log)).append, settings=TENS, sleep=at_once)
     await drain.run()
     assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
     assert source.acknowledgements == [10, 20, 25]
@@ -96,7 +96,7 @@ async def test_a_database_locked_by_another_writer_is_asked_again_later_and_noth
 
     drain = Drain(
         source,
-        CountingFold(log),
+        log.append,
         settings=TENS,
         backoff=Backoff(first_s=1.0, longest_s=60.0),
         randomness=lambda: 1.0,
@@ -115,7 +115,7 @@ async def test_a_drain_that_may_give_up_raises_and_its_source_keeps_everything(l
     holder.execute("BEGIN IMMEDIATE")
     source = KeptSource(run_of(episode(1), 1, 25), closed=True)
     backoff = Backoff(first_s=1.0, longest_s=1.0, attempts_max=2)
-    drain = Drain(source, CountingFold(log), settings=TENS, backoff=backoff, sleep=at_once)
+    drain = Drain(source, log.append, settings=TENS, backoff=backoff, sleep=at_once)
     with pytest.raises(DatabaseUnavailable):
         await drain.run()
     holder.close()
@@ -127,7 +127,7 @@ async def test_a_drain_that_may_give_up_raises_and_its_source_keeps_everything(l
 async def test_a_state_that_was_taken_stays_as_it_was(log: EventLog) -> None:
     drain = Drain(
         KeptSource([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9)], closed=True),
-        CountingFold(log),
+        log.append,
         settings=TENS,
     )
     before = drain.state
@@ -155,7 +155,7 @@ async def test_refused_records_are_set_aside_before_they_are_acknowledged_and_th
         ],
         closed=True,
     )
-    drain = Drain(source, CountingFold(log), settings=TENS)
+    drain = Drain(source, log.append, settings=TENS)
     await drain.run()
     assert seen == [(10, [1, 2, 3, 4, 6, 7, 8, 9]), (20, [1, 2, 3, 4, 6, 7, 8, 9, 10, 11])]
     assert (source.kept, source.given_up, drain.state.acknowledged, drain.state.records) == ([], [], 20, 10)
@@ -175,7 +175,7 @@ async def test_nothing_is_acknowledged_from_the_first_refused_record_on_that_is_
         *run_of(episode(2), 11, 30, position=19),
     ]
     source = KeptSource(records, closed=True, stays=True)
-    drain = Drain(source, CountingFold(log), settings=TENS)
+    drain = Drain(source, log.append, settings=TENS)
     await drain.run()
     assert source.given_up == []
     reason = "event 5 did not arrive before event 6"
@@ -187,12 +187,12 @@ async def test_nothing_is_acknowledged_from_the_first_refused_record_on_that_is_
     assert [(row.id, row.refused) for row in await log.stopped()] == [(name(1), reason)]
 
     again = source.reopened()
-    await Drain(again, CountingFold(log), settings=TENS).run()
+    await Drain(again, log.append, settings=TENS).run()
     assert again.kept == list(range(11, 39))
 
     await log.append([record(episode(1), 5)])  # the missing event is found after all
     last = source.reopened()
-    await Drain(last, CountingFold(log), settings=TENS).run()
+    await Drain(last, log.append, settings=TENS).run()
     assert last.kept == []
     assert ask(log.address.path, STORED) == [(1, 30, 1, 30), (2, 9, 1, 9)]
     assert await log.stopped() == []
@@ -206,7 +206,7 @@ async def test_a_source_that_cannot_set_aside_is_told_once_and_at_once_that_it_c
             raise SpoolUnavailable(Path("/spool/1.refused"), "No space left on device")
 
     source = Full([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9, position=5)])
-    running = asyncio.create_task(Drain(source, CountingFold(log), settings=TENS).run())
+    running = asyncio.create_task(Drain(source, log.append, settings=TENS).run())
     refused = (
         f"episode {name(1)} was refused: event 5 did not arrive before event 6;"
         " its events cannot be kept as dead letters: spool /spool/1.refused: No space left on device"
@@ -230,7 +230,7 @@ async def test_damage_ends_the_drain_and_nothing_of_its_batch_is_acknowledged(
     await log.append([record(episode(1), 15, payload=b"{}")._replace(sequence=1)])
     source = KeptSource([*run_of(episode(2), 1, 10), *run_of(episode(1), 1, 10, position=11)], closed=True)
     with pytest.raises(LogDamaged):
-        await Drain(source, CountingFold(log), settings=TENS).run()
+        await Drain(source, log.append, settings=TENS).run()
     assert source.kept == list(range(11, 21))
     assert ask(log.address.path, STORED) == [(1, 1, 1, 1), (2, 10, 1, 10)]
     damage = f"the writer stopped: episode {name(1)}, event 1: another event is stored under this number already"
@@ -240,7 +240,7 @@ async def test_damage_ends_the_drain_and_nothing_of_its_batch_is_acknowledged(
 
 async def test_whoever_waits_for_a_position_is_told_when_it_is_stored_or_never_will_be(log: EventLog) -> None:
     source = KeptSource(run_of(episode(1), 1, 10))
-    drain = Drain(source, CountingFold(log), settings=TENS)
+    drain = Drain(source, log.append, settings=TENS)
     running = asyncio.create_task(drain.run())
     assert await drain.reached(10)
     waiting = asyncio.create_task(drain.reached(12))
@@ -292,7 +292,7 @@ class PausingSource(KeptSource):
 async def test_a_drain_cancelled_at_any_point_loses_nothing(log: EventLog, point: str, times: int) -> None:
     source = PausingSource(run_of(episode(1), 1, 25), closed=True)
     source.points = Points(point, times)
-    running = asyncio.create_task(Drain(source, PausingLog(log, source.points), settings=TENS).run())
+    running = asyncio.create_task(Drain(source, PausingLog(log, source.points).append, settings=TENS).run())
     await source.points.reached.wait()
     running.cancel()
     with pytest.raises(asyncio.CancelledError):
@@ -301,7 +301,7 @@ async def test_a_drain_cancelled_at_any_point_loses_nothing(log: EventLog, point
     assert ask(log.address.path, STORED) == [(1, 10 * times, 1, 10 * times)]
     rest = source.reopened()
     assert rest.kept[0] == (10 * times + 1 if point == "after acknowledge" else 10 * (times - 1) + 1)
-    await Drain(rest, CountingFold(log), settings=TENS).run()
+    await Drain(rest, log.append, settings=TENS).run()
     assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
     assert rest.kept == []
 
@@ -312,12 +312,12 @@ async def test_a_drain_cancelled_at_any_moment_loses_nothing(log: EventLog) -> N
     chance = random.Random(seed)
     source = KeptSource(run_of(episode(1), 1, 400), closed=True)
     for _ in range(25):
-        running = asyncio.create_task(Drain(source, CountingFold(log), settings=TENS).run())
+        running = asyncio.create_task(Drain(source, log.append, settings=TENS).run())
         await asyncio.sleep(chance.uniform(0, 0.01))
         running.cancel()
         await asyncio.wait([running])
         source = source.reopened()
-    await Drain(source, CountingFold(log), settings=TENS).run()
+    await Drain(source, log.append, settings=TENS).run()
     assert ask(log.address.path, STORED) == [(1, 400, 1, 400)]
     assert source.kept == []
 
