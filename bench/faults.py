@@ -29,7 +29,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from bench.breaking import (
@@ -124,9 +124,29 @@ def slices_of(fault: Fault, *, quick: bool) -> Iterator[tuple[int, int]]:
         yield number, min(fault.slice, total - first)
 
 
+class _Termination:
+    """End the program on SIGTERM by SystemExit, so that it stops its server and deletes its folders.
+
+    Python drops an exception that a signal handler raises inside a weakref callback or a finalizer. The program then
+    ends at the next `check`, that is after the current round.
+    """
+
+    def __init__(self) -> None:
+        self._requested = False
+
+    def request(self, *_: object) -> None:
+        self._requested = True
+        sys.exit(143)
+
+    def check(self) -> None:
+        if self._requested:
+            sys.exit(143)
+
+
 def main() -> int:
     arguments = _arguments()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the server and the folders go then too
+    termination = _Termination()
+    signal.signal(signal.SIGTERM, termination.request)
     seed = arguments.seed if arguments.seed is not None else random.SystemRandom().randrange(2**31)
     console = Console(stderr=True)
     if not console.is_terminal:
@@ -146,7 +166,7 @@ def main() -> int:
             report = Report(arguments.report, seed=seed, quick=arguments.quick, command=command, order=order)
             for fault in faults:
                 if not arguments.only or any(word in fault.name for word in arguments.only):
-                    found = _made(fault, arguments, report, Path(folder), progress)
+                    found = _made(fault, arguments, report, Path(folder), progress, termination)
                     outcomes[fault.name] = summed(found)
                     print(json.dumps(Slice(fault.name, 0, outcomes[fault.name]).line(seed)), flush=True)
                     if not console.is_terminal:
@@ -169,7 +189,12 @@ def _arguments() -> argparse.Namespace:
 
 
 def _made(
-    fault: Fault, arguments: argparse.Namespace, report: Report, folder: Path, progress: Progress
+    fault: Fault,
+    arguments: argparse.Namespace,
+    report: Report,
+    folder: Path,
+    progress: Progress,
+    termination: _Termination,
 ) -> list[Outcome]:
     """What each slice found, those that an earlier run with this seed and report had made included."""
     slices = [
@@ -178,24 +203,29 @@ def _made(
         if arguments.slice in (None, number)
     ]
     bar = progress.add_task(fault.name, total=sum(rounds for _, rounds in slices))
+
+    def step() -> None:
+        termination.check()
+        progress.advance(bar)
+
     found: list[Outcome] = []
     for number, rounds in slices:
         outcome = report.known(fault.name, number)
         if outcome is None:
             # Each with its own numbers, so that one slice alone goes as it did among the others.
             rng = random.Random(f"{report.seed} {fault.name} {number}")
-            outcome = _slice(fault, rounds, rng, folder, progress, bar)
+            outcome = _slice(fault, rounds, rng, folder, step)
             report.add(Slice(fault.name, number, outcome))
         found.append(outcome)
         progress.update(bar, completed=sum(each for other, each in slices if other <= number))
     return found
 
 
-def _slice(fault: Fault, rounds: int, rng: random.Random, folder: Path, progress: Progress, bar: TaskID) -> Outcome:
+def _slice(fault: Fault, rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
     began = time.perf_counter()
     with tempfile.TemporaryDirectory(dir=folder) as place:
         try:
-            outcome = fault.make(rounds, rng, Path(place), lambda: progress.advance(bar))
+            outcome = fault.make(rounds, rng, Path(place), step)
         except Exception as error:  # noqa: BLE001  what a fault may bring out is for the table, and the others go on
             traceback.print_exc()
             outcome = Outcome(broke=f"{type(error).__name__}: {error}")
