@@ -82,7 +82,7 @@ def learn(
 ) -> None:
     """Record random pick-ups, learn a policy from the successful ones, and evaluate it.
 
-    The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra [learning].
+    The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra 'learning'.
     """
     # These checks come first, so that a missing package or a bad path does not fail after an hour of rollouts.
     _check_extra()
