@@ -64,7 +64,7 @@ class _OfAnEpisode(MappedAsDataclass):
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("ProcessMetaData.id"), init=False)
 
     @declared_attr
-    def process_metadata(cls) -> Mapped[MetaDataRow]:  # noqa: N805  SQLAlchemy gives the class
+    def process_metadata(cls) -> Mapped[MetaDataRow]:
         return relationship(init=False)
 
 
@@ -72,7 +72,7 @@ class _WithPose(MappedAsDataclass):
     pose_id: Mapped[int] = mapped_column(ForeignKey("Pose.id"), init=False)
 
     @declared_attr
-    def pose(cls) -> Mapped[PoseRow]:  # noqa: N805
+    def pose(cls) -> Mapped[PoseRow]:
         return relationship(init=False, foreign_keys=[cls.pose_id])  # type: ignore[list-item]
 
 
@@ -80,7 +80,7 @@ class _WithObject(MappedAsDataclass):
     object_id: Mapped[int] = mapped_column(ForeignKey("Object.id"), init=False)
 
     @declared_attr
-    def object(cls) -> Mapped[ObjectRow]:  # noqa: N805
+    def object(cls) -> Mapped[ObjectRow]:
         return relationship(init=False, foreign_keys=[cls.object_id])  # type: ignore[list-item]
 
 

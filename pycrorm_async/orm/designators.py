@@ -4,10 +4,10 @@
 with `class ORMSaying(Action)`, or one that the memory generates for a type without a class. If none exists the object
 is an `Action`, whose fields are in `parameters` (`await action.awaitable_attrs.parameters`).
 
-Derive from `Action` or `Motion` to map a designator of your own; its table has the name of the class:
+Derive from `Action` or `Motion` to map a designator of your own; its table has the name of the class, and its `id` is
+that of its base:
 
 >>> class ORMSaying(Action):
-...     id: Mapped[int] = mapped_column(ForeignKey(f"{Action.__tablename__}.id"), primary_key=True)
 ...     text: Mapped[str]
 """
 
@@ -111,13 +111,17 @@ class Designator(Base):
     __tablename__ = "designator"
 
     def __init_subclass__(cls, **arguments: Any) -> None:
-        # A user's class gets a table of its own, named like the class unless the class names one.
-        if not vars(cls).keys() & {"__tablename__", "__table__", "__abstract__"}:
-            cls.__tablename__ = cls.__name__
+        # Each class gets a table of its own, named like the class unless the class names one, and that table's key.
+        if not vars(cls).keys() & {"__table__", "__abstract__"}:
+            if "__tablename__" not in vars(cls):
+                cls.__tablename__ = cls.__name__
+            if "id" not in vars(cls):
+                base = next(each for each in cls.__mro__[1:] if issubclass(each, Base) and "__table__" in vars(each))
+                cls.id = mapped_column(ForeignKey(f"{base.__tablename__}.id"), primary_key=True, sort_order=-2)
         super().__init_subclass__(**arguments)
 
     @declared_attr.directive
-    def __mapper_args__(cls) -> dict[str, Any]:  # noqa: N805  SQLAlchemy calls it with the class
+    def __mapper_args__(cls) -> dict[str, Any]:
         # "selectin" at every level: a query for a base loads the columns of all leaves without a join for each.
         arguments = {"polymorphic_identity": cls.__name__, "polymorphic_load": "selectin"}
         return {"polymorphic_on": "_lineage", **arguments} if cls.__name__ == "Designator" else arguments
@@ -153,20 +157,14 @@ class Action(Designator):
 
     __tablename__ = "action"
 
-    id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
-
 
 class Motion(Designator):
     """A performed motion: one command to a robot's controllers."""
 
     __tablename__ = "motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
-
 
 class Language(Designator):
     """A performed expression of the plan language. The nodes of its operands are children of its node."""
 
     __tablename__ = "language"
-
-    id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)

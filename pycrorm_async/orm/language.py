@@ -8,8 +8,7 @@ Each expression is a node of the task tree, and the nodes of its operands are it
 
 from __future__ import annotations
 
-from sqlalchemy import ForeignKey
-from sqlalchemy.orm import Mapped, mapped_column
+from sqlalchemy.orm import Mapped
 
 from pycrorm_async.orm.designators import Language
 
@@ -21,15 +20,11 @@ class Sequential(Language):
 
     __tablename__ = "sequential"
 
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
-
 
 class TryInOrder(Language):
     """Performs its operands in order, up to the first that succeeds."""
 
     __tablename__ = "try_in_order"
-
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
 
 
 class Parallel(Language):
@@ -37,15 +32,11 @@ class Parallel(Language):
 
     __tablename__ = "parallel"
 
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
-
 
 class TryAll(Language):
     """Performs its operands concurrently; succeeds if one does."""
 
     __tablename__ = "try_all"
-
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
 
 
 class Repeat(Language):
@@ -53,7 +44,6 @@ class Repeat(Language):
 
     __tablename__ = "repeat"
 
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
     times: Mapped[int]
 
 
@@ -67,7 +57,6 @@ class Monitor(Language):
 
     __tablename__ = "monitor"
 
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
     condition: Mapped[str]
     interval_s: Mapped[float]
 
@@ -81,7 +70,6 @@ class Code(Language):
 
     __tablename__ = "code"
 
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
     function: Mapped[str]
 
     @property
@@ -95,5 +83,4 @@ class Retry(Language):
 
     __tablename__ = "retry"
 
-    id: Mapped[int] = mapped_column(ForeignKey("language.id"), primary_key=True)
     max_tries: Mapped[int]

@@ -6,11 +6,11 @@ The joints of `MoveArmJointsMotion` and `MoveJointsMotion` are rows of `paramete
 from __future__ import annotations
 
 from sqlalchemy import ForeignKey
-from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
+from sqlalchemy.orm import Mapped, mapped_column, synonym
 
-from pycrorm_async.orm.base import Pose
 from pycrorm_async.orm.designators import Motion
 from pycrorm_async.orm.objects import Object
+from pycrorm_async.orm.parameters import ObjectParameter, ObjectPartParameter, TargetParameter
 from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 
 __all__ = [
@@ -28,45 +28,25 @@ __all__ = [
 ]
 
 
-class MoveMotion(Motion):
+class MoveMotion(TargetParameter, Motion):
     """Drive the base to a pose."""
 
     __tablename__ = "move_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
-    pose_id: Mapped[int] = mapped_column("target_id", ForeignKey("pose.id"))
 
-    pose: Mapped[Pose] = relationship(viewonly=True, lazy="selectin")
-    target_id: Mapped[int] = synonym("pose_id")
-    target: Mapped[Pose] = synonym("pose")
-
-
-class MoveTCPMotion(Motion):
+class MoveTCPMotion(TargetParameter, Motion):
     """Bring the tool frame of one arm to a pose."""
 
     __tablename__ = "move_tcp_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
-    pose_id: Mapped[int] = mapped_column("target_id", ForeignKey("pose.id"))
     arm: Mapped[Arms]
     allow_gripper_collision: Mapped[bool | None]
 
-    pose: Mapped[Pose] = relationship(viewonly=True, lazy="selectin")
-    target_id: Mapped[int] = synonym("pose_id")
-    target: Mapped[Pose] = synonym("pose")
 
-
-class LookingMotion(Motion):
+class LookingMotion(TargetParameter, Motion):
     """Turn the head to a point."""
 
     __tablename__ = "looking_motion"
-
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
-    pose_id: Mapped[int] = mapped_column("target_id", ForeignKey("pose.id"))
-
-    pose: Mapped[Pose] = relationship(viewonly=True, lazy="selectin")
-    target_id: Mapped[int] = synonym("pose_id")
-    target: Mapped[Pose] = synonym("pose")
 
 
 class MoveGripperMotion(Motion):
@@ -74,7 +54,6 @@ class MoveGripperMotion(Motion):
 
     __tablename__ = "move_gripper_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
     motion: Mapped[GripperState]
     gripper: Mapped[Arms]
     allow_gripper_collision: Mapped[bool | None]
@@ -84,8 +63,6 @@ class MoveArmJointsMotion(Motion):
     """Move arm joints to positions (rad), by name."""
 
     __tablename__ = "move_arm_joints_motion"
-
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
 
     @property
     def left_arm_poses(self) -> dict[str, float]:
@@ -103,8 +80,6 @@ class MoveJointsMotion(Motion):
 
     __tablename__ = "move_joints_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
-
     @property
     def names(self) -> list[str]:
         """The joints' names, in the designator's order."""
@@ -121,36 +96,23 @@ class DetectingMotion(Motion):
 
     __tablename__ = "detecting_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
     object_type: Mapped[ObjectType]
 
 
-class OpeningMotion(Motion):
+class OpeningMotion(ObjectPartParameter, Motion):
     """Move an arm so that the container whose handle it grasps opens."""
 
     __tablename__ = "opening_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
-    object_id: Mapped[int] = mapped_column("object_part_id", ForeignKey("object.id"))
     arm: Mapped[Arms]
 
-    object: Mapped[Object] = relationship(viewonly=True, lazy="selectin")
-    object_part_id: Mapped[int] = synonym("object_id")
-    object_part: Mapped[Object] = synonym("object")
 
-
-class ClosingMotion(Motion):
+class ClosingMotion(ObjectPartParameter, Motion):
     """Move an arm so that the container whose handle it grasps closes."""
 
     __tablename__ = "closing_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
-    object_id: Mapped[int] = mapped_column("object_part_id", ForeignKey("object.id"))
     arm: Mapped[Arms]
-
-    object: Mapped[Object] = relationship(viewonly=True, lazy="selectin")
-    object_part_id: Mapped[int] = synonym("object_id")
-    object_part: Mapped[Object] = synonym("object")
 
 
 class WorldStateDetectingMotion(Motion):
@@ -158,23 +120,20 @@ class WorldStateDetectingMotion(Motion):
 
     __tablename__ = "world_state_detecting_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
     object_type: Mapped[ObjectType]
 
 
-class AccessingMotion(Motion):
+class AccessingMotion(ObjectParameter, Motion):
     """Open or close a drawer by its handle."""
 
     __tablename__ = "accessing_motion"
 
-    id: Mapped[int] = mapped_column(ForeignKey("motion.id"), primary_key=True)
-    object_id: Mapped[int] = mapped_column("part_of_id", ForeignKey("object.id"))
     arm: Mapped[Arms]
     gripper: Mapped[str]
     drawer_joint: Mapped[str]
     drawer_handle: Mapped[str]
     distance: Mapped[float]
 
-    object: Mapped[Object] = relationship(viewonly=True, lazy="selectin")
+    object_id: Mapped[int] = mapped_column("part_of_id", ForeignKey("object.id"), sort_order=-1)
     part_of_id: Mapped[int] = synonym("object_id")
     part_of: Mapped[Object] = synonym("object")

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from sqlalchemy import ForeignKey, func, select
-from sqlalchemy.orm import Mapped, mapped_column, undefer
+from sqlalchemy import func, select
+from sqlalchemy.orm import Mapped, undefer
 
 from pycrorm_async import Memory, UserView
 from pycrorm_async.orm import Action, Designator, PickUpAction, TaskTreeNode
@@ -108,7 +108,6 @@ class ORMShout(Action):
 
     __tablename__ = "shout_action"
 
-    id: Mapped[int] = mapped_column(ForeignKey(f"{Action.__tablename__}.id"), primary_key=True)
     text: Mapped[str]
 
 

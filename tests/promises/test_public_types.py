@@ -19,11 +19,14 @@ from dataclasses import dataclass
 from typing import assert_type
 
 from sqlalchemy import select
+from sqlalchemy.orm import Mapped
 
 from pycrorm_async import Memory, MemoryStatus, Projection, Reading, Settings, UserView
-from pycrorm_async.orm import Action, NavigateAction, Pose, TaskTreeNode
+from pycrorm_async.orm import AccessingMotion, Action, FaceAtAction, GraspingAction, Monitor
+from pycrorm_async.orm import MoveAndPickUpAction, MoveMotion, NavigateAction, Object as ObjectRow, OpeningMotion
+from pycrorm_async.orm import PickUpAction, PlaceAction, Pose, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, NavigateAction as Navigate, PlanFailure, simulated_robot
-from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose as WorldPose
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose as WorldPose
 
 
 @dataclass
@@ -33,6 +36,51 @@ class GreetActionPerformable(ActionAbstract):
     async def perform(self) -> None:
         if not self.whom:
             raise PlanFailure("nobody to greet")
+
+
+class ORMGreet(Action):
+    whom: Mapped[str]
+
+
+class ORMCarefulPickUp(PickUpAction):
+    force: Mapped[float]
+
+
+def rows(place: PlaceAction, grasping: GraspingAction, face: FaceAtAction, both: MoveAndPickUpAction) -> None:
+    assert_type(place.id, int)
+    assert_type(place.object, ObjectRow)
+    assert_type(place.object_designator, ObjectRow)
+    assert_type(place.object_designator_id, int)
+    assert_type(place.object.pose, Pose | None)
+    assert_type(place.pose, Pose)
+    assert_type(place.target_location, Pose)
+    assert_type(place.target_location_id, int)
+    assert_type(place.arm, Arms)
+    assert_type(grasping.object, ObjectRow)
+    assert_type(grasping.object_desig, ObjectRow)
+    assert_type(face.pose, Pose)
+    assert_type(face.pose_id, int)
+    assert_type(both.standing_position, Pose)
+    assert_type(both.standing_position_id, int)
+    assert_type(both.object, ObjectRow)
+
+
+def motion_rows(move: MoveMotion, opening: OpeningMotion, accessing: AccessingMotion, monitor: Monitor) -> None:
+    assert_type(move.target, Pose)
+    assert_type(move.target_id, int)
+    assert_type(opening.object, ObjectRow)
+    assert_type(opening.object_part, ObjectRow)
+    assert_type(opening.object_part_id, int)
+    assert_type(accessing.part_of, ObjectRow)
+    assert_type(accessing.object_id, int)
+    assert_type(monitor.interval_s, float)
+
+
+def own_rows(greet: ORMGreet, careful: ORMCarefulPickUp) -> None:
+    assert_type(greet.id, int)
+    assert_type(greet.whom, str)
+    assert_type(careful.object, ObjectRow)
+    assert_type(careful.force, float)
 
 
 async def plan() -> None:
@@ -59,6 +107,16 @@ async def main() -> Sequence[Action]:
             assert_type(poses, Sequence[Pose])
             actions = (await session.scalars(select(Action))).all()
             assert_type(actions, Sequence[Action])
+            arms = (await session.scalars(select(PickUpAction.arm))).all()
+            assert_type(arms, Sequence[Arms])
+            places = (await session.scalars(select(PlaceAction.target_location_id))).all()
+            assert_type(places, Sequence[int])
+            query = select(PickUpAction.grasp, ObjectRow.name, TaskTreeNode.end_ns)
+            query = query.join(PickUpAction.object).join(PickUpAction.node)
+            for grasp, name, end_ns in await session.execute(query):
+                assert_type(grasp, Grasp)
+                assert_type(name, str)
+                assert_type(end_ns, int | None)
         frame = await memory.dataframe(select(TaskTreeNode.dtype))
         print(len(frame))
     return actions
@@ -82,9 +140,11 @@ def test_a_program_of_a_user_is_typed_and_its_mistakes_are_found(tmp_path: Path)
     assert done.stdout.startswith("Success: no issues found in 1 source file"), done.stdout
     wrong = PROGRAM.replace('GreetActionPerformable("Ada")', "GreetActionPerformable(1)")
     wrong = wrong.replace("Settings(sync_interval_ms=10)", 'Settings(sync_interval_ms="ten")')
+    wrong = wrong.replace("assert_type(arms, Sequence[Arms])", "assert_type(arms, Sequence[str])")
     done = checked(tmp_path, wrong.replace("await memory.flush()", "await memory.flsh()"))
     assert [line.rpartition("[")[2] for line in done.stdout.splitlines()[:-1]] == [
         "arg-type]",
         "arg-type]",
         "attr-defined]",
+        "assert-type]",
     ]
