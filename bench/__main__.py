@@ -1,15 +1,15 @@
-"""All figures, side by side: every script of `bench` in a process of its own, one after the other.
+"""Run every script of `bench`, each in its own process, one after the other, and collect the figures.
 
-    python -m bench                            two hours and more; the figures in bench/figures
-    python -m bench --quick                    that every script still runs
-    python -m bench --only thesis --only questions,  one by its name, or all whose name begins so
-    python -m bench --report FOLDER            figures.jsonl, figures.md and the plots there
+    python -m bench                            a few hours; writes bench/figures
+    python -m bench --quick                    a short run of every script, to check that it works
+    python -m bench --only thesis --only questions,  a run by its name, or all whose names begin with this
+    python -m bench --report FOLDER            write figures.jsonl, figures.md and the plots there
 
-`figures.jsonl` has a line for each run: what the script printed, with its command, how long it took, versions,
-hardware, and how busy the machine was before and after. What is measured again replaces the line that was there, so
-figures can be measured one by one. `figures.md` shows all of them, with the budgets of the design beside. Lines are
-printed too; exit code 1 if a script failed. It needs the extras `[test,learning,bench]`; without a library there is no
-comparison with it, and the page says so.
+`figures.jsonl` has one line for each run: the JSON that the script printed, its command, its duration, versions,
+hardware, and the load of the machine before and after. A repeated run replaces its line, so single figures can be
+measured again. `figures.md` shows all figures and the budgets of the design. The lines are also printed. The exit code
+is 1 if a script failed. The extras `[test,learning,bench]` are required; if a library is not installed, the page says
+that its comparison is missing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench.reporting.budgets import BUDGETS, judged
+from bench.reporting.budgets import BUDGETS, verdict_on
 from bench.reporting.figures import console
 from bench.reporting.machine import hardware, versions
 from bench.reporting.page import page
@@ -32,7 +32,7 @@ from bench.reporting.plots import draw
 
 
 class Run(NamedTuple):
-    """A script, with what it is told; `quick` is None where the quick version of another one covers it."""
+    """A script with its options; `quick` is False if the quick version of another run covers it."""
 
     name: str
     options: tuple[str, ...] = ()
@@ -69,85 +69,86 @@ RUNS = (
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="that every script still runs")
-    parser.add_argument("--only", action="append", help="those whose name begins with this; can be repeated")
-    parser.add_argument("--report", type=Path, default=Path("bench/figures"), help="the folder of the figures")
-    asked = parser.parse_args()
-    chosen = [
+    parser.add_argument("--quick", action="store_true", help="short runs, to check that every script works")
+    parser.add_argument("--only", action="append", help="runs whose names begin with this; can be repeated")
+    parser.add_argument("--report", type=Path, default=Path("bench/figures"), help="folder for the figures")
+    arguments = parser.parse_args()
+    selected = [
         run
         for run in RUNS
-        if (run.quick or not asked.quick) and any(_means(word, run.name) for word in asked.only or [""])
+        if (run.quick or not arguments.quick) and any(_selects(word, run.name) for word in arguments.only or [""])
     ]
-    if not chosen:
-        parser.error(f"no such figure: {', '.join(asked.only)} (there are {', '.join(run.name for run in RUNS)})")
-    asked.report.mkdir(parents=True, exist_ok=True)
+    if not selected:
+        runs = ", ".join(run.name for run in RUNS)
+        parser.error(f"no run has a name that begins with {', '.join(arguments.only)}; the runs are {runs}")
+    arguments.report.mkdir(parents=True, exist_ok=True)
     failed = []
     try:
-        for run in chosen:
-            line = measured(run, quick=asked.quick)
+        for run in selected:
+            line = measured(run, quick=arguments.quick)
             if line is None:
                 failed.append(run.name)
                 continue
             print(json.dumps(line), flush=True)
-            _note(asked.report, run.name, line)
+            _note(arguments.report, run.name, line)
     except KeyboardInterrupt:
-        console().print("interrupted; what was measured is kept")
+        console().print("interrupted; the finished runs are kept")
         return 130
-    _say_budgets(_lines(asked.report))
+    _print_budgets(_lines(arguments.report))
     for name in failed:
         console().print(f"[bold red]{name} failed[/]")
     return 1 if failed else 0
 
 
-def _means(word: str, name: str) -> bool:
-    """A whole name means that run, the beginning of several means all of them."""
+def _selects(word: str, name: str) -> bool:
+    """Return True if the word is the run's whole name, or a prefix of it and no run's whole name."""
     return name == word if any(run.name == word for run in RUNS) else name.startswith(word)
 
 
 def measured(run: Run, *, quick: bool) -> dict[str, Any] | None:
-    """The line of one run; None if it failed, which its own words on stderr explain."""
+    """Run one script and return its line; return None if it failed, with the reason on stderr."""
     options = [*run.options, *(["--quick"] if quick else [])]
-    shown = shlex.join(["python", "-m", f"bench.{run.script}", *options])
-    console().rule(shown)
+    command = shlex.join(["python", "-m", f"bench.{run.script}", *options])
+    console().rule(command)
     began, before = time.perf_counter(), _load()
-    done = subprocess.run(
+    completed = subprocess.run(
         [sys.executable, "-m", f"bench.{run.script}", *options], stdout=subprocess.PIPE, text=True, check=False
     )
-    took = round(time.perf_counter() - began, 1)
-    lines = done.stdout.splitlines()
-    if done.returncode or len(lines) != 1:
+    took_s = round(time.perf_counter() - began, 1)
+    lines = completed.stdout.splitlines()
+    if completed.returncode or len(lines) != 1:
         return None
-    about = {"command": shown, "took_s": took, "load_before": before, "load_after": _load()}
+    about = {"command": command, "took_s": took_s, "load_before": before, "load_after": _load()}
     return {**json.loads(lines[0]), **about, "versions": versions(), "hardware": hardware()}
 
 
 def _load() -> float:
-    """How many processes wanted to run, on average in the last minute."""
+    """Return the load average of the last minute."""
     return round(os.getloadavg()[0], 1)
 
 
 def _lines(report: Path) -> dict[str, dict[str, Any]]:
-    """What was measured so far, by run."""
+    """Read the lines in the report, by run."""
     file = report / "figures.jsonl"
-    kept = [json.loads(each) for each in file.read_text().splitlines()] if file.exists() else []
-    return {each.pop("run"): each for each in kept}
+    lines = [json.loads(each) for each in file.read_text().splitlines()] if file.exists() else []
+    return {each.pop("run"): each for each in lines}
 
 
 def _note(report: Path, name: str, line: dict[str, Any]) -> None:
-    """Beside what was measured before, in the place of an older line of this run."""
-    found = _lines(report) | {name: line}
-    lines = {run.name: found[run.name] for run in RUNS if run.name in found}
-    made = report / "figures.jsonl.new"
-    made.write_text("".join(json.dumps({"run": run, **each}) + "\n" for run, each in lines.items()))
-    made.replace(report / "figures.jsonl")
+    """Write a line into the report, replacing an older line of the same run, and render the page."""
+    by_run = _lines(report) | {name: line}
+    lines = {run.name: by_run[run.name] for run in RUNS if run.name in by_run}
+    temporary = report / "figures.jsonl.new"
+    temporary.write_text("".join(json.dumps({"run": run, **each}) + "\n" for run, each in lines.items()))
+    temporary.replace(report / "figures.jsonl")
     (report / "figures.md").write_text(page(lines, draw(lines, report)))
 
 
-def _say_budgets(lines: dict[str, dict[str, Any]]) -> None:
+def _print_budgets(lines: dict[str, dict[str, Any]]) -> None:
     for budget in BUDGETS:
-        verdict = judged(budget, lines)
-        mark = {True: "[green]held[/]", False: "[bold red]missed[/]", None: "[dim]?[/]"}[verdict.held]
-        console().print(f"{mark}  {budget.what} ({budget.budget}): {verdict.measured}", highlight=False)
+        verdict = verdict_on(budget, lines)
+        mark = {True: "[green]met[/]", False: "[bold red]missed[/]", None: "[dim]?[/]"}[verdict.met]
+        console().print(f"{mark}  {budget.measurement} ({budget.budget}): {verdict.measured}", highlight=False)
 
 
 if __name__ == "__main__":

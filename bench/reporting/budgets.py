@@ -1,33 +1,33 @@
-"""The budgets of the design, and what was measured for each: pure, from the lines the scripts printed."""
+"""Compare the measurements with the budgets of the design; pure functions of the lines that the scripts print."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-__all__ = ["BUDGETS", "Budget", "Verdict", "judged"]
+__all__ = ["BUDGETS", "Budget", "Verdict", "verdict_on"]
 
 Lines = Mapping[str, Mapping[str, Any]]
-"""What each run printed, by its name."""
+"""The line that each run printed, by the name of the run."""
 
 
 class Verdict(NamedTuple):
-    """What was measured, in words, and whether the budget is held; None where it was not measured."""
+    """A measured value as text; `met` says if the budget is met, and is None if nothing was measured."""
 
     measured: str
-    held: bool | None
+    met: bool | None
 
 
 class Budget(NamedTuple):
-    """What is promised, how much of it, and how to read it off; `read` raises `LookupError` where it was not run."""
+    """A limit for one measurement; `read` derives the verdict and raises `LookupError` if the script did not run."""
 
-    what: str
+    measurement: str
     budget: str
     read: Callable[[Lines], Verdict]
 
 
-def judged(budget: Budget, lines: Lines) -> Verdict:
-    """The verdict on one budget. What a quick run printed shows that it runs, and no more."""
+def verdict_on(budget: Budget, lines: Lines) -> Verdict:
+    """Return the verdict on one budget. Lines of quick runs are ignored, because their measurements are too short."""
     measured = {name: line for name, line in lines.items() if "--quick" not in line["command"]}
     try:
         return budget.read(measured)
@@ -36,27 +36,31 @@ def judged(budget: Budget, lines: Lines) -> Verdict:
 
 
 def _hook(lines: Lines) -> Verdict:
-    found = {name: each for name, each in lines["hook"].items() if isinstance(each, dict) and "hook_us" in each}
-    median = max(each["hook_us"] for each in found.values())
-    p99 = max(each["more_us"]["p99"] / 2 for each in found.values())
-    worst = max(found, key=lambda name: found[name]["hook_us"])
-    text = f"median {median:g} µs, p99 {p99:g} µs after a pause of 1 ms (the worst of each; {worst})"
+    configurations = {
+        name: each for name, each in lines["hook"].items() if isinstance(each, dict) and "hook_us" in each
+    }
+    median = max(each["hook_us"] for each in configurations.values())
+    p99 = max(each["more_us"]["p99"] / 2 for each in configurations.values())
+    worst = max(configurations, key=lambda name: configurations[name]["hook_us"])
+    text = (
+        f"median {median:g} µs, p99 {p99:g} µs after a pause of 1 ms (maxima over all configurations; median: {worst})"
+    )
     if "stages" in lines:
         text += f"; median {lines['stages']['one hook, memory']['median']:g} µs without a pause"
     return Verdict(text, median <= 5 and p99 <= 50)
 
 
 def _plan(lines: Lines) -> Verdict:
-    shares = {how: lines["plan"][f"with_{how}"]["slower_by_median"] for how in ("thread", "daemon")}
-    text = ", ".join(f"{how} {share:+.1%}" for how, share in shares.items())
+    shares = {writer: lines["plan"][f"with_{writer}"]["slower_by_median"] for writer in ("thread", "daemon")}
+    text = ", ".join(f"{writer} {share:+.1%}" for writer, share in shares.items())
     return Verdict(text, all(share <= 0.05 for share in shares.values()))
 
 
 def _log_against_raw(lines: Lines) -> Verdict:
     shares = {
         database: min(
-            found["ours_is"]["median"]
-            for name, found in lines["others"][database].items()
+            figures["ours_is"]["median"]
+            for name, figures in lines["others"][database].items()
             if name in ("executemany", "json_each", "COPY")
         )
         for database in ("sqlite", "postgresql")
@@ -70,7 +74,7 @@ def _log_against_eventsource(lines: Lines) -> Verdict:
     return Verdict(f"{times:.1f} times", times >= 10)
 
 
-def _thesis(database: str, wanted: float) -> Callable[[Lines], Verdict]:
+def _thesis(database: str, times_min: float) -> Callable[[Lines], Verdict]:
     def read(lines: Lines) -> Verdict:
         sizes = [
             each
@@ -80,7 +84,7 @@ def _thesis(database: str, wanted: float) -> Callable[[Lines], Verdict]:
         ]
         largest = max(sizes, key=lambda each: each["nodes"])
         times = largest["times_faster"]["median"]
-        return Verdict(f"{times:.1f} times at {largest['nodes']:,} nodes", times >= wanted)
+        return Verdict(f"{times:.1f} times at {largest['nodes']:,} nodes", times >= times_min)
 
     return read
 
@@ -88,24 +92,26 @@ def _thesis(database: str, wanted: float) -> Callable[[Lines], Verdict]:
 def _rebuild_rate(lines: Lines) -> Verdict:
     rates = {database: _rebuilt(lines, database)[-1]["events_per_s"] for database in ("sqlite", "postgresql")}
     by_two = {database: _rebuilt(lines, database, workers="2")[-1]["events_per_s"] for database in rates}
-    text = ", ".join(f"{database} {by_two[database]:,} events/s ({rate:,} by one)" for database, rate in rates.items())
+    text = ", ".join(
+        f"{database} {by_two[database]:,} events/s ({rate:,} with one)" for database, rate in rates.items()
+    )
     return Verdict(
-        f"by two processes, as the command does it where nobody else is at work: {text}",
+        f"with two processes, which `pycrorm rebuild` uses on an idle machine: {text}",
         all(rate >= 100_000 for rate in by_two.values()),
     )
 
 
 def _rebuild_growth(lines: Lines) -> Verdict:
-    found = {
+    largest = {
         database: max(
             (each for name, each in lines.items() if name.startswith("rebuild") and each["database"] == database),
             key=lambda line: line["by_workers"]["1"][-1]["events"],
         )
         for database in ("sqlite", "postgresql")
     }
-    growth = {database: line["growth"]["1"] for database, line in found.items()}
-    held = all(each["us_per_event"] <= 1.1 and each["mb"] <= _FLAT_MB for each in growth.values())
-    return Verdict(", ".join(_grown(database, line) for database, line in found.items()), held)
+    growth = {database: line["growth"]["1"] for database, line in largest.items()}
+    met = all(each["us_per_event"] <= 1.1 and each["mb"] <= _FLAT_MB for each in growth.values())
+    return Verdict(", ".join(_grown(database, line) for database, line in largest.items()), met)
 
 
 def _grown(database: str, line: Mapping[str, Any]) -> str:
@@ -122,21 +128,23 @@ def _rebuilt(lines: Lines, database: str, *, workers: str = "1") -> list[dict[st
 
 
 def _recording(lines: Lines) -> Verdict:
-    found = {database: lines["growth"][database]["recording"]["bytes_a_node"] for database in ("sqlite", "postgresql")}
-    text = ", ".join(f"{database} {each:g} bytes a node" for database, each in found.items())
-    return Verdict(text, all(each < _FLAT_BYTES for each in found.values()))
+    bytes_a_node = {
+        database: lines["growth"][database]["recording"]["bytes_a_node"] for database in ("sqlite", "postgresql")
+    }
+    text = ", ".join(f"{database} {each:g} bytes a node" for database, each in bytes_a_node.items())
+    return Verdict(text, all(each < _FLAT_BYTES for each in bytes_a_node.values()))
 
 
 _FLAT_BYTES = 100
 
 
 def _learning(lines: Lines) -> Verdict:
-    took = {
+    median_ms = {
         database: lines["questions"][database]["50000"]["learning, frame"]["ms"]["median"]
         for database in ("sqlite", "postgresql")
     }
-    text = ", ".join(f"{database} {each:.0f} ms" for database, each in took.items())
-    return Verdict(text, all(each <= 100 for each in took.values()))
+    text = ", ".join(f"{database} {each:.0f} ms" for database, each in median_ms.items())
+    return Verdict(text, all(each <= 100 for each in median_ms.values()))
 
 
 BUDGETS = (
@@ -149,7 +157,7 @@ BUDGETS = (
     ),
     Budget("the same, PostgreSQL", "≥ 30 times", _thesis("postgresql", 30)),
     Budget("rebuild", "≥ 100,000 events/s", _rebuild_rate),
-    Budget("rebuild, the largest log against the smallest", "≤ 1.1 times an event, memory flat", _rebuild_growth),
-    Budget("memory of a recording process", "flat (the original: 32 kB a node)", _recording),
+    Budget("rebuild, the largest log against the smallest", "≤ 1.1 times per event, flat memory", _rebuild_growth),
+    Budget("memory of a recording process", "flat (system of the thesis: 32 kB a node)", _recording),
     Budget("the thesis' learning query over 50,000 pick-ups → DataFrame", "≤ 100 ms", _learning),
 )

@@ -1,4 +1,4 @@
-"""What every script does with what it measured: a spread, the peak of a process, where people read."""
+"""Summarise measurements as spreads and percentiles, and read memory and CPU time of processes."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ __all__ = [
 ]
 
 MISSING: Final = "missing: pip install '.[bench]'"
-"""In the place of a figure, where a library to compare with is not installed."""
+"""Replaces a figure if the library to compare with is not installed."""
 
 
 def spread(values: Sequence[float]) -> dict[str, float]:
-    """Median, least and most, to four digits."""
+    """Return median, minimum and maximum, rounded to four digits."""
     return {"median": _short(statistics.median(values)), "least": _short(min(values)), "most": _short(max(values))}
 
 
 def percentiles(values: Sequence[float]) -> dict[str, float]:
-    """Median, p99, p99.9 and the largest, to four digits."""
+    """Return median, p99, p99.9 and maximum, rounded to four digits."""
     ordered = sorted(values)
-    at = {"median": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
-    return {name: _short(ordered[round(share * (len(ordered) - 1))]) for name, share in at.items()}
+    shares = {"median": 0.5, "p99": 0.99, "p99.9": 0.999, "max": 1.0}
+    return {name: _short(ordered[round(share * (len(ordered) - 1))]) for name, share in shares.items()}
 
 
 def _short(value: float) -> float:
@@ -45,34 +45,34 @@ def _short(value: float) -> float:
 
 
 def peak_mb() -> float:
-    """The most memory this process held so far, of its own image: not of the one it was started from."""
+    """Return the peak resident memory of this process, without that of the image before `exec`."""
     return held_mb("VmHWM")
 
 
-def held_mb(what: str, process: int | None = None) -> float:
-    """A figure of a process' memory, by the name that `proc(5)` gives it; of this one by default."""
+def held_mb(field: str, process: int | None = None) -> float:
+    """Read one memory figure of a process, by its name in `proc(5)`; by default of this process."""
     lines = Path(f"/proc/{process or 'self'}/status").read_text().splitlines()
-    return next(round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith(f"{what}:"))
+    return next(round(int(line.split()[1]) / 1024, 1) for line in lines if line.startswith(f"{field}:"))
 
 
 def cpu_s_of(process: int) -> float:
-    """How long all threads of a running process were on a processor."""
+    """Return the CPU time of a running process, over all its threads."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def with_children(process: int) -> list[int]:
-    """A running process and those it has started."""
+    """Return the pids of a running process and of its children."""
     children = Path(f"/proc/{process}/task/{process}/children").read_text().split()
     return [process, *map(int, children)]
 
 
 def memory_free_gb() -> float:
-    """What a process can still have without anything being thrown out."""
+    """Return the memory that a process can allocate without swapping (`MemAvailable`)."""
     lines = Path("/proc/meminfo").read_text().splitlines()
     return next(int(line.split()[1]) / 2**20 for line in lines if line.startswith("MemAvailable"))
 
 
 def console() -> Console:
-    """For progress and tables: what is printed elsewhere is for programs."""
+    """Return a console on stderr for progress and tables, because stdout holds only JSON."""
     return Console(stderr=True, width=None if sys.stderr.isatty() else 140)

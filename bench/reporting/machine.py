@@ -1,4 +1,4 @@
-"""What the figures were measured on: hardware, versions, and how busy it was besides."""
+"""Describe the machine of a measurement: hardware and versions."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ _PACKAGES = (
 
 
 def hardware() -> dict[str, Any]:
-    """Processor, cores, memory, kernel, file system of the temporary folder."""
+    """Return processor, cores, memory in GB, and kernel."""
     lines = Path("/proc/cpuinfo").read_text().splitlines()
     model = next(
         (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine()
     )
-    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    memory_bytes = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     return {
         "processor": model,
         "cores": len(os.sched_getaffinity(0)),
-        "memory_gb": round(pages / 2**30, 1),
+        "memory_gb": round(memory_bytes / 2**30, 1),
         "kernel": platform.release(),
     }
 
 
 def versions() -> dict[str, str]:
-    """Python, SQLite, and of each package that is installed."""
-    found = {"python": platform.python_version(), "sqlite": sqlite3.sqlite_version}
+    """Return the versions of Python, SQLite and each installed package of `_PACKAGES`."""
+    by_name = {"python": platform.python_version(), "sqlite": sqlite3.sqlite_version}
     for package in _PACKAGES:
         with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
+            by_name[package] = version(package)
+    return by_name

@@ -1,21 +1,21 @@
-"""The page of all figures, in Markdown: the budgets with what was measured, then every figure of every run."""
+"""Write the Markdown page of all figures: the budgets with their verdicts, then every figure of every run."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bench.reporting.budgets import BUDGETS, Lines, judged
+from bench.reporting.budgets import BUDGETS, Lines, verdict_on
 
 __all__ = ["page", "rows_of"]
 
 _SPREADS = ({"median", "least", "most"}, {"median", "p99", "p99.9", "max"})
 _ABOUT = ("bench", "command", "took_s", "versions", "hardware", "load_before", "load_after")
-_HELD = {True: "yes", False: "**no**", None: ""}
+_MET = {True: "yes", False: "**no**", None: ""}
 
 
 def page(lines: Lines, plots: list[str]) -> str:
-    """All of it. Lines are in the order they were first measured in."""
+    """Return the whole page, with the runs in the order of `lines`."""
     parts = ["# Figures", *_about(lines), "## Budgets", _budgets(lines)]
     parts += [f"![{plot.removesuffix('.svg')}]({plot})" for plot in plots]
     for name, line in lines.items():
@@ -32,10 +32,10 @@ def _about(lines: Lines) -> Iterator[str]:
 
 
 def _budgets(lines: Lines) -> str:
-    rows = ["| what | budget | measured | held |", "|---|---|---|---|"]
+    rows = ["| measurement | budget | measured | met |", "|---|---|---|---|"]
     for budget in BUDGETS:
-        verdict = judged(budget, lines)
-        rows.append(f"| {budget.what} | {budget.budget} | {verdict.measured} | {_HELD[verdict.held]} |")
+        verdict = verdict_on(budget, lines)
+        rows.append(f"| {budget.measurement} | {budget.budget} | {verdict.measured} | {_MET[verdict.met]} |")
     return "\n".join(rows)
 
 
@@ -47,11 +47,11 @@ def _figures(line: Mapping[str, Any]) -> str:
 
 
 def rows_of(figures: Any, path: str = "") -> Iterator[tuple[str, str]]:
-    """Every figure with its path; a spread is one."""
+    """Yield every figure with its path. A spread, such as median, least and most, is one figure."""
     match figures:
         case dict() if set(figures) in _SPREADS:
-            rest = ", ".join(f"{name} {_written(each)}" for name, each in list(figures.items())[1:])
-            yield path, f"{_written(figures['median'])} ({rest})"
+            others = ", ".join(f"{name} {_written(each)}" for name, each in list(figures.items())[1:])
+            yield path, f"{_written(figures['median'])} ({others})"
         case dict():
             for name, each in figures.items():
                 yield from rows_of(each, f"{path}, {name}" if path else str(name))

@@ -1,4 +1,4 @@
-"""The plots beside the page, one for each comparison that has more than one point."""
+"""Draw the plots of the page, one for each comparison with several points."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from bench.reporting.budgets import Lines
 __all__ = ["draw"]
 
 _ORIGINAL = {"sqlite": [(1_000, 1_342), (50_000, 921), (488_044, 987)], "postgresql": [(50_000, 808)]}
-"""What the original itself reached, nodes and nodes a second, on another machine of two cores: for orientation."""
+"""Nodes, and nodes a second, that the thesis' own system reached on another machine with two cores."""
 _DATABASES = ("sqlite", "postgresql")
 
 
 def draw(lines: Lines, folder: Path) -> list[str]:
-    """Draws what there are figures for; the names of the files. None without matplotlib."""
+    """Draw every plot that has figures, and return the file names. Without matplotlib nothing is drawn."""
     try:
         import matplotlib as mpl
     except ModuleNotFoundError:
         return []
     mpl.use("svg")
-    mpl.rcParams["svg.hashsalt"] = "bench"  # so that the same figures are the same file
+    mpl.rcParams["svg.hashsalt"] = "bench"  # without it ids are random, and the same figures give another file
     from matplotlib import pyplot as plt
 
     drawn = []
@@ -32,7 +32,7 @@ def draw(lines: Lines, folder: Path) -> list[str]:
             for axis, database in zip(axes, _DATABASES, strict=True):
                 axis.set_title(database)
                 plot(axis, lines, database)
-        except (LookupError, TypeError):  # not measured, or not on both
+        except (LookupError, TypeError):  # not measured, or on one database only
             continue
         finally:
             plt.close(figure)
@@ -48,50 +48,50 @@ def _thesis(axis: Any, lines: Lines, database: str) -> None:
     for side, name in (("ours", "ours"), ("baseline", "the system of the thesis")):
         rates = [each[f"{side}_nodes_per_s"] for each in sizes]
         _with_spread(axis, nodes, rates, name)
-    axis.plot(*zip(*_ORIGINAL[database], strict=True), "x", color="grey", label="the original, elsewhere")
+    axis.plot(*zip(*_ORIGINAL[database], strict=True), "x", color="grey", label="the thesis' system, another machine")
     _logarithmic(axis, "nodes", "nodes/s, to every row in every table")
 
 
 def _others(axis: Any, lines: Lines, database: str) -> None:
-    found = {name: each for name, each in lines["others"][database].items() if isinstance(each, dict)}
-    rates = [each["events_per_s"]["median"] for each in found.values()]
-    axis.barh(list(found), rates, color=["C0" if name == "ours" else "C7" for name in found])
+    contenders = {name: each for name, each in lines["others"][database].items() if isinstance(each, dict)}
+    rates = [each["events_per_s"]["median"] for each in contenders.values()]
+    axis.barh(list(contenders), rates, color=["C0" if name == "ours" else "C7" for name in contenders])
     axis.set_xscale("log")
     axis.set_xlabel("events/s into the log")
 
 
 def _visible(axis: Any, lines: Lines, database: str) -> None:
-    found = lines["visible"][database]
-    rates = [int(rate) for rate in found]
+    by_rate = lines["visible"][database]
+    rates = [int(rate) for rate in by_rate]
     for name in ("median", "p99", "max"):
-        axis.plot(rates, [each["ms"][name] for each in found.values()], "o-", label=name)
+        axis.plot(rates, [each["ms"][name] for each in by_rate.values()], "o-", label=name)
     _logarithmic(axis, "events/s", "ms from perform to its rows")
 
 
 def _questions(axis: Any, lines: Lines, database: str) -> None:
     runs = [line[database] for name, line in lines.items() if name.startswith("questions")]
-    by_size = dict(sorted((int(size), found) for run in runs for size, found in run.items()))
+    by_size = dict(sorted((int(size), by_question) for run in runs for size, by_question in run.items()))
     for question in ("learning, frame", "learning, kept rows, frame", "all pick-ups with context, frame"):
-        _with_spread(axis, list(by_size), [found[question]["ms"] for found in by_size.values()], question)
+        _with_spread(axis, list(by_size), [by_question[question]["ms"] for by_question in by_size.values()], question)
     _logarithmic(axis, "pick-ups", "ms")
 
 
 def _growth(axis: Any, lines: Lines, database: str) -> None:
-    found = lines["growth"][database]
-    for what in ("nodes_in_an_episode", "recorders", "daemons", "episodes"):
-        points = {int(value): rate for value, rate in found.get(what, {}).items() if isinstance(rate, dict)}
+    curves = lines["growth"][database]
+    for parameter in ("nodes_in_an_episode", "recorders", "daemons", "episodes"):
+        points = {int(value): rate for value, rate in curves.get(parameter, {}).items() if isinstance(rate, dict)}
         if points:
-            _with_spread(axis, list(points), list(points.values()), what.replace("_", " "))
-    _logarithmic(axis, "so many", "nodes/s, to every row in every table")
+            _with_spread(axis, list(points), list(points.values()), parameter.replace("_", " "))
+    _logarithmic(axis, "number", "nodes/s, to every row in every table")
 
 
 def _with_spread(axis: Any, values: list[int], spreads: list[dict[str, float]], name: str) -> None:
-    middle = [each["median"] for each in spreads]
+    medians = [each["median"] for each in spreads]
     below = [each["median"] - each["least"] for each in spreads]
     above = [each["most"] - each["median"] for each in spreads]
     if not values:
         raise LookupError(name)
-    axis.errorbar(values, middle, (below, above), fmt="o-", capsize=3, label=name)
+    axis.errorbar(values, medians, (below, above), fmt="o-", capsize=3, label=name)
 
 
 def _logarithmic(axis: Any, x: str, y: str) -> None:

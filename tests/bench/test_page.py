@@ -1,4 +1,4 @@
-"""The page of all figures says what was measured, and whether it holds what the design promises."""
+"""The page of all figures shows every measurement, and for each budget of the design if it is met."""
 
 import ast
 from importlib import import_module
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from bench.__main__ import RUNS, _lines, _note
-from bench.reporting.budgets import BUDGETS, Verdict, judged
+from bench.reporting.budgets import BUDGETS, Verdict, verdict_on
 from bench.reporting.page import page, rows_of
 
 pytestmark = pytest.mark.slow
@@ -30,18 +30,18 @@ def plan(thread: float, daemon: float, **about: Any) -> dict[str, Any]:
 
 
 def verdict(what: str, lines: dict[str, Any]) -> Verdict:
-    [budget] = [each for each in BUDGETS if each.what.startswith(what)]
-    return judged(budget, lines)
+    [budget] = [each for each in BUDGETS if each.measurement.startswith(what)]
+    return verdict_on(budget, lines)
 
 
-def test_a_budget_is_held_up_to_its_limit_and_missed_beyond_it() -> None:
-    assert verdict("the fastest", plan(0.05, -0.01)) == Verdict("thread +5.0%, daemon -1.0%", held=True)
-    assert verdict("the fastest", plan(0.01, 0.051)).held is False
+def test_a_budget_is_met_up_to_its_limit_and_missed_beyond_it() -> None:
+    assert verdict("the fastest", plan(0.05, -0.01)) == Verdict("thread +5.0%, daemon -1.0%", met=True)
+    assert verdict("the fastest", plan(0.01, 0.051)).met is False
 
 
-def test_what_a_quick_run_printed_is_held_against_no_budget() -> None:
-    found = verdict("the fastest", plan(0.0, 0.0, command="python -m bench.plan --quick"))
-    assert found == Verdict("not measured", None)
+def test_a_quick_run_is_not_compared_with_a_budget() -> None:
+    result = verdict("the fastest", plan(0.0, 0.0, command="python -m bench.plan --quick"))
+    assert result == Verdict("not measured", None)
 
 
 def test_the_largest_number_of_nodes_that_was_measured_is_judged() -> None:
@@ -49,8 +49,8 @@ def test_the_largest_number_of_nodes_that_was_measured_is_judged() -> None:
         return {**ABOUT, "sqlite": [{"nodes": nodes, "times_faster": {"median": times}} for nodes, times in sizes]}
 
     lines = {"thesis": of((1_000, 70.0), (50_000, 60.0)), "thesis, 488,043 nodes": of((488_043, 49.9))}
-    found = verdict("spool", lines)
-    assert found == Verdict("49.9 times at 488,043 nodes", held=False)
+    result = verdict("spool", lines)
+    assert result == Verdict("49.9 times at 488,043 nodes", met=False)
 
 
 def test_of_all_logs_that_were_rebuilt_the_largest_is_judged() -> None:
@@ -63,14 +63,14 @@ def test_of_all_logs_that_were_rebuilt_the_largest_is_judged() -> None:
         "rebuild, large": of("sqlite", 10_000, 1.1, 16.0),
         "rebuild postgresql": of("postgresql", 1_000, 0.9, -1.0),
     }
-    found = verdict("rebuild, the largest log", lines)
-    assert found == Verdict(
+    result = verdict("rebuild, the largest log", lines)
+    assert result == Verdict(
         "sqlite 1.10 times, +16 MB (100 to 10,000 events), postgresql 0.90 times, -1 MB (100 to 1,000 events)",
-        held=True,
+        met=True,
     )
     for worse in (_grown(1.11, 0), _grown(1.0, 16.1)):
         lines["rebuild, large"]["growth"] = {"1": worse}
-        assert verdict("rebuild, the largest log", lines).held is False
+        assert verdict("rebuild, the largest log", lines).met is False
 
 
 def _grown(times: float, mb: float) -> dict[str, float]:
@@ -78,10 +78,10 @@ def _grown(times: float, mb: float) -> dict[str, float]:
 
 
 def test_a_library_that_is_missing_leaves_its_budget_unmeasured_and_is_on_the_page() -> None:
-    words = "missing: pip install '.[bench]'"
-    lines = {"others": {"bench": "others", **ABOUT, "postgresql": {"eventsource-py": words}}}
+    message = "missing: pip install '.[bench]'"
+    lines = {"others": {"bench": "others", **ABOUT, "postgresql": {"eventsource-py": message}}}
     assert verdict("full spool → log against eventsource-py", lines) == Verdict("not measured", None)
-    assert f"| postgresql, eventsource-py | {words} |" in page(lines, [])
+    assert f"| postgresql, eventsource-py | {message} |" in page(lines, [])
 
 
 def test_every_figure_is_on_the_page_with_its_path_and_a_spread_is_one() -> None:
@@ -115,14 +115,14 @@ def test_every_run_names_a_script_that_is_there() -> None:
 
 def test_the_readme_shows_the_budgets_as_they_were_measured() -> None:
     measured = (ROOT / "bench" / "figures" / "figures.md").read_text()
-    budgets = measured[measured.index("| what | budget |") :].split("\n\n")[0]
+    budgets = measured[measured.index("| measurement | budget |") :].split("\n\n")[0]
     assert len(budgets.splitlines()) == 2 + len(BUDGETS)
     assert budgets in (ROOT / "bench" / "README.md").read_text()
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "bench").rglob("*.py")), ids=lambda each: each.stem)
 def test_every_module_of_the_bench_imports_what_the_package_still_has(path: Path) -> None:
-    """Most scripts run on demand only, so a name that moved would be noticed by the next who measures."""
+    """Most scripts run on demand only, so a renamed import would otherwise stay unnoticed until the next run."""
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("pycrorm_async"):
