@@ -22,11 +22,22 @@ if TYPE_CHECKING:
     from pycrorm_async.projections.custom.projection import Projection
     from pycrorm_async.projections.schema.user_views import UserView
     from pycrorm_async.query.reading import Reading
+    from pycrorm_async.query.recorded_world import world_of
     from pycrorm_async.settings import Settings
 
 __version__ = "0.1.0"
 
-__all__ = ["Memory", "MemoryStatus", "Projection", "PycrormError", "Reading", "Settings", "UserView", "recover"]
+__all__ = [
+    "Memory",
+    "MemoryStatus",
+    "Projection",
+    "PycrormError",
+    "Reading",
+    "Settings",
+    "UserView",
+    "recover",
+    "world_of",
+]
 
 _MODULES = {
     "Memory": "memory",
@@ -37,6 +48,7 @@ _MODULES = {
     "Settings": "settings",
     "UserView": "projections.schema.user_views",
     "recover": "operations.recovery",
+    "world_of": "query.recorded_world",
 }
 
 

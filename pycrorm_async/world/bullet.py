@@ -7,7 +7,7 @@ number of worlds can be open at once, in tasks and threads; one world belongs to
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import Self
 
@@ -40,11 +40,19 @@ class BulletWorld:
     Args:
         mode: whether Bullet opens a window.
         copy_of: the world this one is a copy of; only for `world_copy.copied`. A copy has no watcher.
+        set_up: adds the first objects when the world has been entered; if it raises, the world is left again.
     """
 
-    def __init__(self, mode: WorldMode = WorldMode.DIRECT, *, copy_of: BulletWorld | None = None) -> None:
+    def __init__(
+        self,
+        mode: WorldMode = WorldMode.DIRECT,
+        *,
+        copy_of: BulletWorld | None = None,
+        set_up: Callable[[BulletWorld], None] | None = None,
+    ) -> None:
         self.mode = mode
         self.copy_of = copy_of
+        self._set_up = set_up
         self.attachments = Attachments()
         self._objects: dict[int, Object] = {}
         self._robot: Object | None = None
@@ -93,6 +101,12 @@ class BulletWorld:
                 self._watcher.world_entered(self)
             except BaseException:
                 self._close()
+                raise
+        if self._set_up is not None:
+            try:
+                self._set_up(self)
+            except BaseException:
+                self.close()
                 raise
 
     def __exit__(

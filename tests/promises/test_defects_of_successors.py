@@ -10,6 +10,7 @@ import asyncio
 import sys
 import tomllib
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,10 @@ import pytest
 from sqlalchemy import select
 
 import pycrorm_async
+from pycrorm_async import Reading, world_of
 from pycrorm_async.events.types import NodeEnded, NodeStarted
 from pycrorm_async.hooks.event_feed import RecordedEvent
-from pycrorm_async.orm import Attachment, Designator, JointChange, NavigateAction, PickUpAction, PlaceAction
+from pycrorm_async.orm import Designator, NavigateAction, PickUpAction, PlaceAction
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.plan import (
     ActionAbstract,
@@ -34,7 +36,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan import MoveTorsoAction as MoveTorso
 from pycrorm_async.plan import NavigateAction as Navigate
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, Pose
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import joints_of_bullet, numbers
 from tests.promises.lab import (
@@ -47,6 +49,7 @@ from tests.promises.lab import (
     remembered,
     statuses,
     turned,
+    url_of,
 )
 
 pytestmark = pytest.mark.slow
@@ -134,46 +137,37 @@ async def test_whoever_listens_to_a_plan_is_told_of_every_start_and_end(tmp_path
 
 
 async def test_what_is_stored_can_be_played_again(tmp_path: Path) -> None:
+    states = []
     async with remembered(tmp_path):
         with lab() as scene:
-            await ParkArmsActionPerformable(Arms.BOTH).perform()
-            await NavigateActionPerformable(WITHIN_REACH).perform()
-            await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
-            await NavigateActionPerformable(Pose([-1, 0, 0], (0, 0, 0.6, 0.8))).perform()
-            await ParkArmsActionPerformable(Arms.LEFT).perform()
-            then = {each.name: (numbers(each.pose), joints_of_bullet(each)) for each in scene.world.objects}
-            held = {(each.parent.name, each.child.name, each.link) for each in scene.world.attachments}
-            hand = scene.robot.link_pose("l_gripper_tool_frame")
-    # A new world, from nothing but the memory.
-    with BulletWorld() as world:
-        rows = await asked(tmp_path, select(ObjectRow).order_by(ObjectRow.id))
-        turns = await asked(tmp_path, select(JointChange).order_by(JointChange.id))
-        ties = await asked(tmp_path, select(Attachment).order_by(Attachment.id))
-        for row in sorted([*rows, *turns, *ties], key=lambda each: each.id):
-            play(world, row)
-        assert {each.name: numbers(each.pose) for each in world.objects} == {name: was[0] for name, was in then.items()}
-        for each in world.objects:
-            assert joints_of_bullet(each) == pytest.approx(then[each.name][1], abs=1e-9)
-        assert {(each.parent.name, each.child.name, each.link) for each in world.attachments} == held
-        assert held == {("pr2", "milk", "l_gripper_tool_frame")}
-        there = world.object("pr2").link_pose("l_gripper_tool_frame")
-        assert there.distance(hand) < 1e-6
+            for step in (
+                ParkArmsActionPerformable(Arms.BOTH),
+                NavigateActionPerformable(WITHIN_REACH),
+                PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT),
+                NavigateActionPerformable(Pose([-1, 0, 0], (0, 0, 0.6, 0.8))),
+                ParkArmsActionPerformable(Arms.LEFT),
+            ):
+                await step.perform()
+                states.append((datetime.now(UTC), *state_of(scene.world)))
+    held = {("pr2", "milk", "l_gripper_tool_frame")}
+    assert [attachments for *_, attachments in states] == [set(), set(), held, held, held]
+    # Each moment in a new world, from nothing but the memory.
+    async with Reading.open(url_of(tmp_path)) as reading:
+        for time, objects, hand, attachments in states:
+            with world_of(await reading.as_of("last", time=time)) as world:
+                objects_again, hand_again, attachments_again = state_of(world)
+            assert [each[:3] for each in objects_again] == [each[:3] for each in objects]
+            for (*_, again), (*_, joints) in zip(objects_again, objects, strict=True):
+                assert again == pytest.approx(joints, abs=1e-9)
+            assert attachments_again == attachments
+            assert hand_again.distance(hand) < 1e-6
 
 
-def play(world: BulletWorld, row: Any) -> None:
-    """Do in the world what the row says was done."""
-    if isinstance(row, Attachment):
-        parent, child = world.object(row.parent.name), world.object(row.child.name)
-        if row.kind == "attached":
-            parent.attach(child, row.link)
-        else:
-            parent.detach(child)
-    elif isinstance(row, JointChange):
-        world.object(row.object.name).set_joint_position(row.joint, row.position)
-    elif row.id == row.identity_id:
-        Object(row.name, row.obj_type, pose=Pose(at(row.pose), turned(row.pose)), world=world)
-    else:
-        world.object(row.name).set_pose(Pose(at(row.pose), turned(row.pose)))
+def state_of(world: BulletWorld) -> tuple[list[tuple[Any, ...]], Pose, set[tuple[str, str, str | None]]]:
+    """Objects in their order with poses and joints as Bullet has them, the pose of a hand, and attachments."""
+    objects = [(each.name, each.object_type, numbers(each.pose), joints_of_bullet(each)) for each in world.objects]
+    attachments = {(each.parent.name, each.child.name, each.link) for each in world.attachments}
+    return objects, world.object("pr2").link_pose("l_gripper_tool_frame"), attachments
 
 
 async def test_every_stored_node_can_be_read_back_as_what_it_was(tmp_path: Path) -> None:

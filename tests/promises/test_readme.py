@@ -145,17 +145,20 @@ with BulletWorld() as world:
     async with Memory.open("sqlite:///pycrorm.db") as memory:
 """
     body = (
-        textwrap.indent(setting, "    ") + textwrap.indent(THEN, "            ") + "            return then, milk.pose"
+        textwrap.indent(setting, "    ")
+        + textwrap.indent(THEN, "            ")
+        + "            return then, milk.pose, recorded.object('milk').pose, milk_in_hand"
     )
     exec(f"async def asked():\n{body}", names)
     asked = names["asked"]
-    then, pose = await asked()  # type: ignore[operator]
+    then, pose, recorded, held = await asked()  # type: ignore[operator]
     assert [each.dtype for each in then.running][:2] == [None, "TransportAction"]
     assert then.world.object("milk").pose.position == pytest.approx(pose.position)
     with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
         question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'milk' AND object.id < ?"
         *_, there = plain.execute(f"{question} ORDER BY object.id", ((1 << 31) + (116 << 5),)).fetchall()
-    assert pose.position == pytest.approx(there)
+    assert pose.position == recorded.position == pytest.approx(there)
+    assert held == (then.world.object("milk").attached_to is not None)
 
 
 async def test_a_policy_is_learned_from_what_is_remembered_and_used(

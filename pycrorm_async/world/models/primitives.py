@@ -6,14 +6,14 @@ around the object's origin).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.errors import DescriptionNotLoadable
 
-__all__ = ["built_in_urdf", "box_urdf", "cylinder_urdf", "shape", "numbers", "INERTIA"]
+__all__ = ["built_in_urdf", "box_urdf", "cylinder_urdf", "stand_in_urdf", "shape", "numbers", "INERTIA"]
 
 INERTIA = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 """The inertia of every link: Bullet warns about links without one. Its values do not matter because the simulation is
@@ -89,6 +89,25 @@ def cylinder_urdf(name: str, *, radius: float, z: Range, color: Sequence[float] 
     """Return an object of one link: the upright cylinder around its z axis between these heights, m."""
     geometry = f'<cylinder radius="{radius:g}" length="{numbers([z[1] - z[0]])}"/>'
     return _one_link(name, geometry, (0.0, 0.0, (z[0] + z[1]) / 2), color)
+
+
+def stand_in_urdf(name: str, *, joints: Iterable[str], links: Iterable[str]) -> str:
+    """Return a substitute for an object whose shape is unknown: a magenta box of 10 cm around its origin.
+
+    Its joints are continuous, so that they take every position, and move links without a shape. `links` are fixed.
+    """
+    box = shape('<box size="0.1 0.1 0.1"/>', (0.0, 0.0, 0.0), (1.0, 0.0, 1.0, 1.0))
+    parts = [f"<link name={quoteattr(name)}>{INERTIA}{box}</link>"]
+    for kind, joint, link in (
+        *(("continuous", each, f"{each} of stand-in") for each in joints),
+        *(("fixed", f"{each} fixed in stand-in", each) for each in links if each != name),
+    ):
+        parts.append(
+            f"<link name={quoteattr(link)}>{INERTIA}</link><joint name={quoteattr(joint)} type={quoteattr(kind)}>"
+            f'<parent link={quoteattr(name)}/><child link={quoteattr(link)}/><axis xyz="0 0 1"/></joint>'
+        )
+    lines = "\n".join(parts)  # Bullet cannot read a long file that has a single line
+    return f"<robot name={quoteattr(name)}>\n{lines}\n</robot>\n"
 
 
 def shape(geometry: str, middle: Sequence[float], color: Sequence[float]) -> str:

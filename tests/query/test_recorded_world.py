@@ -1,0 +1,124 @@
+"""A world made from a snapshot has its objects as they were then, or says in one line why it cannot."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import world_of
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world
+from pycrorm_async.world.errors import DuplicateName, UnknownJoint, UnknownLink, WorldClosed
+from pycrorm_async.world.models.primitives import box_urdf
+
+AT = Pose([1, 2, 0.5], [0, 0, 0.6, 0.8])
+NARROW = box_urdf("milk", x=(0, 0.01), y=(0, 0.01), z=(0, 0.01))
+
+
+def then(
+    name: str,
+    object_type: str = "MILK",
+    pose: Pose = AT,
+    joints: dict[str, float] | None = None,
+    attached_to: tuple[str, str | None] | None = None,
+) -> ObjectThen:
+    return ObjectThen(1, 1, name, object_type, pose, joints or {}, attached_to)
+
+
+def snapshot(*objects: ObjectThen) -> Moment:
+    now = datetime.now(UTC)
+    return Moment(1, "id", "", "", now, False, 1, 0.0, now, "RUNNING", (), WorldThen(objects, None))
+
+
+def test_built_in_shapes_are_used_where_name_and_type_have_one() -> None:
+    with BulletWorld():
+        built_in = [Object("pr2", ObjectType.ROBOT), Object("milk", ObjectType.MILK)]
+    moment = snapshot(
+        then("pr2", "ROBOT", joints={"torso_lift_joint": 0.2}),
+        then("milk", attached_to=("pr2", "l_gripper_tool_frame")),
+        then("kitchen", "ENVIRONMENT", Pose()),
+    )
+    with world_of(moment) as world:
+        assert current_world.get() is world
+        assert world.robot is world.object("pr2")
+        assert [each.description_text for each in world.objects[:2]] == [each.description_text for each in built_in]
+        assert world.object("pr2").joint_position("torso_lift_joint") == 0.2
+        assert world.object("pr2").attachments == {world.object("milk"): "l_gripper_tool_frame"}
+        assert [each.pose for each in world.objects] == [AT, AT, Pose()]
+        assert [each.original_pose for each in world.objects] == [AT, AT, Pose()]
+
+
+@pytest.mark.parametrize("name", ["unnamed & <bold>", "tiago"])
+def test_a_stand_in_takes_the_recorded_joints_links_and_attachments(name: str) -> None:
+    moment = snapshot(
+        then(name, "ROBOT", joints={"elbow": 12.5, "torso": -0.3}),
+        then("milk", attached_to=(name, "hand")),
+        then("bowl", "BOWL", attached_to=(name, None)),
+        then("cupboard", "GENERIC_OBJECT", joints={"door": 1.0}),
+    )
+    with world_of(moment) as world:
+        robot, milk, bowl, cupboard = world.objects
+        assert robot.joint_positions() == {"elbow": 12.5, "torso": -0.3}
+        assert cupboard.joint_positions() == {"door": 1.0}
+        assert robot.attachments == {milk: "hand", bowl: None}
+        assert tuple(robot.bounding_box().size) == pytest.approx((0.124, 0.124, 0.1))  # turned by 73.74°
+        robot.set_pose(Pose([5, 5, 5], AT.orientation))
+        assert milk.pose.position == bowl.pose.position == pytest.approx((5, 5, 5))
+
+
+def test_a_description_of_the_users_own_replaces_the_built_in_shape(tmp_path: Path) -> None:
+    (tmp_path / "milk.urdf").write_text(NARROW)
+    for description in (NARROW, tmp_path / "milk.urdf"):
+        with world_of(snapshot(then("milk", pose=Pose())), descriptions={"milk": description}) as world:
+            assert tuple(world.object("milk").bounding_box().size) == pytest.approx((0.01, 0.01, 0.01))
+
+
+@pytest.mark.parametrize(
+    ("moment", "error", "message"),
+    [
+        (
+            snapshot(then("milk", joints={"lid": 1.0})),
+            UnknownJoint,
+            "'milk' has no movable joint 'lid'; its joints are: none",
+        ),
+        (
+            snapshot(then("milk"), then("bowl", "BOWL", attached_to=("milk", "lid"))),
+            UnknownLink,
+            "'milk' has no link 'lid'; its links are: milk",
+        ),
+    ],
+)
+def test_a_description_that_does_not_fit_the_recorded_state_is_refused(
+    moment: Moment, error: type[Exception], message: str
+) -> None:
+    world = world_of(moment, descriptions={"milk": NARROW})
+    with BulletWorld() as outer:
+        with pytest.raises(error) as refused, world:
+            pytest.fail("the world was entered")
+        assert str(refused.value) == message
+        assert current_world.get() is outer
+        assert not world.entered
+        with pytest.raises(WorldClosed):
+            _ = world.client
+
+
+def test_a_snapshot_that_no_world_can_show_is_refused_in_one_line() -> None:
+    with pytest.raises(DuplicateName, match="an object named 'milk'"):
+        world_of(snapshot(then("milk"), then("milk")))
+    with pytest.raises(CallerError) as refused:
+        world_of(snapshot(then("drink", "LEMONADE")))
+    assert str(refused.value) == ("object 'drink' was recorded with the type 'LEMONADE', which ObjectType lacks here")
+    with pytest.raises(CallerError) as refused:
+        world_of(snapshot(then("milk")), descriptions={"melk": NARROW})
+    assert str(refused.value) == "the snapshot has no object 'melk' to describe; its objects: milk"
+
+
+def test_an_empty_snapshot_gives_an_empty_world_and_a_world_can_be_connected() -> None:
+    with world_of(snapshot()) as world:
+        assert world.objects == ()
+    world = world_of(snapshot(then("milk")), mode=WorldMode.DIRECT).connect()
+    assert [each.name for each in world.objects] == ["milk"]
+    world.close()
