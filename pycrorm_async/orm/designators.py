@@ -16,12 +16,14 @@ from __future__ import annotations
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ForeignKey
+from sqlalchemy import Dialect, ForeignKey, String
 from sqlalchemy.orm import Mapped, declared_attr, mapped_column, relationship
+from sqlalchemy.types import TypeDecorator
 
 from pycrorm_async.orm.base import Base, ProcessMetaData, RobotState
+from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
-from pycrorm_async.orm.types import ClassOfRow, JsonText
+from pycrorm_async.orm.types import JsonText
 
 if TYPE_CHECKING:
     from pycrorm_async.orm.tree import TaskTreeNode
@@ -92,6 +94,20 @@ class ParameterItem(Base):
             return self
         values = (self.integer, self.real, self.text, self.boolean, self.time)
         return next((value for value in values if value is not None), None)
+
+
+class ClassOfRow(TypeDecorator[str]):
+    """The discriminator of designators: a lineage, nearest name first, read as the identity of the nearest class.
+
+    `CarefulPickUpAction PickUpAction Action` becomes a `CarefulPickUpAction` if that class is mapped, else a
+    `PickUpAction`. No query compares it, so the rows of a type without a class are returned too.
+    """
+
+    impl = String
+    cache_ok = True
+
+    def process_result_value(self, value: str | None, dialect: Dialect) -> str | None:
+        return None if value is None else known_classes(dialect).identity(value, Designator.__mapper__.polymorphic_map)
 
 
 class Designator(Base):

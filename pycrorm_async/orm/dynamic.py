@@ -27,8 +27,9 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
 from pycrorm_async.orm.base import Base, Pose
 from pycrorm_async.orm.designators import Action, Designator, Language, Motion
+from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
-from pycrorm_async.orm.types import Moment, known_classes
+from pycrorm_async.orm.types import Moment
 
 __all__ = ["DynamicClasses"]
 

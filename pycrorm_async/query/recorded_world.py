@@ -19,7 +19,8 @@ from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType, WorldMode
 from pycrorm_async.world.errors import DescriptionNotLoadable, DuplicateName
-from pycrorm_async.world.models.primitives import built_in_urdf, stand_in_urdf
+from pycrorm_async.world.models.catalog import built_in_urdf
+from pycrorm_async.world.models.primitives import stand_in_urdf
 from pycrorm_async.world.objects import Object
 
 __all__ = ["world_of"]

@@ -26,7 +26,7 @@ from pycrorm_async.world.errors import (
     UnknownJoint,
     UnknownLink,
 )
-from pycrorm_async.world.models.primitives import built_in_urdf
+from pycrorm_async.world.models.catalog import built_in_urdf
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.pose import COORDINATE_MAX, Pose
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox

@@ -23,7 +23,7 @@ from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.models.primitives import built_in_urdf
+from pycrorm_async.world.models.catalog import built_in_urdf
 from tests.hooks.fakes import NoteActionPerformable, findings, rigged
 
 
