@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
 from pycrorm_async.events.types import Happening
-from pycrorm_async.projections.fold.column_values import row
+from pycrorm_async.projections.fold.column_values import in_slot, row
 from pycrorm_async.projections.schema.tables import Storage
 from pycrorm_async.projections.schema.user_views import UserView
 
@@ -63,7 +63,7 @@ class Event(NamedTuple):
 
     def row(self, sequence: int, slot: int = 0) -> int:
         """Return the id of a row of another event in the same episode; each event may have 32, by slot."""
-        return row(self.number, sequence, slot)
+        return in_slot(row(self.number, sequence), slot)
 
 
 class Changes:

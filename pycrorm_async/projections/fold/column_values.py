@@ -49,11 +49,11 @@ class CannotFold(ValueError):
     """The fold cannot make rows of an event; the message gives the reason."""
 
 
-def row(number: int, sequence: int, slot: int = 0) -> int:
-    """Return the id of a row. Raises `CannotFold` for a sequence or slot out of range."""
-    if 0 < sequence <= SEQUENCE_MAX and 0 <= slot <= SLOT_MAX:
-        return number * _ROWS_OF_EPISODE + sequence * _ROWS_OF_EVENT + slot  # `row_id` without its repeated checks
-    raise CannotFold(f"no row can have the sequence {sequence} and the slot {slot}")
+def row(number: int, sequence: int) -> int:
+    """Return the id of the row of an event. Raises `CannotFold` for a sequence out of range."""
+    if 0 < sequence <= SEQUENCE_MAX:
+        return number * _ROWS_OF_EPISODE + sequence * _ROWS_OF_EVENT  # `row_id` without its repeated checks
+    raise CannotFold(f"no row can have the sequence {sequence} and the slot 0")
 
 
 def in_slot(own: int, slot: int) -> int:

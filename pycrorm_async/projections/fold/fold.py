@@ -37,6 +37,21 @@ from pycrorm_async.projections.fold.column_values import (
     pose_row,
     row,
 )
+from pycrorm_async.projections.fold.node_row import (
+    DTYPE,
+    ID,
+    KIND,
+    PARENT_ID,
+    PROCESS_METADATA_ID,
+    ROBOT_OBJECT_ID,
+    ROBOT_POSE_ID,
+    ROBOT_TYPE,
+    RUNNING,
+    SIMULATED,
+    START_NS,
+    START_TIME,
+    TORSO_HEIGHT,
+)
 from pycrorm_async.projections.fold.parameters import Designators, ParameterRows
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, Row, Rows
 from pycrorm_async.store.stored import StoredEvent
@@ -81,27 +96,28 @@ def happening_of(event: StoredEvent) -> Happening:
 def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: Designators, rows: Rows) -> None:
     if event.number in rows.episodes:
         raise CannotFold("the episode starts a second time")
-    rows.episodes[event.number] = [
-        event.number,
-        microseconds(event.wall_ns),
-        started.created_by,
-        started.description,
-        started.software,
-        started.host,
-        started.python,
-        started.plan,
-        started.world,
-        started.seed,
-        "RUNNING",
-        None,
-        None,
-        None,
-        started.simulated,
-        started.thought_by.episode if started.thought_by else None,
-        started.thought_by.node if started.thought_by else None,
-        started.continues,
-        None,
-    ]
+    by = started.thought_by
+    rows.episodes[event.number] = {
+        "id": event.number,
+        "created_at": microseconds(event.wall_ns),
+        "created_by": started.created_by,
+        "description": started.description,
+        "version": started.software,
+        "host": started.host,
+        "python": started.python,
+        "plan": started.plan,
+        "world": started.world,
+        "seed": started.seed,
+        "status": "RUNNING",
+        "ended_at": None,
+        "failure_type": None,
+        "failure_message": None,
+        "simulated": started.simulated,
+        "thought_by": by.episode if by else None,
+        "thought_by_node": by.node if by else None,
+        "continues": started.continues,
+        "continued_in": None,
+    }
     if started.simulated:
         rows.inserts["simulated_episode"].append((event.number,))
 
@@ -133,33 +149,26 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     robot = started.robot
     robot_object = row(number, robot.object.row) if robot is not None and robot.object is not None else None
     # Nothing below raises, so that an event adds all of its rows or none.
+    rows.nodes[node] = columns = [*RUNNING]
+    columns[ID] = node
+    columns[PROCESS_METADATA_ID] = number
+    columns[PARENT_ID] = parent
+    columns[KIND] = started.kind
+    columns[START_TIME] = wall_ns // 1000
+    columns[START_NS] = monotonic_ns
+    if started.simulated:
+        columns[SIMULATED] = True
     if robot is not None:
         rows.inserts["pose"].append(pose_row(node + SLOT_ROBOT_POSE, number, robot.pose))
+        columns[ROBOT_POSE_ID] = node + SLOT_ROBOT_POSE
+        columns[TORSO_HEIGHT] = robot.torso_height
+        columns[ROBOT_TYPE] = robot.object_type
+        columns[ROBOT_OBJECT_ID] = robot_object
     if designator is not None:
+        columns[DTYPE] = designator.dtype
         rows.leaves.setdefault(designator.leaf, []).append(leaf)
         for table, each in parameter_rows:
             rows.inserts[table].append(each)
-    rows.nodes[node] = [
-        node,
-        number,
-        parent,
-        started.kind,
-        designator.dtype if designator is not None else None,
-        "RUNNING",
-        wall_ns // 1000,
-        None,
-        monotonic_ns,
-        None,
-        None,
-        None,
-        None,
-        None,
-        node + SLOT_ROBOT_POSE if robot is not None else None,
-        robot.torso_height if robot is not None else None,
-        robot.object_type if robot is not None else None,
-        robot_object,
-        started.simulated,
-    ]
 
 
 def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:

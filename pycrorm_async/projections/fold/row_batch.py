@@ -1,22 +1,23 @@
 """Collect the rows of one batch of events: those to insert, and changes to rows that the tables contain already.
 
-A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`; rows
-of nodes and episodes stay lists until the batch is complete, because later events change them.
+A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`. Until
+the batch is complete later events change the rows of nodes and episodes, which are lists (`node_row`) and dicts.
 """
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 from pycrorm_async.bulk_records import make
+from pycrorm_async.projections.fold.node_row import END_NS, END_TIME, OUTCOME, PROCESS_METADATA_ID, STATUS
 from pycrorm_async.projections.schema.tables import COLUMNS
 
 __all__ = ["Rows", "Row", "NodeEnd", "EpisodeEnd"]
 
 Row: TypeAlias = tuple[Any, ...]
 
-_NODE = COLUMNS["task_tree_node"]
-_EPISODE = COLUMNS["process_metadata"]
+_EPISODE_COLUMNS = itemgetter(*COLUMNS["process_metadata"])
 
 
 class NodeEnd(NamedTuple):
@@ -43,11 +44,7 @@ class EpisodeEnd(NamedTuple):
     continued_in: str | None
 
 
-_STATUS, _END_TIME, _END_NS = (_NODE.index(name) for name in ("status", "end_time", "end_ns"))
-_OUTCOME = slice(_NODE.index("reason"), _NODE.index("result") + 1)
-assert NodeEnd._fields == ("id", "status", "end_time", "end_ns", *_NODE[_OUTCOME])
-_EPISODE_END = tuple(_EPISODE.index(name) for name in EpisodeEnd._fields)
-_NODE_NUMBER = _NODE.index("process_metadata_id")
+assert NodeEnd._fields == ("id", "status", "end_time", "end_ns", *COLUMNS["task_tree_node"][OUTCOME])
 
 
 class Rows:
@@ -63,7 +60,7 @@ class Rows:
 
     def __init__(self) -> None:
         self.nodes: dict[int, list[Any]] = {}
-        self.episodes: dict[int, list[Any]] = {}
+        self.episodes: dict[int, dict[str, Any]] = {}
         self.inserts: dict[str, list[Row]] = {table: [] for table in COLUMNS}
         self.leaves: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
         self.node_ends: list[NodeEnd] = []
@@ -76,10 +73,10 @@ class Rows:
         if row is None:
             self.node_ends.append(make(NodeEnd, (node, status, end_time, end_ns, *outcome)))
             return
-        row[_STATUS] = status
-        row[_END_TIME] = end_time
-        row[_END_NS] = end_ns
-        row[_OUTCOME] = outcome
+        row[STATUS] = status
+        row[END_TIME] = end_time
+        row[END_NS] = end_ns
+        row[OUTCOME] = outcome
 
     def end_episode(self, end: EpisodeEnd) -> None:
         """Set the end of an episode's row, in this batch or in the tables."""
@@ -87,20 +84,19 @@ class Rows:
         if row is None:
             self.episode_ends.append(end)
         else:
-            for index, value in zip(_EPISODE_END, end, strict=True):
-                row[index] = value
+            row.update(end._asdict())
         if end.status == "LOST":
             self._lose_nodes(end.id)
 
     def _lose_nodes(self, number: int) -> None:
         self.lost.append(number)
         for row in self.nodes.values():
-            if row[_NODE_NUMBER] == number and row[_STATUS] == "RUNNING":
-                row[_STATUS] = "LOST"
+            if row[PROCESS_METADATA_ID] == number and row[STATUS] == "RUNNING":
+                row[STATUS] = "LOST"
 
     def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
         """Return all rows to insert, by (table, columns)."""
         self.inserts["task_tree_node"] = list(map(tuple, self.nodes.values()))
-        self.inserts["process_metadata"] = list(map(tuple, self.episodes.values()))
+        self.inserts["process_metadata"] = list(map(_EPISODE_COLUMNS, self.episodes.values()))
         core = {(table, COLUMNS[table]): rows for table, rows in self.inserts.items()}
         return {key: rows for key, rows in (core | self.leaves).items() if rows}

@@ -12,16 +12,13 @@ from typing import Any
 from pycrorm_async.events.ids import row_id, row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.projections.fold.fold import CannotFold, UndecodablePayload, fold_happening, happening_of
+from pycrorm_async.projections.fold.node_row import STATUS
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
-from pycrorm_async.projections.schema.tables import COLUMNS
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.store.stored import Span, StoredEvent
 
 __all__ = ["EpisodeCheck"]
-
-_STATUS = COLUMNS["task_tree_node"].index("status")
-_SIMULATED = COLUMNS["process_metadata"].index("simulated")
 
 
 class EpisodeCheck:
@@ -41,7 +38,7 @@ class EpisodeCheck:
         self.compared = False
         self.carried: frozenset[int] = frozenset()
         self._nodes: dict[int, list[Any]] = {}
-        self._row: list[Any] | None = None
+        self._row: dict[str, Any] | None = None
         self._order: OrderCheck | None = OrderCheck()
         self._in_gap = False
         self._lost: int | None = None
@@ -55,7 +52,7 @@ class EpisodeCheck:
         rows.nodes |= self._nodes
         if self._row is not None:
             rows.episodes[self.number] = self._row
-            if self._row[_SIMULATED]:
+            if self._row["simulated"]:
                 rows.inserts["simulated_episode"].append((self.number,))
 
     def read(
@@ -83,7 +80,7 @@ class EpisodeCheck:
         if self.compared:
             return
         first = row_id(self.number, 0, 0)
-        self._nodes = {key: row for key, row in rows.nodes.items() if key >= first and row[_STATUS] == "RUNNING"}
+        self._nodes = {key: row for key, row in rows.nodes.items() if key >= first and row[STATUS] == "RUNNING"}
         self.carried = frozenset(self._nodes)
         self._row = rows.episodes.pop(self.number, None)
         simulated = rows.inserts["simulated_episode"]
@@ -124,7 +121,7 @@ class EpisodeCheck:
         self._order = None
         if sequence <= folded and self._lost is None:
             self._lost = sequence
-            keys = (row_key(key) for key, row in rows.nodes.items() if row[_STATUS] == "RUNNING")
+            keys = (row_key(key) for key, row in rows.nodes.items() if row[STATUS] == "RUNNING")
             self._open_when_lost = {key.sequence for key in keys if key.number == self.number}
 
     def _damaged(self, sequence: int, reason: str) -> None:
