@@ -111,9 +111,7 @@ def _document(result: VerifyResult, ids: dict[int, str]) -> dict[str, Any]:
         return None if number is None else ids.get(number)
 
     return {
-        **{
-            name: value for name, value in result._asdict().items() if name not in ("damages", "differences", "stopped")
-        },
+        **vars(result),
         "damages": [{"episode": id_of(each.number), **each._asdict()} for each in result.damages],
         "stopped": [{"episode": id_of(each.number), **each._asdict()} for each in result.stopped],
         "differences": [{"episode": id_of(each.number), **each._asdict()} for each in result.differences],

@@ -380,7 +380,7 @@ def test_a_projection_that_cannot_be_is_refused_at_once(attributes: dict[str, An
 async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pycrorm_async.projections.verify.verify_custom._PART_EVENTS", 10)  # several parts
+    monkeypatch.setattr("pycrorm_async.projections.verify.parts._PART_EVENTS", 10)  # several parts
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 5)))]
     await folded(log, [*records, *tries(5).records[:6]], GraspRate())
     found = await verify(log, projections=[GraspRate()])

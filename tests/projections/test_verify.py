@@ -16,7 +16,7 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.types import EpisodeEnded, NodeStarted
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.verify import verify as verifying
+from pycrorm_async.projections.verify import parts
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.log import EventLog
@@ -115,7 +115,7 @@ async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault
     scripts = [full(1, rounds=2), lost(2), full(3, simulated=True)]
     await fold_in_batches(log, [], 1)
     await log.append([*TYPES, *(each for script in scripts for each in script.records)])
-    monkeypatch.setattr(verifying, "_PART_EVENTS", events)
+    monkeypatch.setattr(parts, "_PART_EVENTS", events)
     looks = 0
 
     async def fold() -> None:
@@ -142,7 +142,7 @@ async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault
 async def test_tables_that_are_made_anew_between_two_parts_are_no_fault(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(verifying, "_PART_EVENTS", 10)
+    monkeypatch.setattr(parts, "_PART_EVENTS", 10)
     told = 0
 
     async def rebuild() -> None:
@@ -168,7 +168,7 @@ async def test_an_episode_that_grows_between_two_parts_is_no_fault(
     stored = 12
     beginning.records = whole.records[:stored]
     await fold_in_batches(log, [beginning], 10_000)
-    monkeypatch.setattr(verifying, "_PART_EVENTS", 5)
+    monkeypatch.setattr(parts, "_PART_EVENTS", 5)
 
     async def record() -> None:
         other = await opened(database_url)
@@ -316,7 +316,7 @@ async def test_a_table_that_is_gone_is_told_in_a_line(log: EventLog, database_ur
 async def test_while_robots_record_and_tables_are_folded_and_made_anew_nothing_false_is_found(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(verifying, "_PART_EVENTS", 60)
+    monkeypatch.setattr(parts, "_PART_EVENTS", 60)
     done = asyncio.Event()
 
     async def again_and_again(step: Callable[[], Awaitable[object]]) -> None:

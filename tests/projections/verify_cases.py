@@ -6,6 +6,7 @@ import asyncio
 import json
 import threading
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import pytest
@@ -36,7 +37,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.verify import verify as verifying
+from pycrorm_async.projections.verify import parts
 from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -143,13 +144,13 @@ async def look(log: EventLog, *, episode: int | None = None) -> VerifyResult:
 
 def findings(found: VerifyResult) -> tuple[Any, ...]:
     """In an order that does not depend on the parts in which the log was read."""
-    whole = found._replace(damages=[], differences=[])
-    return (*whole, sorted(found.damages, key=repr), sorted(found.differences, key=repr))
+    whole = replace(found, damages=[], differences=[])
+    return (whole, sorted(found.damages, key=repr), sorted(found.differences, key=repr))
 
 
 async def in_parts(log: EventLog, events: int, monkeypatch: pytest.MonkeyPatch) -> VerifyResult:
     with monkeypatch.context() as patched:
-        patched.setattr(verifying, "_PART_EVENTS", events)
+        patched.setattr(parts, "_PART_EVENTS", events)
         return await look(log)
 
 

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from pycrorm_async.projections.verify.row_comparison import Difference
 
 __all__ = ["Damage", "StoppedEpisode", "VerifyResult"]
+
+_FINDINGS_MAX = 100
+"""Bounds the findings of each kind that are kept; all are counted."""
 
 
 class Damage(NamedTuple):
@@ -31,8 +35,9 @@ class StoppedEpisode(NamedTuple):
     reason: str
 
 
-class VerifyResult(NamedTuple):
-    """The result of a verification.
+@dataclass(kw_only=True)
+class VerifyResult:
+    """The result of a verification, complete when `verify` returns it.
 
     Attributes:
         episodes, events, rows: the number of each that was checked.
@@ -46,16 +51,28 @@ class VerifyResult(NamedTuple):
         outdated: the reason why no table was compared: an older fold made them. None for tables of this version.
     """
 
-    episodes: int
-    events: int
-    rows: int
-    behind: int
-    damage: int
-    drift: int
-    damages: list[Damage]
-    differences: list[Difference]
-    remarks: int
-    not_compared: Mapping[str, str]
-    stopped: list[StoppedEpisode]
-    unmade: Mapping[str, str]
-    outdated: str | None
+    episodes: int = 0
+    events: int = 0
+    rows: int = 0
+    behind: int = 0
+    damage: int = 0
+    drift: int = 0
+    damages: list[Damage] = field(default_factory=list)
+    differences: list[Difference] = field(default_factory=list)
+    remarks: int = 0
+    not_compared: Mapping[str, str] = field(default_factory=dict)
+    stopped: list[StoppedEpisode] = field(default_factory=list)
+    unmade: Mapping[str, str] = field(default_factory=dict)
+    outdated: str | None = None
+
+    def add_damage(self, number: int | None, sequence: int | None, reason: str) -> None:
+        """Count a damage and keep it, unless there are many."""
+        self.damage += 1
+        if len(self.damages) < _FINDINGS_MAX:
+            self.damages.append(Damage(number, sequence, " ".join(reason.split())))
+
+    def add_difference(self, difference: Difference) -> None:
+        """Count a difference and keep it, unless there are many."""
+        self.drift += 1
+        if len(self.differences) < _FINDINGS_MAX:
+            self.differences.append(difference)
