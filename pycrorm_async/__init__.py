@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pycrorm_async.projections.custom.projection import Projection
     from pycrorm_async.projections.schema.user_views import UserView
     from pycrorm_async.query.reading import Reading
+    from pycrorm_async.query.recorded_designator import performable_of
     from pycrorm_async.query.recorded_world import world_of
     from pycrorm_async.settings import Settings
 
@@ -35,6 +36,7 @@ __all__ = [
     "Reading",
     "Settings",
     "UserView",
+    "performable_of",
     "recover",
     "world_of",
 ]
@@ -47,6 +49,7 @@ _MODULES = {
     "Reading": "query.reading",
     "Settings": "settings",
     "UserView": "projections.schema.user_views",
+    "performable_of": "query.recorded_designator",
     "recover": "operations.recovery",
     "world_of": "query.recorded_world",
 }

@@ -19,16 +19,15 @@ import pytest
 from sqlalchemy import select
 
 import pycrorm_async
-from pycrorm_async import Reading, world_of
+from pycrorm_async import Reading, performable_of, world_of
 from pycrorm_async.events.types import NodeEnded, NodeStarted
 from pycrorm_async.hooks.event_feed import RecordedEvent
-from pycrorm_async.orm import Designator, NavigateAction, PickUpAction, PlaceAction
+from pycrorm_async.orm import Designator, NavigateAction
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.plan import (
     ActionAbstract,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
-    ObjectDesignatorDescription,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
     PlaceActionPerformable,
@@ -48,7 +47,6 @@ from tests.promises.lab import (
     nodes_of,
     remembered,
     statuses,
-    turned,
     url_of,
 )
 
@@ -189,24 +187,9 @@ async def test_every_stored_node_can_be_read_back_as_what_it_was(tmp_path: Path)
     # From the rows alone the same plan again, in a new world, with the same end.
     with lab() as again:
         for row in rows:
-            await performable(row).perform()
+            await performable_of(row).perform()
         assert again.milk.pose.distance(resting) < 1e-9
         assert again.robot.joint_positions() == pytest.approx(joints, abs=1e-9)
-
-
-def performable(row: Any) -> ActionAbstract:
-    """The action a row tells of."""
-    if isinstance(row, NavigateAction):
-        return NavigateActionPerformable(Pose(at(row.pose), turned(row.pose)))
-    if isinstance(row, PickUpAction):
-        milk = ObjectDesignatorDescription(names=[row.object.name]).resolve()
-        return PickUpActionPerformable(milk, row.arm, row.grasp)
-    if isinstance(row, PlaceAction):
-        milk = ObjectDesignatorDescription(names=[row.object.name]).resolve()
-        return PlaceActionPerformable(milk, row.arm, Pose(at(row.pose), turned(row.pose)))
-    if row.dtype == "ParkArmsAction":
-        return ParkArmsActionPerformable(row.arm)
-    return MoveTorsoActionPerformable(row.position)
 
 
 async def test_alternatives_that_all_fail_are_a_failure(tmp_path: Path) -> None:

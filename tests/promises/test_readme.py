@@ -33,7 +33,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 [TIDY] = python_of("pycrorm_async/plan/README.md")
-THEN, RATE = python_of("pycrorm_async/query/README.md")
+THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 [BETTER] = python_of("pycrorm_async/learning/README.md")
 
 
@@ -147,11 +147,13 @@ with BulletWorld() as world:
     body = (
         textwrap.indent(setting, "    ")
         + textwrap.indent(THEN, "            ")
-        + "            return then, milk.pose, recorded.object('milk').pose, milk_in_hand"
+        + "            milk_then = recorded.object('milk').pose\n"
+        + textwrap.indent(AGAIN, "            ")
+        + "            return then, milk.pose, milk_then, milk_in_hand, recorded.object('milk').attached_to"
     )
     exec(f"async def asked():\n{body}", names)
     asked = names["asked"]
-    then, pose, recorded, held = await asked()  # type: ignore[operator]
+    then, pose, recorded, held, holding = await asked()  # type: ignore[operator]
     assert [each.dtype for each in then.running][:2] == [None, "TransportAction"]
     assert then.world.object("milk").pose.position == pytest.approx(pose.position)
     with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
@@ -159,6 +161,7 @@ with BulletWorld() as world:
         *_, there = plain.execute(f"{question} ORDER BY object.id", ((1 << 31) + (116 << 5),)).fetchall()
     assert pose.position == recorded.position == pytest.approx(there)
     assert held == (then.world.object("milk").attached_to is not None)
+    assert holding.name == "pr2"  # it has picked up the milk again
 
 
 async def test_a_policy_is_learned_from_what_is_remembered_and_used(

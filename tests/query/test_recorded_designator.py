@@ -1,0 +1,271 @@
+"""A designator made from its row has the parameters it had, or says in one line which one it cannot have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+from sqlalchemy.orm import undefer
+
+from pycrorm_async import Memory, performable_of
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm import Action, Designator
+from pycrorm_async.plan import (
+    ActionAbstract,
+    BelieveObject,
+    LocatedObject,
+    MoveArmJointsMotion,
+    NavigateActionPerformable,
+    ObjectDesignator,
+    ObjectPart,
+    ResolutionError,
+)
+from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.query.recorded_designator import NotPerformable
+from pycrorm_async.world import Arms, Object, ObjectType, Pose
+from pycrorm_async.world.errors import NoWorld, ObjectNotInWorld
+from tests.memory.note_actions import NoteActionPerformable
+from tests.promises.lab import CEREAL_AT, Lab, asked, lab, remembered, url_of
+
+pytestmark = pytest.mark.slow
+
+
+class Taste(Enum):
+    SWEET = 1
+    SOUR = 2
+
+
+@dataclass
+class Recipe:
+    taste: Taste
+    spoons: list[int]
+    inner: Recipe2 | None = None
+
+
+@dataclass
+class Recipe2:
+    comment: str
+
+
+@dataclass
+class CookActionPerformable(ActionAbstract):
+    text: str
+    count: int
+    weight_kg: float
+    hot: bool
+    start: datetime
+    arm: Arms
+    taste: Taste
+    place: Pose
+    milk: Object
+    cereal: ObjectDesignator | Object
+    finger: ObjectPart
+    believed: BelieveObject
+    located: LocatedObject
+    frozen: ObjectDesignator
+    recipe: Recipe
+    words: Sequence[str]
+    poses: tuple[Pose, ...]
+    objects: list[ObjectDesignator]
+    tastes: dict[Arms, Taste]
+    note: NoteActionPerformable
+    other_recipe: Recipe | None = None
+    maybe: int | None = None
+    empty: list[float] = field(default_factory=list)
+    nothing: list[float] | None = None
+    _cache: str = "not recorded"
+
+    async def perform(self) -> None:
+        """Cooked."""
+
+
+class MixActionPerformable(ActionAbstract):
+    def __init__(self, first: str, *rest: int, speed: float = 1.0, **options: str) -> None:
+        self.everything = (first, rest, speed, options)
+
+    async def perform(self) -> None:
+        """Mixed."""
+
+
+def cooking(scene: Lab) -> CookActionPerformable:
+    return CookActionPerformable(
+        text="salt",
+        count=2**40,
+        weight_kg=0.1,
+        hot=False,
+        start=datetime(2024, 7, 1, 12, 30, 0, 123456, tzinfo=UTC),
+        arm=Arms.BOTH,
+        taste=Taste.SOUR,
+        place=Pose([1, 2, 3], [0, 0.6, 0, 0.8], "odom"),
+        milk=scene.milk,
+        cereal=scene.cereal,
+        finger=ObjectPart("l_gripper_tool_frame", scene.robot),
+        believed=BelieveObject("bowl", ObjectType.BOWL, Pose([4, 5, 6])),
+        located=LocatedObject("cup", ObjectType.JEROEN_CUP, Pose([0, 0.2, 0]), scene.cereal),
+        frozen=designator_of(scene.milk).frozen_copy(),
+        recipe=Recipe(Taste.SWEET, [1, 2], Recipe2("stir")),
+        words=["a", "b"],
+        poses=(Pose([1, 0, 0]), Pose([2, 0, 0])),
+        objects=[designator_of(scene.cereal), designator_of(scene.milk)],
+        tastes={Arms.LEFT: Taste.SOUR, Arms.RIGHT: Taste.SWEET},
+        note=NoteActionPerformable("inside"),
+    )
+
+
+@pytest.mark.parametrize("options", [(), (undefer(Designator.parameters),)])
+async def test_every_kind_of_parameter_comes_back(tmp_path: Path, options: tuple[Any, ...]) -> None:
+    async with remembered(tmp_path):
+        with lab() as scene:
+            cooked = cooking(scene)
+            await cooked.perform()
+            scene.milk.set_pose(Pose([9, 9, 9]))
+    (row,) = await asked(tmp_path, select(Action).options(*options))
+    with lab() as again:
+        again.cereal.set_pose(Pose([7, 7, 7]))
+        made = performable_of(row)
+        assert type(made) is CookActionPerformable
+        same = "text count weight_kg hot start arm taste place recipe words poses tastes note other_recipe maybe empty"
+        assert [getattr(made, name) for name in same.split()] == [getattr(cooked, name) for name in same.split()]
+        assert (made.nothing, made._cache, made.place.time_ns) == (
+            None,
+            "not recorded",
+            cooked.place.time_ns // 1000 * 1000,
+        )
+        assert made.milk is again.milk
+        assert made.cereal == designator_of(again.cereal)
+        assert made.objects == [designator_of(again.cereal), designator_of(again.milk)]
+        assert (made.finger, made.believed) == (ObjectPart("l_gripper_tool_frame", again.robot), cooked.believed)
+        assert made.frozen == cooked.frozen
+        assert made.frozen.pose.position == (1.3, 1.0, 0.9)
+        assert type(made.located) is LocatedObject
+        assert (made.located.name, made.located.reference) == ("cup", designator_of(again.cereal))
+        assert made.located.relative_pose.position == pytest.approx((0, 0.2, 0))
+        assert abs(made.located.timestamp - cooked.located.timestamp).total_seconds() < 1e-5
+        assert made.located.pose.position == pytest.approx((7, 7.2, 7))
+    assert CEREAL_AT != (7, 7, 7)
+
+
+async def test_arguments_of_a_class_that_is_no_dataclass_come_back_and_may_be_replaced(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        for mixed in (
+            MixActionPerformable("a", 1, 2, speed=0.5, sugar="much"),
+            MixActionPerformable("b"),
+        ):
+            await mixed.perform()
+    first, second = await asked(tmp_path, select(Action).order_by(Action.id))
+    assert performable_of(first).everything == ("a", (1, 2), 0.5, {"sugar": "much"})  # type: ignore[attr-defined]
+    assert performable_of(second).everything == ("b", (), 1.0, {})  # type: ignore[attr-defined]
+    assert performable_of(second, first="c", speed=2.0).everything == ("c", (), 2.0, {})  # type: ignore[attr-defined]
+    with pytest.raises(CallerError) as refused:
+        performable_of(second, velocity=2.0)
+    assert str(refused.value) == "MixAction has no parameter 'velocity'; its parameters: first, rest, speed, options"
+
+
+async def test_a_motion_comes_back_with_its_joints(tmp_path: Path) -> None:
+    targets = {"l_wrist_roll_joint": 0.5}
+    async with remembered(tmp_path):
+        with lab():
+            await MoveArmJointsMotion(targets).perform()
+    (row,) = await asked(tmp_path, select(Designator))
+    assert performable_of(row) == MoveArmJointsMotion(targets, None)
+
+
+@dataclass
+class StrangeActionPerformable(ActionAbstract):
+    kind_of_thing: str
+    numbers: list[float]
+    number: float | None
+    anything: Any = None
+
+    async def perform(self) -> None:
+        """Odd."""
+
+
+async def strange_row(folder: Path, *options: Any) -> Any:
+    """Of an action whose fields were recorded as missing."""
+    async with Memory.open(url_of(folder)) as memory:
+        async with memory.episode():
+            await StrangeActionPerformable("odd", [float("nan")], float("inf"), object()).perform()
+        await memory.flush()
+    (row,) = await asked(folder, select(Action).options(*options))
+    return row
+
+
+async def test_a_parameter_that_was_not_recorded_is_named_with_the_reason_and_may_be_passed(tmp_path: Path) -> None:
+    row = await strange_row(tmp_path, undefer(Action.parameters))
+    passed: dict[str, Any] = {}
+    for name, reason in (
+        ("numbers", "it was not recorded, because nan is not a finite number"),
+        ("number", "it was not recorded, because inf is not a finite number"),
+        ("anything", "it was not recorded, because has the type Any"),
+    ):
+        with pytest.raises(NotPerformable) as refused:
+            performable_of(row, **passed)
+        message = str(refused.value)
+        assert message.startswith(f"row {row.id} of StrangeAction has no value for {name!r}: {reason}")
+        assert message.endswith(f"; pass one, as in performable_of(row, {name}=…)")
+        passed[name] = [1.0] if name == "numbers" else 1.0
+    assert performable_of(row, **passed) == StrangeActionPerformable("odd", [1.0], 1.0, 1.0)
+
+
+async def test_objects_and_places_that_the_present_world_lacks_are_named(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        with lab() as scene:
+            await cooking(scene).perform()
+    (row,) = await asked(tmp_path, select(Action))
+    with pytest.raises(NoWorld):
+        performable_of(row)
+    with lab() as again:
+        again.milk.remove()
+        with pytest.raises(ObjectNotInWorld) as refused:
+            performable_of(row)
+    assert str(refused.value) == "'milk' is not in the world; its objects are: pr2, cereal"
+
+
+async def test_a_class_that_is_not_imported_and_one_that_is_there_twice_are_named(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        await NoteActionPerformable("once").perform()
+        await (NoteActionPerformable("a") + NoteActionPerformable("b")).perform()
+    row, sequence, *_ = await asked(tmp_path, select(Designator).order_by(Designator.id))
+    with pytest.raises(NotPerformable) as refused:
+        performable_of(sequence)
+    assert str(refused.value) == (
+        "Sequential is an expression: combine the designators of the rows whose nodes are children of node"
+        f" {sequence.id}"
+    )
+    row.dtype = "VanishedAction"
+    with pytest.raises(NotPerformable) as refused:
+        performable_of(row)
+    assert str(refused.value) == ("no imported class has the dtype 'VanishedAction': import the module that defines it")
+
+    class Here(NoteActionPerformable):
+        dtype = "TwiceAction"
+
+    class There(NoteActionPerformable):
+        aliases = ("TwiceAction",)
+
+    row.dtype = "TwiceAction"
+    with pytest.raises(NotPerformable) as refused:
+        performable_of(row)
+    path = f"{__name__}.test_a_class_that_is_not_imported_and_one_that_is_there_twice_are_named.<locals>"
+    assert str(refused.value) == f"several classes have the dtype 'TwiceAction': {path}.Here, {path}.There"
+
+
+async def test_values_that_no_longer_fit_the_class_are_refused(tmp_path: Path) -> None:
+    async with remembered(tmp_path):
+        with lab() as scene:
+            await cooking(scene).perform()
+            await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    cooked, drove = await asked(tmp_path, select(Action).order_by(Action.id))
+    with pytest.raises(ResolutionError, match=r"target_location: expected Pose"):
+        performable_of(drove, target_location="the kitchen")
+    cooked.taste = "BITTER"
+    with lab(), pytest.raises(NotPerformable) as refused:
+        performable_of(cooked)
+    assert str(refused.value) == "Taste has no member 'BITTER', which was recorded; it has: SWEET, SOUR"
