@@ -23,12 +23,13 @@ resume, and a row under `gone` all that it needs to drop the tables.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import msgspec
-from sqlalchemy import Integer, Text, column, delete, select, table, text
+from sqlalchemy import Dialect, Integer, Text, column, delete, literal, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement, Index
 
@@ -97,6 +98,13 @@ INSERT INTO {_NOTES} (projection, version, generation, revision, layout, views)
 VALUES (:projection, :version, :generation, :revision, :layout, :views)
 ON CONFLICT (projection) DO UPDATE SET version = excluded.version, generation = excluded.generation,
  revision = excluded.revision, layout = excluded.layout, views = excluded.views""")  # noqa: S608
+_Stored: TypeAlias = Callable[[str], str]
+"""Maps a column to its name in a database."""
+
+_TEXTS_KEPT = 512
+"""Bounds the tables whose statements are kept: a new memory has 62. A process that opens many memories, as tests do,
+otherwise spends half of the time of opening on compiling the same statements again."""
+
 _notes = table(
     _NOTES,
     column("projection", Text()),
@@ -237,11 +245,12 @@ def view_texts_of(
     """
     layout, number = generation.layout, generation.number
     stored = dialect_of(connection).stored_column
-    selects = public_views(layout, number, stored, simulated=simulated)
+    built_in = _built_in_views(msgspec.json.encode(layout), number, stored, _syntax_of(connection), simulated=simulated)
     texts = dict(layout.user_views) if simulated else shown_texts(layout, number, stored)
     # A name registered for a user's view may have become built-in since; the built-in definition wins.
-    users = {name: each for name, each in texts.items() if name not in selects}
-    taken = {name.lower() for name in (*selects, *users)}
+    users = {name: each for name, each in texts.items() if name not in built_in}
+    taken = {name.lower() for name in (*built_in, *users)}
+    custom: dict[str, str] = {}
     own: dict[str, str] = {}
     for name, each in projections.items():
         names = {view.removeprefix(OWN).lower() for view in (*each.layout.leaves, *each.layout.user_views)}
@@ -250,24 +259,56 @@ def view_texts_of(
             _log.warning("the projection %s has no views: the names %s belong to the memory", name, names_taken)
             continue
         taken |= names
-        selects |= projection_views(each.layout, each.number, number, stored, simulated=simulated)
+        selects = projection_views(each.layout, each.number, number, stored, simulated=simulated)
+        custom |= {view: view_text(select_, connection.dialect) for view, select_ in selects.items()}
         own |= each.layout.user_views
-    return {name: view_text(each, connection.dialect) for name, each in selects.items()} | users | own
+    return {**built_in, **custom, **users, **own}
+
+
+@dataclass(frozen=True)
+class _Syntax:
+    """A dialect of SQLAlchemy, equal to every other one that writes the same SQL: each engine has its own."""
+
+    dialect: Dialect = field(compare=False)
+    name: str
+    backslash: str
+    """As a literal. PostgreSQL has a setting by which it is doubled."""
+
+
+def _syntax_of(connection: AsyncConnection) -> _Syntax:
+    dialect = connection.dialect
+    return _Syntax(dialect, dialect.name, view_text(literal("\\", Text()), dialect))
+
+
+@lru_cache(maxsize=8)
+def _built_in_views(
+    layout: bytes, number: int, stored: _Stored, syntax: _Syntax, *, simulated: bool
+) -> Mapping[str, str]:
+    selects = public_views(msgspec.json.decode(layout, type=Layout), number, stored, simulated=simulated)
+    return {name: view_text(each, syntax.dialect) for name, each in selects.items()}
 
 
 async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[str, Storage]], generation: int) -> None:
     """Create these tables of a generation, given by name and columns, with their indexes."""
     statements: list[str] = []
+    stored, syntax = dialect_of(connection).stored_column, _syntax_of(connection)
     for name, columns in tables.items():
-        table = make_table(name, dict(columns), generation, dialect_of(connection).stored_column)
-        indexes = sorted(table.indexes, key=lambda each: str(each.name))
-        definitions: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
-        statements += [str(each.compile(dialect=connection.dialect)) for each in definitions]
+        statements += _definitions(name, tuple(columns.items()), generation, stored, syntax)
     if statements:
         await dialect_of(connection).execute_all(connection, statements)
         await dialect_of(connection).expect(
             connection, [expected(name, dict(columns), generation) for name, columns in tables.items()]
         )
+
+
+@lru_cache(maxsize=_TEXTS_KEPT)
+def _definitions(
+    name: str, columns: tuple[tuple[str, Storage], ...], generation: int, stored: _Stored, syntax: _Syntax
+) -> tuple[str, ...]:
+    table = make_table(name, dict(columns), generation, stored)
+    indexes = sorted(table.indexes, key=lambda each: str(each.name))
+    definitions: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
+    return tuple(str(each.compile(dialect=syntax.dialect)) for each in definitions)
 
 
 async def _add_columns(
