@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.databases import Server, server_in
+from tests.databases import Server, server_in_memory
 from tests.soak_turns import TURN_S_MAX, current_commit, place_of, turn_of
 
 _BEGAN = pytest.StashKey[float]()
@@ -18,7 +17,7 @@ _BEGAN = pytest.StashKey[float]()
 @pytest.fixture(scope="session")
 def server() -> Iterator[Server]:
     """A server with short paths, as a socket's has to be."""
-    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
+    with server_in_memory() as running:
         yield running
 
 

@@ -6,8 +6,10 @@ import asyncio
 import contextlib
 import itertools
 import os
+import shutil
 import signal
 import sqlite3
+import tempfile
 import threading
 import time
 import warnings
@@ -19,7 +21,10 @@ from urllib.parse import urlsplit
 
 import asyncpg
 
-__all__ = ["Server", "server_in", "ask", "ask_to_change", "await_events", "in_a_loop_of_its_own"]
+__all__ = ["Server", "server_in", "server_in_memory", "ask", "ask_to_change", "await_events", "in_a_loop_of_its_own"]
+
+_ROOM_BYTES: Final = 4 << 30
+"""A server takes 200 MB, and each process that runs tests starts one, or two."""
 
 
 class Server:
@@ -90,7 +95,8 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
         server = get_server(str(folder))
     running = Server(folder, server)
     if not syncs:
-        for change in ("SET fsync = off", "SET full_page_writes = off"):
+        # Whether a table was vacuumed or analysed meanwhile shall depend on no clock.
+        for change in ("SET fsync = off", "SET full_page_writes = off", "SET autovacuum = off"):
             in_a_loop_of_its_own(_run(running.url(), f"ALTER SYSTEM {change}", ()))
         in_a_loop_of_its_own(_run(running.url(), "SELECT pg_reload_conf()", ()))
     try:
@@ -100,6 +106,21 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
         server._postmaster_info = None  # where nobody reaps it, it would be stopped once more, in vain and aloud
         server.cleanup()
         lock.unlink(missing_ok=True)
+
+
+@contextmanager
+def server_in_memory() -> Iterator[Server]:
+    """A server that never syncs, and whose files are in memory where there is room for them.
+
+    On a disk, to drop a database waits until some hundred files were written that nobody reads.
+    """
+    memory = Path("/dev/shm")
+    roomy = memory.is_dir() and os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > _ROOM_BYTES
+    with (
+        tempfile.TemporaryDirectory(prefix="pg", dir=memory if roomy else None) as folder,
+        server_in(Path(folder), syncs=False) as running,
+    ):
+        yield running
 
 
 def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> list[Any]:

@@ -2,7 +2,6 @@
 
 import random
 import sqlite3
-import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.crash.robot_processes import Lab
-from tests.databases import Server, server_in
+from tests.databases import Server, server_in_memory
 
 pytestmark = pytest.mark.slow
 
@@ -58,7 +57,7 @@ def test_daemons_and_plans_are_killed_a_hundred_times(
 
 @pytest.fixture
 def own_server() -> Iterator[Server]:
-    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
+    with server_in_memory() as running:
         yield running
 
 

@@ -8,9 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import random
-import tempfile
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -26,7 +24,7 @@ from pycrorm_async.store.postgresql import engine
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
-from tests.databases import Server, ask, server_in
+from tests.databases import Server, ask, server_in_memory
 from tests.store.factories import declaration, episode, run_of
 from tests.writer.fakes import KeptSource
 
@@ -251,7 +249,7 @@ async def test_the_server_asks_after_a_machine_that_says_nothing_any_more_in_the
 @pytest.fixture
 def own_server() -> Iterator[Server]:
     """A server to be killed."""
-    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
+    with server_in_memory() as running:
         yield running
 
 

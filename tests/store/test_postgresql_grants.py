@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import asyncpg
@@ -15,7 +13,7 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
-from tests.databases import Server, ask, server_in
+from tests.databases import Server, ask, server_in_memory
 from tests.store.factories import episode, run_of
 
 pytestmark = pytest.mark.slow
@@ -24,7 +22,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def new_server() -> Iterator[Server]:
     """A server that never had the roles of a memory, which belong to a whole server."""
-    with tempfile.TemporaryDirectory(prefix="pg") as folder, server_in(Path(folder), syncs=False) as running:
+    with server_in_memory() as running:
         yield running
 
 
