@@ -226,7 +226,7 @@ def _drain_if_mine(folder: str, barrier: object) -> None:
     for name, sequence, payload in events_of(records):
         recorder_process.say("drained", name, sequence, payload)
     asyncio.run(recovered.acknowledge(records[-1].position))
-    recovered.remove()
+    recovered.release()
 
 
 def second_openers(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:

@@ -142,10 +142,8 @@ async def _step(machine: Machine, life: _Life, destination: _Faulty, rng: random
 async def _drained(folder: Path, log: EventLog, rng: random.Random) -> None:
     """What the next process does with the folder, cancelled and begun again at random."""
     for attempt in range(30):
-        recovered = open_dead(folder)
+        recovered = open_dead(folder, check=rng.random() < 0.5)
         assert recovered is not None
-        if rng.random() < 0.5:
-            recovered.check()
         settings = Settings(batch_events_max=rng.choice((1, 5, 100)))
         drain = Drain(recovered, _Faulty(log, rng).append, settings=settings, backoff=_AT_ONCE)
         running = asyncio.create_task(drain.run())
@@ -155,10 +153,8 @@ async def _drained(folder: Path, log: EventLog, rng: random.Random) -> None:
             running.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await running
-        if recovered.all_stored:
-            recovered.remove()
+        if recovered.release() is not None:
             return
-        recovered.release()
 
 
 def simulated(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:

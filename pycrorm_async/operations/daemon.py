@@ -3,8 +3,8 @@
 Theory of operation. The actors are the daemon process, its fold workers (`fold_workers`), and the recorders, which are
 other processes with a folder each in the spool. One daemon drains a spool: it takes the spool's `writer` lock file,
 whose note also publishes the states of the fold workers to `pycrorm status`. `_Folders` finds the folders and claims
-each by its `drain` lock. The folder of a living recorder (`_LivingSource`) is drained as far as it is synced, and
-released when the recorder ends; that of a dead one (`_DeadSource`) is read to its end, completed with LOST ends, and
+each by its `drain` lock. The folder of a living recorder (`LiveSource`) is drained as far as it is synced, and
+released when the recorder ends; that of a dead one (`DeadSource`) is read to its end, completed with LOST ends, and
 deleted once everything in it is stored. A folder that cannot be claimed is reported and does not delay the others.
 
 A recorder may die at any moment; its folder is then claimed again as that of a dead one, and records that were stored
@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
 
@@ -25,7 +25,6 @@ import msgspec
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseForeign, SpoolTaken
-from pycrorm_async.events.envelope import Record
 from pycrorm_async.operations.destination import open_destination, shared_address
 from pycrorm_async.operations.fold_process import FoldProcess
 from pycrorm_async.operations.fold_worker import Assignment
@@ -36,13 +35,13 @@ from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
-from pycrorm_async.queue.sources.dead_source import RecoveredQueue, open_dead
-from pycrorm_async.queue.sources.live_source import LiveQueue
+from pycrorm_async.queue.sources.dead_source import open_dead
+from pycrorm_async.queue.sources.live_source import LiveSource
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, DaemonSummary
-from pycrorm_async.writer.ports import ClaimedSource, ReleaseOutcome, ScanResult, Tables
+from pycrorm_async.writer.ports import ClaimedSource, ScanResult, Tables
 
 __all__ = ["serve"]
 
@@ -136,7 +135,7 @@ class _Folders:
             self._spool.bind(self._log_id)
         for folder in folders:
             try:
-                source = _claim(folder, self._stored, again=folder.name in self._taken)
+                source = self._claim(folder)
             except Exception as error:  # noqa: BLE001 - reported for this folder; the others are drained
                 failed[folder.name] = folder_error(folder.path, error)
             else:
@@ -144,6 +143,13 @@ class _Folders:
                     claimed.append(source)
                     self._taken.add(folder.name)
         return ScanResult(claimed, failed)
+
+    def _claim(self, folder: RecorderFolder) -> ClaimedSource | None:
+        """Claim a folder as that of a living or a dead recorder; None if another process has it."""
+        if folder.alive:
+            return LiveSource.take(folder.path)
+        # Check a folder that comes back whole: damage further on would make the daemon store its start each time.
+        return open_dead(folder.path, stored=self._stored, check=folder.name in self._taken)
 
 
 def _identity(file: Path | None) -> tuple[int, int] | None:
@@ -153,71 +159,3 @@ def _identity(file: Path | None) -> tuple[int, int] | None:
     except OSError:
         return None
     return None if status is None else (status.st_dev, status.st_ino)
-
-
-def _claim(folder: RecorderFolder, stored: StoredSegments | None = None, *, again: bool) -> ClaimedSource | None:
-    """Claim a folder as that of a living or a dead recorder; None if another process has it."""
-    if folder.alive:
-        return _LivingSource.take(folder.path)
-    dead = open_dead(folder.path, stored=stored)
-    if dead is None:
-        return None
-    try:
-        if again:  # check all of it first: damage further on would make the daemon store the start again each time
-            dead.check()
-    except BaseException:
-        dead.release()
-        raise
-    return _DeadSource(dead)
-
-
-class _LivingSource(LiveQueue):
-    """The claimed folder of a living recorder. Implements `ClaimedSource`."""
-
-    def release_folder(self) -> ReleaseOutcome:
-        is_alive, closed = self.is_alive, self.is_closed
-        self.release()
-        what = "has ended" if closed else "is left at work" if is_alive else "died"
-        return ReleaseOutcome(what, whole=self.stored == self.supplied or not is_alive)
-
-
-class _DeadSource(ClaimedSource):
-    """The claimed folder of a dead recorder. No process waits for its records, so visibility is not reported to it."""
-
-    is_alive = False
-
-    def __init__(self, queue: RecoveredQueue) -> None:
-        self._queue = queue
-
-    @property
-    def name(self) -> str:
-        return self._queue.name
-
-    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
-        return await self._queue.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
-
-    async def acknowledge(self, position: int) -> None:
-        await self._queue.acknowledge(position)
-
-    def dead_letter(self, records: Sequence[Record]) -> bool:
-        return self._queue.dead_letter(records)
-
-    def fail(self, reason: str) -> None:
-        self._queue.fail(reason)
-
-    def finish(self) -> None:
-        """Do nothing, because a dead recorder's queue is complete."""
-
-    def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None: ...
-
-    def mark_unavailable(self, reason: str | None) -> None: ...
-
-    def release_folder(self) -> ReleaseOutcome:
-        if not self._queue.all_stored:
-            self._queue.release()
-            return ReleaseOutcome("is kept", whole=False, again=not self._queue.holds_refused)
-        self._queue.remove()
-        count = len(self._queue.lost)
-        return ReleaseOutcome(
-            f"is recovered ({count} episode{'s' * (count != 1)} LOST)" if count else "is recovered", whole=True
-        )

@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import episode_text
+from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.operations.destination import open_destination, shared_address
 from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
@@ -24,10 +24,9 @@ from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
-from pycrorm_async.queue.sources.dead_source import RecoveredQueue, open_dead
-from pycrorm_async.queue.sources.live_source import LiveQueue
+from pycrorm_async.queue.sources.dead_source import DeadSource, open_dead
+from pycrorm_async.queue.sources.live_source import LiveSource
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain_once import DrainSummary, drain_once
 from pycrorm_async.writer.ports import Source
@@ -38,8 +37,6 @@ __all__ = [
     "recover",
     "Rebinding",
     "rebind",
-    "PendingRecorders",
-    "pending_recorders",
 ]
 
 _log = logging.getLogger("pycrorm_async")
@@ -51,7 +48,7 @@ def dead_queues(
     lost: list[str] | None = None,
     *,
     settings: Settings | None = None,
-) -> Iterator[RecoveredQueue]:
+) -> Iterator[DeadSource]:
     """Yield the queue of each dead recorder, one at a time, and delete its folder once all of it is stored.
 
     A folder that cannot be recovered is added to `failures`; the others are recovered. The ids of episodes that the
@@ -70,10 +67,7 @@ def dead_queues(
             finally:
                 if lost is not None:
                     lost += [episode_text(end.episode) for end in recovered.lost if end.episode is not None]
-                if recovered.all_stored:
-                    recovered.remove()
-                else:
-                    recovered.release()
+                recovered.release()
             if recovered.damage is not None:  # not logged here: the caller that drained this queue reports the damage
                 failures[folder.name] = recovered.damage
         except Exception as error:  # noqa: BLE001 - kept in `failures`; the next folder may be readable
@@ -116,45 +110,40 @@ async def recover(
     address = shared_address(url)
     settings = settings or Settings()
     place = Spool(spool or address.default_spool, settings.file_access)
+    episodes: dict[str, set[EpisodeId]] = {}  # by living recorder, those in its batches
+
+    def note_batch(source: Source, batch: Sequence[Record]) -> None:
+        if source.name in episodes:
+            episodes[source.name].update(each.episode for each in batch if each.episode is not None)
+
     async with open_destination(
         address, place, clock=SYSTEM_CLOCK, projections=validate_projections(projections), settings=settings
     ) as destination:
         with ExitStack() as stack:
-            living = list(_living_queues(place, failures, stack))
+            living = list(_living_sources(place, failures, stack))
+            episodes.update((each.name, set()) for each in living)
             sources: Iterator[Source] = chain(living, dead_queues(place, failures, lost, settings=settings))
-            done = await drain_once(sources, destination, settings=settings)
-            for queue, state in zip(living, done.drained, strict=False):
-                stopped = {each: why for each, why in done.stopped.items() if each in queue.episodes}
-                queue.mark_visible(state.appended or queue.supplied, {**state.refused, **stopped})
+            done = await drain_once(sources, destination, settings=settings, on_append=note_batch)
+            for source, state in zip(living, done.drained, strict=False):
+                ids = map(episode_text, episodes[source.name])
+                stopped = {each: done.stopped[each] for each in ids if each in done.stopped}
+                source.mark_visible(state.appended or source.supplied, stopped)
     dead_letters = {each.refused: each.path for each in place.recorders() if each.refused is not None}
     return RecoveryReport(done, len(living), tuple(lost), {**done.failed, **failures}, dead_letters)
 
 
-class _LivingQueue(LiveQueue):
-    """The queue of a living recorder, drained once. `episodes` are the ids of the episodes in its batches."""
-
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        self.episodes: set[str] = set()
-
-    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
-        batch = await super().get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
-        self.episodes |= {episode_text(each) for each in {record.episode for record in batch} if each is not None}
-        return batch
-
-
-def _living_queues(spool: Spool, failures: dict[str, PycrormError], stack: ExitStack) -> Iterator[_LivingQueue]:
+def _living_sources(spool: Spool, failures: dict[str, PycrormError], stack: ExitStack) -> Iterator[LiveSource]:
     """Yield the synced records of each living recorder that no other process drains. `stack` releases the folders."""
     for folder in spool.recorders():
         try:
-            queue = _LivingQueue.take(folder.path) if folder.alive else None
+            source = LiveSource.take(folder.path) if folder.alive else None
         except Exception as error:  # noqa: BLE001 - kept in `failures`; the next folder may be readable
             failures[folder.name] = folder_error(folder.path, error)
             continue
-        if queue is not None:
-            stack.callback(queue.release)
-            queue.finish()
-            yield queue
+        if source is not None:
+            stack.callback(source.release)
+            source.finish()
+            yield source
 
 
 class Rebinding(NamedTuple):
@@ -190,18 +179,3 @@ async def rebind(
     say(rebinding)
     place.rebind(log.log_id)
     return rebinding
-
-
-class PendingRecorders(NamedTuple):
-    """The number of dead recorders, whose events may not be in the database yet, and of living recorders in a spool."""
-
-    dead: int
-    alive: int
-
-
-def pending_recorders(url: str, spool: Path | None = None) -> PendingRecorders:
-    """Count the recorders in a database's spool. Writes nothing. Raises `SpoolUnavailable`."""
-    folders = Spool(spool or DatabaseAddress.parse(url).default_spool).recorders()
-    recorders = [each for each in folders if each.refused is None]  # `pycrorm status` reports dead letters
-    alive = sum(each.alive for each in recorders)
-    return PendingRecorders(len(recorders) - alive, alive)

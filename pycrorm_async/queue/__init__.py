@@ -61,7 +61,7 @@ when the segments that began them are deleted: a segment is deleted only after t
 
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
-from pycrorm_async.queue.sources.dead_source import RecoveredQueue, open_dead
-from pycrorm_async.queue.sources.live_source import LiveQueue
+from pycrorm_async.queue.sources.dead_source import DeadSource, open_dead
+from pycrorm_async.queue.sources.live_source import LiveSource
 
-__all__ = ["RecorderQueue", "LiveQueue", "RecoveredQueue", "open_dead", "Spool", "RecorderFolder"]
+__all__ = ["RecorderQueue", "LiveSource", "DeadSource", "open_dead", "Spool", "RecorderFolder"]

@@ -136,7 +136,7 @@ class Daemon:
         except asyncio.CancelledError:
             for source in result.held:  # free for the next daemon, possibly in this process
                 with suppress(PycrormError):
-                    source.release_folder()
+                    source.release()
             raise
         except SpoolForeign:
             raise
@@ -186,14 +186,14 @@ class Daemon:
     async def _release(self, tracker: VisibilityTracker, fault: str | None) -> None:
         name, state, retried = tracker.source.name, tracker.state, True
         try:
-            outcome = await asyncio.to_thread(tracker.source.release_folder)
-            retried = outcome.again
-            if fault is None and not outcome.whole:
+            outcome = await asyncio.to_thread(tracker.source.release)
+            retried = outcome is not None or not tracker.source.holds_dead_letters
+            if fault is None and outcome is None:
                 fault = next(
                     (f"episode {episode} {why}" for episode, why in state.refused.items()), "not all events are stored"
                 )
             if fault is None:
-                self._say(f"recorder {name} {outcome.what}; {state.records} events stored")
+                self._say(f"recorder {name} {outcome}; {state.records} events stored")
         except PycrormError as error:
             fault = fault or str(error)
         del self._serving[name]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from pycrorm_async.errors import DatabaseError, InternalError, PycrormError
+from pycrorm_async.events.envelope import Record
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Drain, DrainState
 from pycrorm_async.writer.ports import Destination, Source
@@ -31,15 +33,24 @@ class DrainSummary:
     stopped: Mapping[str, str]
 
 
-async def drain_once(sources: Iterable[Source], destination: Destination, *, settings: Settings) -> DrainSummary:
+async def drain_once(
+    sources: Iterable[Source],
+    destination: Destination,
+    *,
+    settings: Settings,
+    on_append: Callable[[Source, Sequence[Record]], None] = lambda _source, _batch: None,
+) -> DrainSummary:
     """Drain each source to its end, then fold. A damaged source does not prevent draining the others.
 
-    Raises `DatabaseUnavailable` if the database stays unavailable for five attempts; stored events stay stored.
+    Calls `on_append` with each acknowledged batch. Raises `DatabaseUnavailable` if the database stays unavailable for
+    five attempts; stored events stay stored.
     """
     drained: list[DrainState] = []
     failed: dict[str, PycrormError] = {}
     for source in sources:
-        drain = Drain(source, destination.append, settings=settings, backoff=BRIEF)
+        drain = Drain(
+            source, destination.append, settings=settings, backoff=BRIEF, on_append=partial(on_append, source)
+        )
         try:
             await drain.run()
         except DatabaseError:

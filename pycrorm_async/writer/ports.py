@@ -17,7 +17,6 @@ __all__ = [
     "Log",
     "Destination",
     "ClaimedSource",
-    "ReleaseOutcome",
     "SourceScanner",
     "ScanResult",
     "Tables",
@@ -117,6 +116,11 @@ class ClaimedSource(Source, Protocol):
         """True if the recorder lives in another process and may record more."""
         ...
 
+    @property
+    def holds_dead_letters(self) -> bool:
+        """True for a folder of records that a database refused: only the next writer should offer them again."""
+        ...
+
     def finish(self) -> None:
         """End this source behind the records that are synced now."""
         ...
@@ -129,20 +133,12 @@ class ClaimedSource(Source, Protocol):
         """Publish why the database is unavailable; None when it is available again."""
         ...
 
-    def release_folder(self) -> ReleaseOutcome:
-        """Release the folder; delete a dead recorder's folder if all its records are stored. Blocks."""
+    def release(self) -> str | None:
+        """Release the folder; delete a dead recorder's folder if all its records are stored. Blocks.
+
+        Returns the outcome for a report; None if not all records could be stored. Raises `SpoolUnavailable`.
+        """
         ...
-
-
-class ReleaseOutcome(NamedTuple):
-    """The outcome of releasing a folder: a description, and whether all its records could be stored (`whole`).
-
-    `again`: whether this process should retry the rest.
-    """
-
-    what: str
-    whole: bool
-    again: bool = True
 
 
 class ScanResult(NamedTuple):

@@ -24,7 +24,7 @@ from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.projections.verify.verify import VerifyResult, verify
-from pycrorm_async.queue import RecorderQueue, RecoveredQueue
+from pycrorm_async.queue import DeadSource, RecorderQueue
 from pycrorm_async.store.log import EventLog
 from tests.backups import Backup
 
@@ -184,12 +184,12 @@ def test_a_recovery_that_does_this_is_seen(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    get_batch = RecoveredQueue.get_batch
+    get_batch = DeadSource.get_batch
 
-    async def broken(queue: RecoveredQueue, **limits: Any) -> list[Record]:
+    async def broken(queue: DeadSource, **limits: Any) -> list[Record]:
         return breaks(await get_batch(queue, **limits))
 
-    monkeypatch.setattr(RecoveredQueue, "get_batch", broken)
+    monkeypatch.setattr(DeadSource, "get_batch", broken)
     outcome = fault(3, random.Random(1), tmp_path, lambda: None)
     assert getattr(outcome, count) > 0
     assert not outcome.clean

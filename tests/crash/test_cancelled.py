@@ -20,7 +20,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.operations.daemon import _Folders, _LivingSource
+from pycrorm_async.operations.daemon import _Folders
 from pycrorm_async.operations.destination import LogAndTables, open_destination
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import Spool
@@ -259,9 +259,7 @@ async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, 
             queue.close()
             was_cancelled = await cancelled_at(at, life(spool))
             while held:  # its process ends then, and with it the locks
-                living = held.pop()
-                assert isinstance(living, _LivingSource)
-                living.release()
+                held.pop().release()
             assert stored(database_url, script) >= queue.stored - 1
             nobody_holds_a_lock(database_url)
             queue.release()

@@ -110,7 +110,7 @@ def recover_all(url: str, spool: Path) -> None:
         recovered = open_dead(folder.path)
         if recovered is not None:
             asyncio.run(drained(url, recovered))
-            recovered.remove()
+            recovered.release()
 
 
 def _recover_all(url: str, spool: Path, _say: object) -> None:

@@ -56,10 +56,7 @@ def recover(url: str, spool: Path, _say: object) -> None:
         recovered = open_dead(folder.path)
         if recovered is not None:
             asyncio.run(drained(url, recovered))
-            if recovered.all_stored:
-                recovered.remove()
-            else:
-                recovered.release()
+            recovered.release()
 
 
 def dead_letter(spool: Path) -> list[Record]:

@@ -23,13 +23,10 @@ from pycrorm_async.errors import (
     SpoolForeign,
     SpoolUnavailable,
 )
-from pycrorm_async.operations.daemon import _claim, serve
+from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.files.spool import RecorderFolder
-from pycrorm_async.queue.retention.stored_segments import StoredSegments
-from pycrorm_async.queue.sources.live_source import LiveQueue
-from pycrorm_async.writer.ports import ClaimedSource
+from pycrorm_async.queue.sources.live_source import LiveSource
 from tests.databases import ask, ask_to_change
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
@@ -133,7 +130,7 @@ async def test_closing_says_so_when_all_is_stored_and_the_tables_are_behind(
         await NoteActionPerformable("a").perform()
         await memory.synced()
         [folder] = Spool(spool).recorders()
-        drainer = LiveQueue.take(folder.path)
+        drainer = LiveSource.take(folder.path)
         assert drainer is not None
         batch = await drainer.get_batch(events_max=100, bytes_max=2**20, age_s_max=0.0)
         await drainer.acknowledge(batch[-1].position)
@@ -302,15 +299,17 @@ async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folder
 ) -> None:
     looking, cancelled = threading.Event(), threading.Event()
 
-    def take(folder: RecorderFolder, stored: StoredSegments, *, again: bool) -> ClaimedSource | None:
+    take = LiveSource.take
+
+    def take_late(folder: Path) -> LiveSource | None:
         looking.set()
         assert cancelled.wait(60)
-        return _claim(folder, stored, again=again)
+        return take(folder)
 
     async with memory_at(database_url, spool) as memory:
         await NoteActionPerformable("a").perform()
         with monkeypatch.context() as patch:
-            patch.setattr("pycrorm_async.operations.daemon._claim", take)
+            patch.setattr(LiveSource, "take", take_late)
             first = Daemon(database_url, spool)
             assert await asyncio.to_thread(looking.wait, 60)
             first.task.cancel()

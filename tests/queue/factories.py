@@ -8,8 +8,10 @@ from pathlib import Path
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
-from pycrorm_async.queue import LiveQueue, RecorderQueue, RecoveredQueue, open_dead
+from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, open_dead
+from pycrorm_async.queue.files.frame import EVENT, Frame, encode
 from pycrorm_async.queue.files.names import MAKING
+from pycrorm_async.queue.files.segment import salt_of
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.syncable_appender import SyncableAppender
 from pycrorm_async.settings import Settings
@@ -73,7 +75,7 @@ def copy_beside_recording(source: Path, target: Path) -> Path:
     return Path(shutil.copytree(source, target, ignore=shutil.ignore_patterns(f"*{MAKING}")))
 
 
-async def drain(queue: RecorderQueue | RecoveredQueue | LiveQueue, *, events_max: int = 10_000) -> list[Record]:
+async def drain(queue: RecorderQueue | DeadSource | LiveSource, *, events_max: int = 10_000) -> list[Record]:
     """All that is left, without acknowledging; a live queue must be closed."""
     records: list[Record] = []
     while batch := await queue.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0):
@@ -144,6 +146,11 @@ class Author:
     def end(self) -> int:
         """Where the next frame goes in the last segment."""
         return self.appender._offset
+
+
+def second_frame(payload: bytes, *, sequence: int = 2, salt: int = salt_of(RECORDER, 1)) -> bytes:
+    """The frame of a node at position 2 of the first segment, as a forger or an elder file would leave it."""
+    return encode(Frame(EVENT, 1, 2, sequence, WALL_NS, 1, episode(1), b"NodeStarted", payload), salt)
 
 
 def overwrite(path: Path, offset: int, content: bytes) -> None:

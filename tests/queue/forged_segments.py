@@ -29,18 +29,7 @@ def rewritten(path: Path, frames: list[Frame], start: int, salt: int) -> None:
         if frame.kind == COMMIT:
             covered, unsaid = unsaid, []
             payload, sequence = CHECKSUM.pack(span_checksum(covered)), len(covered)
-        encoded = encode(
-            kind=frame.kind,
-            version=frame.version,
-            position=frame.position,
-            sequence=sequence,
-            wall_ns=frame.wall_ns,
-            monotonic_ns=frame.monotonic_ns,
-            episode=frame.episode,
-            type_name=frame.type,
-            payload=payload,
-            salt=salt,
-        )
+        encoded = encode(frame._replace(payload=payload, sequence=sequence), salt)
         if frame.kind != COMMIT:
             unsaid.append(CHECKSUM.unpack_from(encoded, 60)[0])
         parts.append(encoded)
@@ -69,21 +58,13 @@ def change_a_frame(path: Path, rng: random.Random, *, fitting: bool = True, name
         "episode": rng.choice((bytes(16), b"\xff" * 16)),
     }
     field = rng.choice(list(changes)) if name is None else "type"
-    changed = frame._replace(**{field: changes[field]})
+    frames[index] = frame._replace(**{field: changes[field]})
     if fitting:
-        frames[index] = changed
         rewritten(path, frames, start, salt)
         return frame.position
-    parts = [content[:start]]
-    for number, each in enumerate(frames):
-        each = changed if number == index else each
-        fields = {"type_name": each.type, **{name: getattr(each, name) for name in _COPIED}}
-        parts.append(encode(salt=salt, **fields))
+    parts = [content[:start], *(encode(each, salt) for each in frames)]
     path.write_bytes(b"".join(parts).ljust(len(content), b"\0"))
     return frame.position
-
-
-_COPIED = ("kind", "version", "position", "sequence", "wall_ns", "monotonic_ns", "episode", "payload")
 
 
 def change_the_header(path: Path, rng: random.Random) -> None:

@@ -8,7 +8,7 @@ import pytest
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import episode_text
-from pycrorm_async.queue import LiveQueue, Spool, open_dead
+from pycrorm_async.queue import LiveSource, Spool, open_dead
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from pycrorm_async.queue.maintenance.repair import finish_repairs, repair_folder
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
@@ -132,7 +132,7 @@ def test_an_event_that_does_not_follow_what_is_kept_is_refused_and_named(own: Pa
     with pytest.raises(SpoolUnavailable, match="is used by another process"):
         put(own, some(8, 8))
     refused.release()
-    assert LiveQueue.take(kept_in(own)) is None
+    assert LiveSource.take(kept_in(own)) is None
 
 
 async def test_what_is_refused_again_stays_where_it_is_and_a_part_that_is_stored_goes(own: Path) -> None:
@@ -166,7 +166,7 @@ async def test_a_dead_recorders_refused_events_and_computed_end_go_aside_and_its
     assert recovered is not None
     batch = await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0)
     await recovered.acknowledge(batch[-1].position)
-    recovered.remove()
+    recovered.release()
     assert await recover(kept_in(author.folder)) == [*placed(author.records[1:]), lost(4, 1, 4)]
 
 

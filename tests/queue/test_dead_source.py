@@ -9,7 +9,7 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.files.frame import CHECKSUM, EVENT, encode
+from pycrorm_async.queue.files.frame import CHECKSUM
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.recorder_folder import parse_folder_name
 from pycrorm_async.queue.files.scan import scan, seal, tails
@@ -17,7 +17,6 @@ from pycrorm_async.queue.files.segment import salt_of
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
-    WALL_NS,
     Author,
     drain,
     ended,
@@ -26,6 +25,7 @@ from tests.queue.factories import (
     node,
     overwrite,
     recover,
+    second_frame,
     started,
 )
 
@@ -56,7 +56,7 @@ async def test_a_recorder_that_lived_without_a_record_leaves_nothing(author: Aut
     assert recovered is not None
     assert await drain(recovered) == []
     assert (recovered.all_stored, recovered.stored, recovered.lost) == (True, 0, ())
-    recovered.remove()
+    recovered.release()
     assert not author.folder.exists()
 
 
@@ -178,18 +178,7 @@ async def test_nothing_of_a_first_segment_that_was_never_synced_need_be_there(au
 async def test_a_record_of_another_file_left_on_the_same_blocks_does_not_come_back_to_life(author: Author) -> None:
     author.put(started())
     author.sync()
-    stale = encode(
-        kind=EVENT,
-        version=1,
-        position=2,
-        sequence=2,
-        wall_ns=WALL_NS,
-        monotonic_ns=1,
-        episode=bytes(started()[0] or b""),
-        type_name=b"NodeStarted",
-        payload=b"stale",
-        salt=salt_of(episode_id(1, b"an elder.."), 1),
-    )
+    stale = second_frame(b"stale", salt=salt_of(episode_id(1, b"an elder.."), 1))
     overwrite(author.segments[0], author.end, stale)
     assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
     ours = stale[:56] + CHECKSUM.pack(salt_of(RECORDER, 1)) + stale[60:]
@@ -273,18 +262,7 @@ async def test_other_records_than_those_that_were_safe_are_damage(author: Author
     author.put(node(), b"was written")
     author.sync()
     path, offset, _ = author.places[1]
-    other = encode(
-        kind=EVENT,
-        version=1,
-        position=2,
-        sequence=2,
-        wall_ns=WALL_NS,
-        monotonic_ns=1,
-        episode=bytes(node()[0] or b""),
-        type_name=b"NodeStarted",
-        payload=b"was forged!",
-        salt=salt_of(RECORDER, 1),
-    )
+    other = second_frame(b"was forged!")
     overwrite(path, offset, other)
     with pytest.raises(SpoolDamaged, match="differ from those that were synced"):
         open_dead(author.folder)
@@ -292,18 +270,7 @@ async def test_other_records_than_those_that_were_safe_are_damage(author: Author
 
 async def test_a_gap_in_an_episode_is_damage(author: Author) -> None:
     author.put(started())
-    forged = encode(
-        kind=EVENT,
-        version=1,
-        position=2,
-        sequence=3,
-        wall_ns=WALL_NS,
-        monotonic_ns=1,
-        episode=bytes(node()[0] or b""),
-        type_name=b"NodeStarted",
-        payload=b"{}",
-        salt=salt_of(RECORDER, 1),
-    )
+    forged = second_frame(b"{}", sequence=3)
     overwrite(author.segments[0], author.end, forged)
     with pytest.raises(SpoolDamaged, match="event 3 of episode"):
         open_dead(author.folder)
@@ -334,7 +301,7 @@ async def test_foreign_files_in_a_folder_are_left_alone_also_when_it_is_deleted(
     assert recovered is not None
     assert await drain(recovered) == [author.records[0], lost(2, 1, 2)]
     await recovered.acknowledge(2)
-    recovered.remove()
+    recovered.release()
     assert [path.name for path in author.folder.iterdir()] == ["notes.txt"]
     assert Spool(author.folder.parent).recorders() == []
 
@@ -401,7 +368,7 @@ async def test_stored_segments_go_and_the_ends_are_the_same_from_the_header_of_t
         assert await drain(recovered) == [*author.records[sum(left[:gone]) :], *ends]
     await recovered.acknowledge(11)
     assert author.segments[2].exists()
-    recovered.remove()
+    recovered.release()
     assert not author.folder.exists()
 
 
@@ -441,10 +408,12 @@ async def test_a_removal_that_was_killed_anywhere_leaves_the_same_records_or_not
     assert await recover(author.folder) == whole[4:]
     author.segments[1].unlink()
     assert await recover(author.folder) == []
-    (author.folder / "drain").unlink()
+    assert not author.folder.exists()
+    author.folder.mkdir()
+    (author.folder / "alive").touch()
     assert await recover(author.folder) == []
-    (author.folder / "drain").unlink()
-    (author.folder / "alive").unlink()
+    assert not author.folder.exists()
+    author.folder.mkdir()
     assert Spool(author.folder.parent).recorders() == []
 
 
@@ -486,9 +455,8 @@ async def test_a_live_queue_that_was_let_go_has_no_tail(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     queue.release()
-    recovered = open_dead(queue.folder)
+    recovered = open_dead(queue.folder, check=True)
     assert recovered is not None
-    recovered.check()
     assert len(await drain(recovered)) == 2
     recovered.release()
     kept = scan(queue.folder, parse_folder_name(queue.name).recorder)

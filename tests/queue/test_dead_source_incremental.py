@@ -48,11 +48,11 @@ async def given_before_damage(folder: Path, *, events_max: int = 10_000) -> list
                 assert not recovered.all_stored
         with pytest.raises(SpoolDamaged):  # and it stays so
             await recovered.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0)
-        with pytest.raises(SpoolDamaged):
-            recovered.check()
         assert not recovered.lost
     finally:
-        recovered.release()
+        assert recovered.release() is None
+    with pytest.raises(SpoolDamaged):
+        open_dead(folder, check=True)
     return records
 
 
@@ -74,7 +74,7 @@ async def test_what_is_whole_is_given_and_forgotten_before_all_was_looked_at(spo
     assert records == [*author.records, lost(RECORDS + 1, 1, RECORDS + 1)]
     assert recovered.lost == (records[-1],)
     assert recovered.all_stored
-    recovered.remove()
+    recovered.release()
     assert not author.folder.exists()
 
 

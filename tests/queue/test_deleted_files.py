@@ -15,7 +15,7 @@ import pytest
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.envelope import LOST, Record
-from pycrorm_async.queue import LiveQueue, RecorderQueue, Spool, open_dead
+from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.files.recorder_folder import finish_folder
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from tests.crash.test_queue_disk import SLOW
@@ -312,7 +312,7 @@ async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_t
     queue = make(tmp_path / "spool", settings=SLOW, offered=True)
     queue.put_nowait(started(), b"{}")
     await queue.synced_to()
-    first = LiveQueue.take(queue.folder)
+    first = LiveSource.take(queue.folder)
     assert first is not None
     [one] = await first.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)
     await first.acknowledge(1)
@@ -326,7 +326,7 @@ async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_t
     first.release()
     [found] = [each for each in Spool(tmp_path / "spool").recorders() if each.alive]
     assert open_dead(found.path) is None
-    second = LiveQueue.take(found.path)
+    second = LiveSource.take(found.path)
     assert second is not None
     again = await second.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)
     assert events(again) == [(1, 1), (2, 2), (3, 3)]

@@ -60,18 +60,7 @@ COMMIT_BY_HAND = by_hand(
 
 
 def event(payload: bytes = b'{"a":"\xc3\xa4"}', *, position: int = 42) -> bytes:
-    return encode(
-        kind=EVENT,
-        version=3,
-        position=position,
-        sequence=7,
-        wall_ns=WALL_NS,
-        monotonic_ns=MONOTONIC_NS,
-        episode=EPISODE,
-        type_name=b"NodeStarted",
-        payload=payload,
-        salt=SALT,
-    )
+    return encode(Frame(EVENT, 3, position, 7, WALL_NS, MONOTONIC_NS, EPISODE, b"NodeStarted", payload), SALT)
 
 
 def test_an_event_has_its_golden_bytes_and_means_what_was_written() -> None:

@@ -16,7 +16,7 @@ import pytest
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.queue import LiveQueue, RecorderQueue, Spool, open_dead
+from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
 from tests.queue.factories import (
     DECLARED,
@@ -44,13 +44,13 @@ def offered(spool: Path) -> Iterator[RecorderQueue]:
     made.release()
 
 
-def taken(queue: RecorderQueue) -> LiveQueue:
-    found = LiveQueue.take(queue.folder)
+def taken(queue: RecorderQueue) -> LiveSource:
+    found = LiveSource.take(queue.folder)
     assert found is not None
     return found
 
 
-async def some(source: LiveQueue, *, events_max: int = 10_000, bytes_max: int = 2**22) -> list[int]:
+async def some(source: LiveSource, *, events_max: int = 10_000, bytes_max: int = 2**22) -> list[int]:
     """The positions of the next batch, which must come within a minute."""
     batch = await asyncio.wait_for(
         source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=0.05), timeout=60
@@ -148,7 +148,7 @@ async def test_a_folder_is_drained_by_one_only(offered: RecorderQueue) -> None:
     assert not offered.is_drained
     source = taken(offered)
     assert offered.is_drained
-    assert LiveQueue.take(offered.folder) is None
+    assert LiveSource.take(offered.folder) is None
     source.release()
     source.release()
     assert not offered.is_drained
@@ -156,10 +156,10 @@ async def test_a_folder_is_drained_by_one_only(offered: RecorderQueue) -> None:
 
 
 async def test_a_queue_that_its_own_process_drains_is_not_taken(queue: RecorderQueue) -> None:
-    assert LiveQueue.take(queue.folder) is None
+    assert LiveSource.take(queue.folder) is None
     queue.put_nowait(started(), b"{}")
     await queue.synced_to()
-    assert LiveQueue.take(queue.folder) is None
+    assert LiveSource.take(queue.folder) is None
     assert len(await queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)) == 1
     assert queue.external_drain_status is None
     assert queue.is_drained
@@ -168,16 +168,16 @@ async def test_a_queue_that_its_own_process_drains_is_not_taken(queue: RecorderQ
 @pytest.mark.parametrize("size", [0, 4095])
 async def test_a_folder_whose_progress_is_missing_or_short_is_not_taken(offered: RecorderQueue, size: int) -> None:
     os.truncate(offered.folder / "progress", size)
-    assert LiveQueue.take(offered.folder) is None
+    assert LiveSource.take(offered.folder) is None
     (offered.folder / "progress").unlink()
-    assert LiveQueue.take(offered.folder) is None
+    assert LiveSource.take(offered.folder) is None
     assert not offered.is_drained
 
 
 async def test_a_folder_that_is_not_there_any_more_is_not_taken_and_not_made_again(spool: Path) -> None:
     queue = make(spool, offered=True)
     queue.release()
-    assert LiveQueue.take(queue.folder) is None
+    assert LiveSource.take(queue.folder) is None
     assert not queue.folder.exists()
 
 
@@ -318,7 +318,7 @@ async def test_a_queue_that_is_closed_ends_and_deletes_itself_when_all_is_stored
     assert [each.sequence for each in await drain(source)] == [1, 2]
     await source.acknowledge(2)
     await eventually(lambda: queue.stored == 2)
-    assert LiveQueue.take(queue.folder) is None
+    assert LiveSource.take(queue.folder) is None
     queue.release()
     assert not queue.folder.exists()
     source.mark_visible(2, {})  # said into a file that is gone, which is nobody's harm
@@ -339,7 +339,7 @@ async def test_a_queue_that_leaves_before_all_is_stored_leaves_a_dead_folder(spo
             pass
     assert open_dead(queue.folder) is None  # while it is held
     source.release()
-    assert LiveQueue.take(queue.folder) is None
+    assert LiveSource.take(queue.folder) is None
     assert await recover(queue.folder) == [record(1, started(), 1, b"{}"), record(2, ended(), 2, b"{}")]
 
 
@@ -353,7 +353,7 @@ async def test_recovery_ignores_what_progress_says_and_removes_it(spool: Path) -
     assert recovered is not None
     assert await drain(recovered) == [record(1, started(), 1, b"{}"), lost(2, 1, 2)]
     await recovered.acknowledge(2)
-    recovered.remove()
+    recovered.release()
     assert not queue.folder.exists()
 
 
@@ -376,7 +376,7 @@ async def test_a_recorder_killed_while_it_is_drained_ends_the_source_and_recover
         assert process.stdout is not None
         assert process.stdout.readline() == b"put\n"
         (folder,) = Spool(spool).recorders()
-        source = LiveQueue.take(folder.path)
+        source = LiveSource.take(folder.path)
         assert source is not None
         given: list[Record] = []
         while len(given) < 11:

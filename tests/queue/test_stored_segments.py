@@ -98,7 +98,7 @@ async def test_a_dead_recorder_is_kept_the_same_without_its_torn_tail(tmp_path: 
     assert recovered is not None
     for record in await drain(recovered, events_max=4):
         await recovered.acknowledge(record.position)
-    recovered.remove()
+    recovered.release()
     assert kept(bound) == [(folder.name, f"0000000{number}.segment") for number in (1, 2, 3)]
     assert scan(bound / "stored" / "a-log" / folder.name, RECORDER).cut.position == 11
     assert not folder.exists()

@@ -155,7 +155,7 @@ class Appender:
                         raise self._refusal()
                     if episode is None:
                         kind = DECLARATION
-                        self._declare(body, len(name), version, len(payload))
+                        self._declare(body, name, version, payload)
                     elif (last := self.open.get(episode)) is not None:
                         sequence = last[0] + 1
                     elif type_name == EPISODE_STARTED:
@@ -214,10 +214,10 @@ class Appender:
         if not self._capacity.takes_episode(episodes=len(self.open), declared=self.declarations.bytes):
             raise EpisodeRefused(f"{len(self.open):,} episodes are open: no more fit into a segment (segment_bytes)")
 
-    def _declare(self, body: bytes, name_bytes: int, version: int, payload_bytes: int) -> None:
+    def _declare(self, body: bytes, name: bytes, version: int, payload: bytes) -> None:
         """Repeat this declaration at the beginning of every later segment, if it fits."""
         room = self._capacity.room_to_declare(episodes=len(self.open), declared=self.declarations.bytes)
-        self.declarations.add(body, name_bytes=name_bytes, version=version, payload_bytes=payload_bytes, room=room)
+        self.declarations.add(body, name=name, version=version, payload=payload, room=room)
 
     def _encode_type(self, type_name: str) -> bytes:
         name = type_name.encode()

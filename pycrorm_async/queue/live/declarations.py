@@ -10,7 +10,7 @@ from typing import NamedTuple
 from zlib import crc32
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.queue.files.frame import CHECKSUM_START, DECLARATION, HEADER_BYTES, NO_EPISODE, encode_header
+from pycrorm_async.queue.files.frame import CHECKSUM_START, DECLARATION, HEADER_BYTES, NO_EPISODE, Frame, encode
 
 __all__ = ["Declarations", "AppendState"]
 
@@ -30,41 +30,28 @@ class Declarations:
     def __init__(self) -> None:
         self.bytes = 0
         self.unrepeated = 0
-        self._bodies: dict[bytes, tuple[int, int, int]] = {}
+        self._frames: dict[bytes, Frame] = {}
 
-    def add(self, body: bytes, *, name_bytes: int, version: int, payload_bytes: int, room: int) -> None:
+    def add(self, body: bytes, *, name: bytes, version: int, payload: bytes, room: int) -> None:
         """Add a declaration. Ignores one in use already; does not repeat one larger than `room` bytes."""
-        if body in self._bodies:
+        if body in self._frames:
             return
         size = HEADER_BYTES + len(body)
         if size > room:
             self.unrepeated += 1
             return
-        self._bodies[body] = name_bytes, version, payload_bytes
+        self._frames[body] = Frame(DECLARATION, version, 0, 0, 0, 0, NO_EPISODE, name, payload)
         self.bytes += size
 
     def write(self, buffer: mmap.mmap, state: AppendState, *, salt: int, clock: Clock) -> AppendState:
         """Write the declarations' frames from `state` on; return the state behind them."""
         offset, position, records, checksum = state
-        for body, (name_bytes, version, payload_bytes) in self._bodies.items():
+        for frame in self._frames.values():
             position += 1
             records += 1
-            header = encode_header(
-                DECLARATION,
-                name_bytes,
-                version,
-                payload_bytes,
-                position,
-                0,
-                clock.wall_ns(),
-                clock.monotonic_ns(),
-                NO_EPISODE,
-                salt,
-                crc32(body),
-            )
-            end = offset + HEADER_BYTES + len(body)
-            buffer[offset : offset + HEADER_BYTES] = header
-            buffer[offset + HEADER_BYTES : end] = body
-            offset = end
-            checksum = crc32(header[CHECKSUM_START:], checksum)
+            frame = frame._replace(position=position, wall_ns=clock.wall_ns(), monotonic_ns=clock.monotonic_ns())
+            encoded = encode(frame, salt)
+            buffer[offset : offset + len(encoded)] = encoded
+            offset += len(encoded)
+            checksum = crc32(encoded[CHECKSUM_START:HEADER_BYTES], checksum)
         return AppendState(offset, position, records, checksum)

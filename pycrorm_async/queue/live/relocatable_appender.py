@@ -19,9 +19,9 @@ from pycrorm_async.queue.files.frame import (
     EVENT,
     HEADER_BYTES,
     Fields,
+    Frame,
     decode_each,
-    encode_body,
-    encode_header,
+    encode,
 )
 from pycrorm_async.queue.files.segment import EPISODE_ENDED, Segment
 from pycrorm_async.queue.live.syncable_appender import SyncableAppender
@@ -69,32 +69,17 @@ class RelocatableAppender(SyncableAppender):
         return self._end - self._offset
 
     def _carry(self, record: Fields) -> None:
-        kind, version, position, sequence, wall_ns, monotonic_ns, episode, name, payload, _, _ = record
+        kind, _, position, sequence, wall_ns, monotonic_ns, episode, name, _, _, size = record
         if position != self.position + 1:
             raise SpoolUnavailable(self._folder, f"position {self.position + 1} cannot be read in the old folder")
-        body = encode_body(name, payload)
-        if self._offset + HEADER_BYTES + len(body) > self._end:
+        if self._offset + size > self._end:
             self._roll()
-        offset, end = self._offset, self._offset + HEADER_BYTES + len(body)
-        header = encode_header(
-            kind,
-            len(name),
-            version,
-            len(payload),
-            position,
-            sequence,
-            wall_ns,
-            monotonic_ns,
-            episode,
-            self._salt,
-            crc32(body),
-        )
-        self._buffer[offset + HEADER_BYTES : end] = body
-        self._buffer[offset : offset + HEADER_BYTES] = header
-        self._offset = end
+        frame = encode(Frame(*record), self._salt)
+        self._buffer[self._offset : self._offset + size] = frame
+        self._offset += size
         self.position = position
         self._span_count += 1
-        self._span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
+        self._span_checksum = crc32(frame[CHECKSUM_START:HEADER_BYTES], self._span_checksum)
         if kind == EVENT:
             self.open[EpisodeId(episode)] = (sequence, wall_ns, monotonic_ns)
             if name == _EPISODE_ENDED:

@@ -147,7 +147,7 @@ class _EpisodeFolder:
 
     def _span(self, fresh: Sequence[Record]) -> tuple[bytes, bytes]:
         frames = [
-            Frame(EVENT, version, 0, sequence, wall_ns, monotonic_ns, self._episode, kind.encode(), payload, 0, 0)
+            Frame(EVENT, version, 0, sequence, wall_ns, monotonic_ns, self._episode, kind.encode(), payload)
             for _, _, sequence, kind, version, wall_ns, monotonic_ns, payload in fresh
         ]
         salt = salt_of(self._recorder, self._number)

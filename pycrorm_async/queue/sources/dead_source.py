@@ -1,7 +1,7 @@
 """Drain a dead recorder's folder: supply its whole records and the computed ends, then delete the folder.
 
 **Theory of operation.** `open_dead` takes `alive`, which proves that the recorder is dead, and `drain`, which excludes
-other drainers; `release` or `remove` gives both back. No process writes the segments any more, so the only races are
+other drainers; `release` gives both back. No process writes the segments any more, so the only races are
 with other recoverers, which the locks exclude, and with a kill of this process.
 
 The source scans one segment at a time (`files/scan.py`) and syncs it before it supplies any of its records: a killed
@@ -16,13 +16,13 @@ computes the same bytes, and the log stores them once.
 
 `acknowledge` deletes segments whose records are all stored, oldest first, but keeps the last scanned one: the ends are
 computed from its header and records, and the next segment's header, which lists the open episodes too, may be damaged.
-The folder loses its last segment only in `remove`, after all records and ends are acknowledged.
+The folder loses its last segment only in `release`, after all records and ends are acknowledged.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
@@ -43,15 +43,16 @@ from pycrorm_async.queue.files.segment import EPISODE_ENDED, segment_path
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
-__all__ = ["RecoveredQueue", "computed_ends", "open_dead"]
+__all__ = ["DeadSource", "computed_ends", "open_dead"]
 
 
-def open_dead(folder: Path, *, stored: StoredSegments | None = None) -> RecoveredQueue | None:
+def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool = False) -> DeadSource | None:
     """Open a dead folder as a source; None if its recorder lives, another process drains it, or it is missing.
 
     Also None for dead letters of a recorder whose own folder still exists, because its drainer may add more.
 
-    Holds `alive` and `drain` until `release` or `remove`. Scans until there are records to supply. Moves segments whose
+    Holds `alive` and `drain` until `release`. Scans until there are records to supply, and with `check` the whole
+    folder. Moves segments whose
     records are all stored to `stored`, or deletes them without it. Raises `SpoolDamaged`, `SpoolForeign` and
     `SpoolUnavailable`; then it holds no lock.
     """
@@ -69,7 +70,9 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None) -> Recovere
                 return None
             try:
                 recorder = parse_folder_name(folder.name).recorder
-                return RecoveredQueue(folder, recorder, (drain, alive), stored)
+                if check:
+                    scan(folder, recorder)
+                return DeadSource(folder, recorder, (drain, alive), stored)
             except BaseException:
                 drain.release()
                 raise
@@ -78,12 +81,16 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None) -> Recovere
             raise
 
 
-class RecoveredQueue:
+class DeadSource:
     """The records of a dead recorder, in order, then the computed ends. Constructed by `open_dead`.
+
+    Implements the writer's `ClaimedSource`.
 
     `lost` holds these ends, one per open episode; it is empty until the scan has finished. `stored` is the last
     acknowledged position.
     """
+
+    is_alive = False
 
     def __init__(
         self, folder: Path, recorder: EpisodeId, locks: tuple[FileLock, ...], stored: StoredSegments | None
@@ -91,7 +98,6 @@ class RecoveredQueue:
         self.folder = folder
         self.name = folder.name
         self.lost: tuple[Record, ...] = ()
-        self._recorder = recorder
         self._ready: list[Record] = []
         """Records scanned but not supplied yet; those beyond position `_confirmed` must wait."""
         self._confirmed = 0
@@ -99,6 +105,7 @@ class RecoveredQueue:
         while self._scan_further() and self._confirmed == self._scanner.prefix.start.position:
             pass
         self._locks = locks
+        self._released = False
         self._stored_segments = stored
         self._dead_letters = DeadLetters(folder)
         self._supplied = self.stored = self._scanner.prefix.start.position
@@ -109,7 +116,7 @@ class RecoveredQueue:
         return self._scanner.finished and self.stored == self._confirmed
 
     @property
-    def holds_refused(self) -> bool:
+    def holds_dead_letters(self) -> bool:
         """True if this is a folder of dead letters."""
         return parse_folder_name(self.name).episode is not None
 
@@ -117,11 +124,6 @@ class RecoveredQueue:
     def damage(self) -> SpoolDamaged | None:
         """The damage met by the scan, if any; no record behind it is supplied."""
         return self._scanner.damage
-
-    def check(self) -> None:
-        """Scan the whole folder, supply nothing. Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`."""
-        with wrap_os_errors(self.folder):
-            scan(self.folder, self._recorder)
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
         """Return the next records in order, at least one, within the limits; an empty list after the last.
@@ -158,7 +160,7 @@ class RecoveredQueue:
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
         """As `RecorderQueue.dead_letter`; False for records that are dead letters already, which stay here."""
-        if self.holds_refused:
+        if self.holds_dead_letters:
             return False
         self._dead_letters.put(records)
         return True
@@ -166,22 +168,36 @@ class RecoveredQueue:
     def fail(self, reason: str) -> None:
         """Do nothing: no producer waits for space in a dead folder."""
 
-    def remove(self) -> None:
-        """Delete the folder, all of whose records are stored, and release the locks. Raises `SpoolUnavailable`."""
-        assert self.all_stored, "records that are not acknowledged must not be deleted"
-        try:
-            with wrap_os_errors(self.folder):
-                remove_made_ahead(self.folder)
-                self._keep_last_segments()
-                remove_folder(self.folder)
-        finally:
-            self.release()
+    def finish(self) -> None:
+        """Do nothing: no more records are added to a dead folder."""
 
-    def release(self) -> None:
-        """Release the locks; the next recovery supplies the unacknowledged records again. Idempotent."""
-        self._dead_letters.release()
-        for lock in self._locks:
-            lock.release()
+    def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None:
+        """Do nothing: no process waits for the records of a dead folder to become visible."""
+
+    def mark_unavailable(self, reason: str | None) -> None:
+        """Do nothing: no process waits for the records of a dead folder to be stored."""
+
+    def release(self) -> str | None:
+        """Delete the folder if all its records are stored, and release the locks. Idempotent.
+
+        Returns the outcome for a report; None if records are not stored: the next recovery supplies them again. Raises
+        `SpoolUnavailable`.
+        """
+        try:
+            if not self.all_stored:
+                return None
+            if not self._released:
+                with wrap_os_errors(self.folder):
+                    remove_made_ahead(self.folder)
+                    self._keep_last_segments()
+                    remove_folder(self.folder)
+        finally:
+            self._released = True
+            self._dead_letters.release()
+            for lock in self._locks:
+                lock.release()
+        count = len(self.lost)
+        return f"is recovered ({count} episode{'s' * (count != 1)} LOST)" if count else "is recovered"
 
     def _delete_segment(self, segment: Path, *, length: int | None = None) -> None:
         if self._stored_segments is None:

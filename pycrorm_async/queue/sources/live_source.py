@@ -28,7 +28,7 @@ from pycrorm_async.queue.files.scan import read_header
 from pycrorm_async.queue.files.segment import header_bytes, map_segment, segment_numbers, segment_path
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
-__all__ = ["LiveQueue"]
+__all__ = ["LiveSource"]
 
 _PAUSE_S_MIN = 0.002
 _PAUSE_S_MAX = 0.02
@@ -37,8 +37,13 @@ _ALIVE_CHECK_S = 0.25
 """Interval between two tests of the recorder's `alive`."""
 
 
-class LiveQueue:
-    """A live recorder's folder as a source. Constructed by `take`, used by one task, ended by `release`."""
+class LiveSource:
+    """A live recorder's folder as a source. Constructed by `take`, used by one task, ended by `release`.
+
+    Implements the writer's `ClaimedSource`.
+    """
+
+    holds_dead_letters = False
 
     def __init__(self, folder: Path, recorder: EpisodeId, drain: FileLock, progress: Progress) -> None:
         """For `take`, which holds the lock. Raises as `take` does."""
@@ -170,17 +175,22 @@ class LiveQueue:
         with wrap_os_errors(self.folder):
             return is_locked(self.folder / ALIVE)
 
-    @property
-    def is_closed(self) -> bool:
-        """True if the recorder has closed its queue."""
-        return self._progress.recorded().closed
+    def release(self) -> str | None:
+        """Close the files and release `drain`. Idempotent.
 
-    def release(self) -> None:
-        """Close the files and release `drain`. Idempotent."""
-        self._reader.close()
-        self._progress.close()
-        self._dead_letters.release()
-        self._drain.release()
+        Returns the outcome for a report; None if the recorder lives and supplied records are not stored. Raises
+        `SpoolUnavailable`.
+        """
+        try:
+            closed, is_alive = self._progress.recorded().closed, self.is_alive
+        finally:
+            self._reader.close()
+            self._progress.close()
+            self._dead_letters.release()
+            self._drain.release()
+        if is_alive and self.stored != self.supplied:
+            return None
+        return "has ended" if closed else "is left at work" if is_alive else "died"
 
     # --- inside -----------------------------------------------------------------------------------------------
 

@@ -1,0 +1,209 @@
+"""The contract of a source, held by a recorder's own queue, a living recorder's folder and a dead one's."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import pytest
+
+from pycrorm_async.errors import SpoolStuck
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, Spool, open_dead
+from pycrorm_async.queue.files.scan import survey
+from pycrorm_async.queue.files.segment import read_segment, segment_path
+from tests.queue.factories import RECORDER, as_left_by_a_kill, ended, make, node, started
+from tests.queue.test_full_spool import fill
+
+AnySource = RecorderQueue | LiveSource | DeadSource
+Opened = TypeVar("Opened")
+SIZES = [0, *[200] * 40, 0]
+"""Bytes of the payloads of one episode, over several segments."""
+
+
+class Scene:
+    """A recorder, and the source of its records under test."""
+
+    def __init__(self, kind: Literal["own", "living", "dead"], folder: Path) -> None:
+        self.kind = kind
+        self.queue = make(folder / "spool", offered=kind == "living")
+        self._other = folder / "other"
+        self._left: Path | None = None
+        self._opened: list[AnySource] = []
+
+    async def record(self, sizes: Sequence[int] = SIZES) -> None:
+        """Record and sync one whole episode."""
+        for index, size in enumerate(sizes):
+            heading = started() if index == 0 else ended() if index == len(sizes) - 1 else node()
+            self.queue.put_nowait(heading, b"%04d" % index + b"x" * size)
+        await self.queue.synced_to()
+
+    def source(self) -> AnySource:
+        """The first source, and at each further call the next one."""
+        for each in self._opened:
+            each.release()
+        self._opened.append(self._next())
+        return self._opened[-1]
+
+    def _next(self) -> AnySource:
+        if self.kind == "own" and not self._opened:
+            return self.queue
+        if self.kind == "living":
+            return _present(LiveSource.take(self.queue.folder))
+        if self.kind == "dead" and self._left is None:
+            self._left = as_left_by_a_kill(self.queue, self._other)
+        return _present(open_dead(self._left or self.queue.folder))
+
+    @property
+    def folder(self) -> Path:
+        return self._left or self.queue.folder
+
+    def end(self) -> None:
+        for each in (*self._opened, self.queue):
+            each.release()
+
+
+def _present(opened: Opened | None) -> Opened:
+    assert opened is not None
+    return opened
+
+
+@pytest.fixture(params=["own", "living", "dead"])
+def scene(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Scene]:
+    made = Scene(request.param, tmp_path)
+    yield made
+    made.end()
+
+
+async def batch(source: AnySource, *, events_max: int = 1000, bytes_max: int = 2**22) -> list[Record]:
+    async with asyncio.timeout(60):
+        return await source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=0.05)
+
+
+async def rest(source: AnySource) -> list[Record]:
+    """All further records of a closed queue."""
+    records: list[Record] = []
+    while some := await batch(source):
+        records += some
+        assert len(records) <= 2 * len(SIZES)
+    return records
+
+
+def positions(records: Sequence[Record]) -> list[int]:
+    return [each.position for each in records]
+
+
+async def eventually(reached: Callable[[], bool]) -> None:
+    async with asyncio.timeout(60):
+        while not reached():  # noqa: ASYNC110 - the sync thread sets no event of ours
+            await asyncio.sleep(0.005)
+
+
+async def test_each_synced_record_is_supplied_once_in_order(scene: Scene) -> None:
+    await scene.record()
+    source = scene.source()
+    records: list[Record] = []
+    while len(records) < len(SIZES):
+        records += await batch(source, events_max=7)
+    assert positions(records) == list(range(1, len(SIZES) + 1))
+    assert [each.sequence for each in records] == list(range(1, len(SIZES) + 1))
+    assert [each.payload for each in records] == [b"%04d" % at + b"x" * size for at, size in enumerate(SIZES)]
+
+
+async def test_a_batch_holds_at_most_this_many_records(scene: Scene) -> None:
+    await scene.record()
+    source = scene.source()
+    assert positions(await batch(source, events_max=1)) == [1]
+    assert positions(await batch(source, events_max=30)) == list(range(2, 32))
+
+
+async def test_a_batch_holds_at_most_this_many_bytes_and_a_larger_record_comes_alone(scene: Scene) -> None:
+    await scene.record([6, 6, 6, 996, 6, 0])  # payloads of 10 bytes, one of 1000
+    source = scene.source()
+    sizes = [positions(await batch(source, bytes_max=25)) for _ in range(4)]
+    assert sizes == [[1, 2], [3], [4], [5, 6]]
+
+
+async def test_after_the_last_record_of_a_closed_queue_every_batch_is_empty(scene: Scene) -> None:
+    await scene.record()
+    scene.queue.close()
+    source = scene.source()
+    assert len(await rest(source)) == len(SIZES)
+    assert await batch(source) == []
+    assert await batch(source) == []
+
+
+async def test_the_next_source_supplies_again_what_was_not_acknowledged(scene: Scene) -> None:
+    await scene.record()
+    source = scene.source()
+    first, second = await batch(source, events_max=5), await batch(source, events_max=5)
+    assert positions(second) == list(range(6, 11))
+    await source.acknowledge(first[-1].position)
+    scene.queue.close()
+    again = positions(await rest(scene.source()))
+    assert again == list(range(again[0], len(SIZES) + 1))
+    assert again[0] <= 6
+
+
+@pytest.mark.parametrize("stored", [0, 1, 20, 41])
+async def test_only_segments_whose_records_are_all_stored_are_deleted(scene: Scene, stored: int) -> None:
+    await scene.record()
+    source = scene.source()
+    supplied = [await batch(source, events_max=1) for _ in range(max(stored, 1))]
+    assert positions(supplied[-1]) == [max(stored, 1)]
+    bases = survey(scene.folder, RECORDER).prefix.bases
+    contents = {number: read_segment(segment_path(scene.folder, number)) for number in bases}
+    await source.acknowledge(stored)
+    kept = {number for number in bases if bases.get(number + 1, len(SIZES) + 2) - 1 > stored}
+    await eventually(lambda: all(segment_path(scene.folder, each).exists() == (each in kept) for each in bases))
+    await asyncio.sleep(0.1)  # another turn of the sync thread, which could delete more
+    assert {number for number in bases if segment_path(scene.folder, number).exists()} == kept
+    assert (len(kept) < len(bases)) == (stored >= 20)
+    for number in sorted(kept)[:-1]:  # the sync thread still writes to the last one
+        assert read_segment(segment_path(scene.folder, number)) == contents[number]
+
+
+async def test_a_refused_record_is_kept_once_however_often_it_is_offered(scene: Scene) -> None:
+    await scene.record()
+    source = scene.source()
+    refused = await batch(source, events_max=9)
+    assert source.dead_letter(refused[:5])
+    assert source.dead_letter(refused)
+    assert source.dead_letter(refused)
+    source = scene.source()  # from which nothing was acknowledged
+    assert source.dead_letter(await batch(source, events_max=10))
+    source.release()
+    [kept] = [each.path for each in Spool(scene.folder.parent).recorders() if each.refused is not None]
+    sequences: list[int] = []
+    survey(kept, RECORDER, on_frame=lambda _, frame: sequences.append(frame.sequence) if frame.kind == 1 else None)
+    assert sequences == list(range(1, 11))
+
+
+async def test_a_source_that_fails_wakes_the_producers_that_wait_for_space(scene: Scene) -> None:
+    scene.queue.put_nowait(started(), b"{}")
+    fill(scene.queue)
+    await scene.queue.synced_to()
+    source = scene.source()
+    waiting = asyncio.create_task(scene.queue.room())
+    await asyncio.sleep(0.1)
+    assert not waiting.done()
+    source.fail("the first reason")
+    source.fail("another reason")
+    if scene.kind == "dead":  # no producer waits for the records of a dead recorder
+        waiting.cancel()
+        return
+    with pytest.raises(SpoolStuck, match="the first reason"):
+        async with asyncio.timeout(60):
+            await waiting
+
+
+async def test_a_source_can_be_released_twice_and_frees_the_folder_for_the_next(scene: Scene) -> None:
+    await scene.record()
+    source = scene.source()
+    await batch(source, events_max=3)
+    source.release()
+    source.release()
+    scene.queue.close()
+    assert positions(await rest(scene.source())) == list(range(1, len(SIZES) + 1))
