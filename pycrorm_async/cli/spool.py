@@ -226,6 +226,8 @@ def _spans(noun: str, ranges: Sequence[Range]) -> str:
 
 def _document(report: SpoolReport) -> dict[str, object]:
     recorders = [asdict(each) | {"records": each.records} for each in report.recorders]
+    for each in recorders:  # `pycrorm status` shows these
+        del each["bytes_spooled"], each["recorded"], each["drained"]
     return asdict(report) | {"recorders": recorders}
 
 

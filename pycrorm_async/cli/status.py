@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,12 +19,8 @@ from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
 from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
 from pycrorm_async.projections.schema.unmade_types import unmade_types
-from pycrorm_async.queue.files.drain_status import Progress
-from pycrorm_async.queue.files.locks import is_locked
-from pycrorm_async.queue.files.names import DRAIN
-from pycrorm_async.queue.files.recorder_folder import folder_error, wrap_os_errors
-from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
+from pycrorm_async.queue.maintenance.inspection import inspect_folder
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -101,7 +96,11 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     place = Spool(spool or address.default_spool)
     folders = place.recorders()
     recorders = [_recorder(each) for each in folders if each.refused is None]
-    refused = [RefusedState(each.refused, each.path, _bytes(each.path)) for each in folders if each.refused is not None]
+    refused = [
+        RefusedState(each.refused, each.path, inspect_folder(each).bytes_spooled)
+        for each in folders
+        if each.refused is not None
+    ]
     has_daemon = place.has_writer
     workers = _workers(place.writer_note())
     episodes: list[EpisodeState] = []
@@ -207,51 +206,22 @@ def _print_workers(workers: Sequence[FoldWorkerState]) -> None:
 
 
 def _recorder(folder: RecorderFolder) -> RecorderState:
-    try:
-        return _state(folder)
-    except Exception as error:  # noqa: BLE001 - shown for this recorder; the others are still read
-        fault = str(folder_error(folder.path, error))
-        return RecorderState(folder.name, folder.alive, "nobody", None, None, None, 0, None, None, {}, fault)
-
-
-def _state(folder: RecorderFolder) -> RecorderState:
-    with wrap_os_errors(folder.path):
-        locked = is_locked(folder.path / DRAIN)
-        spooled = _bytes(folder.path)
-        progress = Progress.open(folder.path, writing=False) if folder.alive else None
-        if progress is None:
-            drained = "nobody" if not locked else "itself" if folder.alive else "another"
-            return RecorderState(folder.name, folder.alive, drained, None, None, None, spooled, None, None, {})
-        try:
-            recorded, drain_status = progress.recorded(), progress.drained()
-        finally:
-            progress.close()
-    drained, note = ("another" if locked else "nobody"), drain_status.note
+    report = inspect_folder(folder)
+    drained_by = "another" if report.recorded is not None or not folder.alive else "itself"
+    status, locked = report.drained, report.being_drained
     return RecorderState(
-        folder.name,
-        folder.alive,
-        drained,
-        recorded.synced,
-        drain_status.stored,
-        drain_status.folded,
-        spooled,
-        note.away if locked else None,
-        note.given_up if locked else None,
-        note.stopped,
+        report.name,
+        report.alive,
+        drained_by if locked else "nobody",
+        None if report.recorded is None else report.recorded.synced,
+        None if status is None else status.stored,
+        None if status is None else status.folded,
+        report.bytes_spooled,
+        status.note.away if locked and status is not None else None,
+        status.note.given_up if locked and status is not None else None,
+        {} if status is None else status.note.stopped,
+        report.refused,
     )
-
-
-def _bytes(folder: Path) -> int:
-    with suppress(OSError):  # the folder may have been stored and deleted meanwhile; `_state` reports other errors
-        return sum(_size(segment_path(folder, number)) for number in segment_numbers(folder))
-    return 0
-
-
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except FileNotFoundError:
-        return 0
 
 
 async def _query(

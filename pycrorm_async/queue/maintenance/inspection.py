@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
+from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.files.locks import is_locked
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, MENDED, PROGRESS, TAIL
@@ -25,10 +26,13 @@ from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 __all__ = [
     "DAMAGED_SUFFIX",
     "SpoolReport",
+    "FolderReport",
     "RecorderReport",
     "SegmentReport",
     "OpenEpisode",
     "Damage",
+    "inspect_folder",
+    "inspect_recorder",
     "inspect_spool",
 ]
 
@@ -67,14 +71,34 @@ class Damage:
 
 
 @dataclass(frozen=True)
-class RecorderReport:
-    """One recorder's folder, or a folder of dead letters.
+class FolderReport:
+    """One recorder's folder, or a folder of dead letters, without the content of its segments.
 
     Attributes:
         name: the folder's name: the recorder's id, followed by the episode's id for dead letters.
         path: the folder.
         alive: the recorder's process lives; for dead letters, a drainer may add more.
         being_drained: a process holds `drain`.
+        bytes_spooled: size of the segments; a living recorder allocates them in advance.
+        recorded, drained: the two parts of `progress`; None for a dead recorder and for one that drains itself.
+        refused: why the folder could not be examined: another recorder's file, a newer format, an OS error.
+    """
+
+    name: str
+    path: str
+    alive: bool
+    being_drained: bool = False
+    bytes_spooled: int = 0
+    recorded: RecorderStatus | None = None
+    drained: DrainStatus | None = None
+    refused: str | None = None
+
+
+@dataclass(frozen=True)
+class RecorderReport(FolderReport):
+    """One recorder's folder, or a folder of dead letters, with the content of its segments.
+
+    Attributes:
         first, last: positions of the first and the last whole record; last is first - 1 if there is none.
         safe: the last position that a commit frame covers.
         segments: the files, in order.
@@ -85,13 +109,8 @@ class RecorderReport:
         cut_off: files with the tails that earlier recoveries cut off.
         foreign: files that are not ours.
         damage: where the damage begins; only records before it are counted.
-        refused: why the folder could not be examined: another recorder's file, a newer format, an OS error.
     """
 
-    name: str
-    path: str
-    alive: bool
-    being_drained: bool
     first: int = 1
     last: int = 0
     safe: int = 0
@@ -103,7 +122,6 @@ class RecorderReport:
     cut_off: tuple[str, ...] = ()
     foreign: tuple[str, ...] = ()
     damage: Damage | None = None
-    refused: str | None = None
 
     @property
     def records(self) -> int:
@@ -182,20 +200,54 @@ def _is_name(name: str) -> bool:
     return True
 
 
-def inspect_recorder(recorder: RecorderFolder) -> RecorderReport:
-    """Report the content of one recorder's folder; an error that prevents it is in `refused`."""
-    name, path = recorder.name, str(recorder.path)
+def inspect_folder(recorder: RecorderFolder) -> FolderReport:
+    """Report the state of a recorder's folder, scanning no segment; an error that prevents it is in `refused`."""
     try:
         with wrap_os_errors(recorder.path):
-            draining = is_locked(recorder.path / DRAIN)
-            try:
-                return _examine(recorder, being_drained=draining)
-            except SpoolForeign as foreign:
-                return RecorderReport(name, path, recorder.alive, draining, refused=str(foreign))
+            return _look(recorder)
     except Exception as error:  # noqa: BLE001 - reported; must not prevent the report on the others
-        return RecorderReport(
-            name, path, recorder.alive, being_drained=False, refused=str(folder_error(recorder.path, error))
-        )
+        fault = str(folder_error(recorder.path, error))
+        return FolderReport(recorder.name, str(recorder.path), recorder.alive, refused=fault)
+
+
+def inspect_recorder(recorder: RecorderFolder) -> RecorderReport:
+    """Report the content of one recorder's folder; an error that prevents it is in `refused`."""
+    folder = inspect_folder(recorder)
+    try:
+        if folder.refused is None:
+            with wrap_os_errors(recorder.path):
+                return _examine(recorder, folder)
+        fault = folder.refused
+    except Exception as error:  # noqa: BLE001 - reported; must not prevent the report on the others
+        fault = str(folder_error(recorder.path, error))
+    return RecorderReport(folder.name, folder.path, folder.alive, folder.being_drained, refused=fault)
+
+
+def _look(recorder: RecorderFolder) -> FolderReport:
+    name, path, alive = recorder.name, str(recorder.path), recorder.alive
+    being_drained, spooled = is_locked(recorder.path / DRAIN), _bytes(recorder.path)
+    progress = Progress.open(recorder.path, writing=False) if alive else None
+    if progress is None:
+        return FolderReport(name, path, alive, being_drained, spooled)
+    try:
+        return FolderReport(name, path, alive, being_drained, spooled, progress.recorded(), progress.drained())
+    finally:
+        progress.close()
+
+
+def _bytes(folder: Path) -> int:
+    try:
+        segments = [segment_path(folder, number) for number in segment_numbers(folder)]
+    except FileNotFoundError:  # all records were stored and the folder deleted meanwhile
+        return 0
+    return sum(_size(each) for each in segments)
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
 
 
 @dataclass
@@ -217,16 +269,13 @@ class _Count:
             self.episodes.add(frame.episode)
 
 
-def _examine(recorder: RecorderFolder, *, being_drained: bool) -> RecorderReport:
+def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
     folder = recorder.path
-    count, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or being_drained)
+    count, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or state.being_drained)
     ours = {ALIVE, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in prefix.numbers)}
     others = sorted(_text(each.name) for each in folder.iterdir() if each.name not in ours)
     return RecorderReport(
-        recorder.name,
-        str(folder),
-        recorder.alive,
-        being_drained,
+        **vars(state),
         first=prefix.start.position + 1,
         last=prefix.cut.position,
         safe=max(count.safe, prefix.start.position),
@@ -267,8 +316,7 @@ def _survey_stable(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
 
 def _segment(folder: Path, number: int, prefix: ValidPrefix, count: _Count) -> SegmentReport:
     path = segment_path(folder, number)
-    size = path.stat().st_size if path.exists() else 0
-    return SegmentReport(path.name, size, prefix.bases.get(number), count.segments[number])
+    return SegmentReport(path.name, _size(path), prefix.bases.get(number), count.segments[number])
 
 
 def _open(prefix: ValidPrefix) -> list[OpenEpisode]:
