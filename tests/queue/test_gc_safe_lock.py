@@ -3,7 +3,9 @@
 import asyncio
 import gc
 import threading
+import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -160,30 +162,27 @@ def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
     assert waits
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("rounds", [50, pytest.param(500, marks=pytest.mark.soak)])
-def test_of_many_who_ring_at_once_each_waiter_is_woken_once(rounds: int) -> None:
-    bell = Notifier()
-    over = threading.Event()
-    failures: list[BaseException] = []
+def test_of_two_that_notify_the_same_waiter_at_once_one_wakes_it_and_neither_fails() -> None:
+    notifier, both_have_copied = Notifier(), threading.Barrier(2)
 
-    def notify_all() -> None:
-        try:
-            while not over.is_set():
-                bell.notify_all()
-        except BaseException as error:  # noqa: BLE001  # shown below
-            failures.append(error)
+    class Tickets(set[Future[None]]):
+        """Lets a thread go on from its copy of the tickets only when the other has its own."""
 
-    ringing = [threading.Thread(target=notify_all) for _ in range(3)]
-    for thread in ringing:
-        thread.start()
-    for _ in range(rounds):
-        asked = iter([False, True])
-        assert bell.block_until(lambda asked=asked: next(asked), remaining_s=lambda: PATIENCE_S)  # type: ignore[misc]
-    over.set()
-    for thread in ringing:
-        thread.join()
-    assert failures == []
+        def __iter__(self) -> Iterator[Future[None]]:
+            copy = list(super().__iter__())
+            both_have_copied.wait(PATIENCE_S)
+            return iter(copy)
+
+    notifier._tickets = Tickets()
+    answers = iter([False, True])
+    with ThreadPoolExecutor(3) as threads:
+        woken = threads.submit(notifier.block_until, lambda: next(answers), remaining_s=lambda: PATIENCE_S)
+        while not notifier.awaited:
+            time.sleep(0.001)
+        for each in [threads.submit(notifier.notify_all) for _ in range(2)]:
+            each.result(PATIENCE_S)
+        assert woken.result(PATIENCE_S)
+    assert not notifier.awaited
 
 
 @pytest.mark.parametrize("running", [True, False])
