@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import episode_text
+from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Append, Drain, DrainState
 from pycrorm_async.writer.ports import ClaimedSource
@@ -36,9 +36,11 @@ class VisibilityTracker:
         self.source = source
         self._drain = Drain(source, append, settings=settings, on_append=self._track, say=say)
         self._on_append = on_append
-        self._invisible: deque[tuple[int, dict[str, int]]] = (
-            deque()
-        )  # position, and each episode's last sequence up to it
+        self._stored_before = source.stored if source.invisible else 0
+        # Of each batch its last position, and each episode's last sequence up to it; first those stored before.
+        self._invisible: deque[tuple[int, dict[str, int]]] = deque()
+        if source.invisible:
+            self._invisible.append((source.stored, _by_text(source.invisible)))
         self._stopped: dict[str, str] = {}
         self._updated = asyncio.Event()
 
@@ -55,8 +57,8 @@ class VisibilityTracker:
 
     @property
     def appended(self) -> int:
-        """Position of the last appended record."""
-        return self._drain.appended
+        """Position of the last appended record, by this process or an earlier one."""
+        return max(self._drain.appended, self._stored_before)
 
     def note(self, appended: int, behind: Mapping[str, int], stopped: Mapping[str, str]) -> None:
         """Publish to the recorder which records are visible.
@@ -79,10 +81,13 @@ class VisibilityTracker:
             self._updated.set()
 
     def _track(self, batch: Sequence[Record]) -> None:
-        lasts = {each.episode: each.sequence for each in batch if each.episode is not None}
-        lasts_by_id = {episode_text(episode): last for episode, last in lasts.items()}
+        lasts = _by_text({each.episode: each.sequence for each in batch if each.episode is not None})
         if len(self._invisible) >= _BATCHES_MAX:
             _, before = self._invisible.pop()
-            lasts_by_id = before | lasts_by_id
-        self._invisible.append((batch[-1].position, lasts_by_id))
+            lasts = before | lasts
+        self._invisible.append((batch[-1].position, lasts))
         self._on_append()
+
+
+def _by_text(lasts: Mapping[EpisodeId, int]) -> dict[str, int]:
+    return {episode_text(episode): last for episode, last in lasts.items()}

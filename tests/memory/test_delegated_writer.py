@@ -27,6 +27,8 @@ from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.sources.live_source import LiveSource
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
@@ -137,6 +139,26 @@ async def test_closing_says_so_when_all_is_stored_and_the_tables_are_behind(
     drainer.release()
     [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
     assert line.startswith("all events are stored, but the last 7 are not visible in the tables yet (")
+
+
+async def test_a_flush_returns_when_a_daemon_died_between_storing_and_folding_and_the_next_one_folds(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=10.0)) as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.synced()
+        [folder] = Spool(spool).recorders()
+        killed = LiveSource.take(folder.path)
+        assert killed is not None
+        batch = await killed.get_batch(events_max=100, bytes_max=2**20, age_s_max=0.0)
+        log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+        await log.append(batch)
+        await log.close()
+        await killed.acknowledge(batch[-1].position)
+        killed.release()
+        async with daemon():
+            await memory.flush()
+            assert await texts(memory) == ["a"]
 
 
 async def test_one_round_stores_what_a_living_process_has_synced_and_its_flush_returns(

@@ -7,7 +7,7 @@ uses `scan.py`.
 from __future__ import annotations
 
 import mmap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -100,10 +100,12 @@ class Reader:
         complete = full or len(records) >= events_max or total >= bytes_max
         return Batch(records, total, Cursor(number, offset, position), complete)
 
-    def skip_to(self, position: int) -> None:
+    def skip_to(self, position: int, *, on_records: Callable[[Sequence[Record]], None] = lambda _: None) -> None:
         """Move the cursor behind this position; the records up to it must be readable. Raises as `read` does."""
         while self.cursor.position < position:
-            self.cursor = self.read(last=position, events_max=10_000, bytes_max=2**22).after
+            batch = self.read(last=position, events_max=10_000, bytes_max=2**22)
+            on_records(batch.records)
+            self.cursor = batch.after
 
     def close(self) -> None:
         """Close the current segment."""

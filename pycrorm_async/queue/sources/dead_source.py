@@ -91,6 +91,7 @@ class DeadSource:
     """
 
     is_alive = False
+    invisible: Mapping[EpisodeId, int] = {}
 
     def __init__(
         self, folder: Path, recorder: EpisodeId, locks: tuple[FileLock, ...], stored: StoredSegments | None

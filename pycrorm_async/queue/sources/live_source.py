@@ -2,8 +2,9 @@
 
 The holder of `drain` reads; only the recorder deletes segments, after it reads in `progress` that they are stored. So
 either process may be killed at any time. After a killed drainer the next one starts behind the stored position and
-appends the records in between again, which the log stores once. After a killed recorder this source ends, and recovery
-supplies the whole folder again without regard to `progress`.
+appends the records in between again, which the log stores once. A flush of the recorder may wait for records that the
+killed drainer stored and that are not visible yet; `invisible` lists them, so that their visibility is published. After
+a killed recorder this source ends, and recovery supplies the whole folder again without regard to `progress`.
 """
 
 from __future__ import annotations
@@ -41,6 +42,10 @@ class LiveSource:
     """A live recorder's folder as a source. Constructed by `take`, used by one task, ended by `release`.
 
     Implements the writer's `ClaimedSource`.
+
+    Attributes:
+        invisible: by episode, the last sequence that earlier drainers stored and that was not visible, as far as the
+            segments are left.
     """
 
     holds_dead_letters = False
@@ -55,8 +60,10 @@ class LiveSource:
         self._dead_letters = DeadLetters(folder)
         before = progress.drained()
         self._status = before._replace(note=DrainNote())  # drops the note of an earlier drainer
-        self._reader = Reader(recorder=recorder, start=self._start_of(before.stored), load=self._load)
-        self._reader.skip_to(min(before.stored, progress.recorded().synced))
+        visible = min(before.stored, before.folded)
+        self._reader = Reader(recorder=recorder, start=self._start_of(visible), load=self._load)
+        self.invisible: dict[EpisodeId, int] = {}
+        self._reader.skip_to(min(before.stored, progress.recorded().synced), on_records=self._note_invisible)
         self._until: int | None = None
         self._alive_checked_s = 0.0
         progress.write_drain_status(self._status)
@@ -66,8 +73,8 @@ class LiveSource:
         """Open the folder as a source; None if it is not offered, drained by another process, closed and drained, or
         its recorder is dead.
 
-        Reads at most one segment to find the first record that is not stored. Raises `SpoolDamaged`, `SpoolForeign` and
-        `SpoolUnavailable`; then it holds no lock.
+        Reads the segments from the first record that is not visible to the last one that is stored. Raises
+        `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`; then it holds no lock.
         """
         with wrap_os_errors(folder):
             progress = Progress.open(folder, writing=True)
@@ -207,6 +214,9 @@ class LiveSource:
         self._alive_checked_s = now_s
         return not self.is_alive
 
+    def _note_invisible(self, records: Sequence[Record]) -> None:
+        self.invisible.update((each.episode, each.sequence) for each in records if each.episode is not None)
+
     def _update_note(self, **fields: object) -> None:
         status = self._status._replace(note=msgspec.structs.replace(self._status.note, **fields))
         if status != self._status:
@@ -217,7 +227,7 @@ class LiveSource:
             self._progress.write_drain_status(status)
         self._status = status
 
-    def _start_of(self, stored: int) -> Cursor:
+    def _start_of(self, visible: int) -> Cursor:
         """Return the beginning of the segment with the record behind this position, or of the oldest segment."""
         start: Cursor | None = None
         for number in segment_numbers(self.folder):
@@ -228,7 +238,7 @@ class LiveSource:
                 continue
             with buffer:
                 header = read_header(path, buffer, recorder=self._recorder, number=number)
-            if header is None or (start is not None and header.base - 1 > stored):
+            if header is None or (start is not None and header.base - 1 > visible):
                 break
             start = Cursor(number, header_bytes(len(header.open)), header.base - 1)
         return start or Cursor(1, header_bytes(0), 0)
