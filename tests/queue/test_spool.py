@@ -141,6 +141,14 @@ def test_strangers_in_the_spool_are_named_and_left_alone(spool: Path, queue: Rec
     assert [each.path for each in Spool(spool).recorders()] == [queue.folder]
 
 
+def test_a_spool_that_cannot_be_created_is_one_line_with_what_to_do() -> None:
+    with pytest.raises(SpoolUnavailable) as refused:
+        Spool(Path("/proc/none")).bind("a-log")
+    assert str(refused.value) == (
+        "spool /proc/none: cannot be created: No such file or directory; name another folder with --spool"
+    )
+
+
 def test_a_file_where_the_spool_belongs_is_one_clear_line(tmp_path: Path) -> None:
     blocking = tmp_path / "blocking"
     blocking.touch()

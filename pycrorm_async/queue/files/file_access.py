@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Final
 
+from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.settings import FILE_MODES, FileAccess
 
 __all__ = ["create_spool", "create_folder", "create_folders", "open_file", "rewrite"]
@@ -26,13 +27,16 @@ _SHARED: Final = stat.S_ISGID | stat.S_IWGRP
 def create_spool(path: Path, access: FileAccess) -> None:
     """Make the spool and its parents unless they exist; with "group", open an existing spool to its group.
 
-    Raises `OSError`.
+    Raises `SpoolUnavailable` if it cannot be created, and `OSError`.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         _make(path, access)
-    except FileExistsError:
-        if not path.is_dir():
+    except OSError as error:
+        if not os.path.lexists(path):
+            reason = f"cannot be created: {error.strerror}; name another folder with --spool"
+            raise SpoolUnavailable(path, reason) from error
+        if not isinstance(error, FileExistsError) or not path.is_dir():
             raise
         if access == "group" and _access_below(path) == "owner":
             path.chmod(_FOLDER_MODES["group"])

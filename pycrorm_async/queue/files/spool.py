@@ -153,7 +153,7 @@ class Spool:
         except FileNotFoundError:
             return []
         except NotADirectoryError:
-            raise SpoolUnavailable(self.path, "is a file, not a folder") from None
+            raise SpoolUnavailable(self.path, "is a file, not a folder; name a folder with --spool") from None
 
 
 def _is_recorder(path: Path) -> bool:

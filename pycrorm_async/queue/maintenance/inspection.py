@@ -154,7 +154,7 @@ def inspect_spool(path: Path) -> SpoolReport:
     spool = Spool(path)
     with wrap_os_errors(path):
         if not path.exists():
-            raise SpoolUnavailable(path, "does not exist")
+            raise SpoolUnavailable(path, "does not exist; `pycrorm status --url URL` prints the spool of a database")
     recorders, log_id = spool.recorders(), spool.log_id()
     others = spool.strangers()
     replaced = [each for each in others if is_damaged_copy(each)]
