@@ -29,6 +29,7 @@ _KEYS = {
     "parameter_item": ("node_id", "field", "position"),
     "joint_change": ("id", "joint"),
     "location_candidate": ("resolution_id", "position"),
+    "location_refusal": ("resolution_id", "position"),
     "detection": ("id", "position"),
     "state_sample": ("id", "channel"),
 }

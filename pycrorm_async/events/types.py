@@ -20,6 +20,7 @@ __all__ = [
     "FailureValue",
     "MissingValue",
     "CandidateValue",
+    "RefusalValue",
     "SeenValue",
     "NodeReference",
     "FieldType",
@@ -125,6 +126,13 @@ class CandidateValue(_Value, frozen=True):
     arms: tuple[str, ...] = ()
     grasp: str | None = None
     torso_height: float | None = None
+
+
+class RefusalValue(_Value, frozen=True):
+    """A pose that a location designator tried and did not offer, with the reason."""
+
+    pose: PoseValue
+    reason: str
 
 
 class SeenValue(_Value, frozen=True):
@@ -330,6 +338,7 @@ class LocationResolved(Happening, frozen=True):
         taken: index into `offered` of the candidate that the plan used; None if it used none.
         considered: number of places the designator examined to find them.
         node: the node that resolved it.
+        refused: the first examined places that it did not offer, in order; empty in events of older versions.
     """
 
     location: str
@@ -337,6 +346,7 @@ class LocationResolved(Happening, frozen=True):
     taken: int | None = None
     considered: int = 0
     node: int | None = None
+    refused: tuple[RefusalValue, ...] = ()
 
 
 class ObjectDetected(Happening, frozen=True):

@@ -63,7 +63,7 @@ from pycrorm_async.hooks.values.parameters import ROBOT, fit_node_start, read_pa
 from pycrorm_async.hooks.values.value_snapshot import encode_or_missing, failure_value, missing_in
 from pycrorm_async.hooks.world_recorder import WorldRecorder
 from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.execution.observer import Candidate, Seen
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
@@ -225,16 +225,20 @@ class Episode:
 
     def record_location(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
-        node: TaskTreeNode | None,
+        refused: tuple[Refusal, ...], node: TaskTreeNode | None,
     ) -> int:  # fmt: skip
-        """Write which candidates a location designator offered and which one was taken; return the sequence."""
+        """Write which places a location designator offered, took and refused; return the sequence."""
         number = self._sequence_of(node)
-        resolved = location_resolved(location, offered, taken=taken, considered=considered, node=number)
+        resolved = location_resolved(
+            location, offered, taken=taken, considered=considered, refused=refused, node=number
+        )
         try:
             return self._emitter.put(self.id, resolved)
         except NotEncodable as error:
-            self._emitter.missing.note(resolved.location, "offered", error.reason)
-            return self._emitter.put(self.id, fit_resolution(resolved, self._emitter.settings.record_bytes_max))
+            fitted = fit_resolution(resolved, self._emitter.settings.record_bytes_max)
+            shortened = "offered" if len(fitted.offered) < len(resolved.offered) else "refused"
+            self._emitter.missing.note(resolved.location, shortened, error.reason)
+            return self._emitter.put(self.id, fitted)
 
     def record_detection(
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],

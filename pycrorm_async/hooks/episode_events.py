@@ -17,12 +17,13 @@ from pycrorm_async.events.types import (
     NodeReference,
     NodeStatus,
     ObjectDetected,
+    RefusalValue,
     SeenValue,
 )
 from pycrorm_async.hooks.values.texts import clean
 from pycrorm_async.hooks.values.value_snapshot import References, pose_value
 from pycrorm_async.plan.exceptions import is_plan_failure
-from pycrorm_async.plan.execution.observer import Candidate, Seen
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
 from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["EpisodeOpening", "episode_started", "location_resolved", "object_detected", "end_statuses"]
@@ -58,8 +59,9 @@ def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> Epi
 
 
 def location_resolved(
-    location: str, offered: Sequence[Candidate], *, taken: int | None, considered: int, node: int | None
-) -> LocationResolved:
+    location: str, offered: Sequence[Candidate], *, taken: int | None, considered: int, refused: Sequence[Refusal],
+    node: int | None,
+) -> LocationResolved:  # fmt: skip
     """Build the event of a resolved location designator; `node` is the sequence of the node that resolved it."""
     return LocationResolved(
         location=clean(location),
@@ -75,6 +77,7 @@ def location_resolved(
         taken=taken,
         considered=considered,
         node=node,
+        refused=tuple(RefusalValue(pose_value(each.pose), clean(each.reason)) for each in refused),
     )
 
 

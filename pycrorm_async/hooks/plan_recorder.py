@@ -39,7 +39,7 @@ from pycrorm_async.hooks.episode import Episode, NodeRecord, current_task
 from pycrorm_async.hooks.episode_events import EpisodeOpening
 from pycrorm_async.hooks.sampler import Sampler
 from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
-from pycrorm_async.plan.execution.observer import Candidate, Seen, Thought, thinking
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Thought, thinking
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
@@ -254,14 +254,14 @@ class Recorder:
 
     def location_resolved(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
-        node: TaskTreeNode | None,
+        refused: tuple[Refusal, ...], node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
         episode = self._open_episode()
         if episode is None or self._emitter.is_closed:
             return
         try:
             sequence = episode.record_location(
-                location=location, offered=offered, taken=taken, considered=considered, node=node
+                location=location, offered=offered, taken=taken, considered=considered, refused=refused, node=node
             )
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("LocationResolved", error)

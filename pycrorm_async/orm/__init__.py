@@ -49,7 +49,7 @@ from pycrorm_async.orm.objects import (
     ObjectRemoval,
 )
 from pycrorm_async.orm.perception import Detection, StateSample
-from pycrorm_async.orm.tree import LocationCandidate, LocationResolution, TaskTreeNode
+from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
 from pycrorm_async.orm.views import PickUpWithContextView
 
 __all__ = [
@@ -69,6 +69,7 @@ __all__ = [
     "TaskTreeNode",
     "LocationResolution",
     "LocationCandidate",
+    "LocationRefusal",
     "Detection",
     "StateSample",
     "DesignatorType",

@@ -14,7 +14,7 @@ from pycrorm_async.orm.types import JsonText
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
 
-__all__ = ["TaskTreeNode", "LocationResolution", "LocationCandidate"]
+__all__ = ["TaskTreeNode", "LocationResolution", "LocationCandidate", "LocationRefusal"]
 
 
 class TaskTreeNode(Base):
@@ -93,6 +93,24 @@ class LocationCandidate(Base):
         return [Arms[name] for name in self.arms.split(",") if name]
 
 
+class LocationRefusal(Base):
+    """A place that a location designator tried and did not offer, and the reason; `position` is its rank, 0 first."""
+
+    __tablename__ = "location_refusal"
+
+    resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
+    position: Mapped[int] = mapped_column(primary_key=True)
+    x: Mapped[float]
+    y: Mapped[float]
+    z: Mapped[float]
+    qx: Mapped[float]
+    qy: Mapped[float]
+    qz: Mapped[float]
+    qw: Mapped[float]
+    frame: Mapped[str]
+    reason: Mapped[str]
+
+
 class LocationResolution(Base):
     """A location designator's answer to one request for a place.
 
@@ -101,6 +119,8 @@ class LocationResolution(Base):
         considered, offered: the number of places it checked, and of those it offered.
         taken: the rank of the place that the plan used, whose pose is `pose`; None if it used none.
         node: the node that made the request.
+        refusals: the first 1,000 places that it refused. Not loaded by default: use
+            `await resolution.awaitable_attrs.refusals`.
     """
 
     __tablename__ = "location_resolution"
@@ -119,5 +139,8 @@ class LocationResolution(Base):
     pose: Mapped[Pose | None] = relationship(viewonly=True, lazy="selectin")
     candidates: Mapped[list[LocationCandidate]] = relationship(
         viewonly=True, lazy="selectin", order_by=LocationCandidate.position
+    )
+    refusals: Mapped[list[LocationRefusal]] = relationship(
+        viewonly=True, lazy="select", order_by=LocationRefusal.position
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

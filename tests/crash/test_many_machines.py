@@ -210,8 +210,8 @@ class Told:
             table: ask(url, f"SELECT count(*) FROM {table}")[0][0]
             for table in (
                 "process_metadata task_tree_node step_action carry_action pose parameter_item"
-                " object object_removal attachment joint_change location_resolution location_candidate detection"
-                " state_sample"
+                " object object_removal attachment joint_change location_resolution location_candidate location_refusal"
+                " detection state_sample"
             ).split()
         }
 

@@ -25,7 +25,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.execution.observer import Candidate
+from pycrorm_async.plan.execution.observer import Candidate, Refusal
 from pycrorm_async.plan.motions.process_modules import simulated_robot
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
 from pycrorm_async.settings import Settings
@@ -226,11 +226,18 @@ async def test_a_resolved_location_is_remembered_with_its_node() -> None:
     with rigged() as rig, rig.episode() as episode:
         pose = Pose([1.0, 2.0, 0.0], time_ns=5)
         rig.recorder.location_resolved(
-            location="CostmapLocation", offered=(Candidate(pose, (Arms.LEFT,)),), taken=0, considered=7, node=None
+            location="CostmapLocation",
+            offered=(Candidate(pose, (Arms.LEFT,)),),
+            taken=0,
+            considered=7,
+            refused=(Refusal(pose, "LEFT: too far"), Refusal(pose, "hidden\0")),
+            node=None,
         )
     event = next(e for _, e in rig.sink.of(episode) if isinstance(e, LocationResolved))
     assert event.offered[0].pose == PoseValue((1.0, 2.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 5)
     assert (event.offered[0].arms, event.taken, event.considered, event.node) == (("LEFT",), 0, 7, None)
+    assert [each.reason for each in event.refused] == ["LEFT: too far", "hidden\\x00"]
+    assert {each.pose for each in event.refused} == {event.offered[0].pose}
 
 
 async def test_three_plans_in_three_tasks_never_share_a_parent() -> None:

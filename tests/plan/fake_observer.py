@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-from pycrorm_async.plan.execution.observer import Candidate, Seen, Thought, recorder, thinking
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Thought, recorder, thinking
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, current_node
 from pycrorm_async.world import ObjectType
 
@@ -21,6 +21,7 @@ class Recording:
 
     def __init__(self) -> None:
         self.told: list[str] = []
+        self.refused: list[tuple[Refusal, ...]] = []
         self.places: list[tuple[str, tuple[Candidate, ...], int | None, int, TaskTreeNode | None]] = []
         self.open: list[TaskTreeNode] = []
         self.ended: list[TaskTreeNode] = []
@@ -64,8 +65,10 @@ class Recording:
         offered: tuple[Candidate, ...],
         taken: int | None,
         considered: int,
+        refused: tuple[Refusal, ...],
         node: TaskTreeNode | None,
     ) -> None:
+        self.refused.append(refused)
         self.places.append((location, offered, taken, considered, node))
         self.told.append(f"place {location}")
 

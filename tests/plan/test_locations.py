@@ -142,6 +142,9 @@ def test_no_place_to_reach_it_from_is_a_failure_and_is_recorded(scene: Scene) ->
         assert caught.value.data == (OUT_OF_REACH,)
         assert list(CostmapLocation(OUT_OF_REACH, reachable_for=scene.robot)) == []
     assert recording.places == [("CostmapLocation", (), None, 600, None)] * 3
+    for refused in recording.refused:
+        assert len({each.pose.position for each in refused}) == 600
+        assert all(re.fullmatch("LEFT: .+; RIGHT: .+", each.reason) for each in refused)
 
 
 def test_no_place_to_see_it_from_is_a_failure_and_is_recorded(scene: Scene) -> None:
@@ -306,6 +309,9 @@ def test_a_place_that_is_taken_is_not_offered(scene: Scene) -> None:
         left = list(location)
     assert 0 < len(left) < free
     assert recording.places[0][3] == free
+    assert len(recording.refused[0]) == free - len(left)
+    assert {each.reason for each in recording.refused[0]} == {"cereal is in the way"}
+    assert not {each.pose.position for each in recording.refused[0]} & {each.pose.position for each in left}
     for place in left:
         scene.milk.set_pose(place.pose)
         milk, cereal = scene.milk.bounding_box(), scene.cereal.bounding_box()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 
 import pytest
 
@@ -24,6 +25,7 @@ from pycrorm_async.plan.failures import (
     EnvironmentUnreachable,
     PerceptionObjectNotInWorld,
 )
+from pycrorm_async.plan.locations.designators import REFUSALS_MAX
 from pycrorm_async.world import Arms, Pose
 from pycrorm_async.world.errors import UnknownLink
 from tests.plan.conftest import Scene
@@ -148,7 +150,8 @@ def test_a_handle_that_cannot_be_reached_from_anywhere_is_a_failure_and_is_recor
     assert caught.value.data == ("sink_area_drawer_handle",)
     ((name, offered, taken, considered, _),) = recording.places
     assert (name, offered, taken) == ("AccessingLocation", (), None)
-    assert considered > 600
+    assert considered > REFUSALS_MAX == len(recording.refused[0])
+    assert all(re.fullmatch("LEFT: .+; RIGHT: .+", each.reason) for each in recording.refused[0])
 
 
 def test_what_cannot_be_opened_is_said(scene: Scene) -> None:

@@ -186,6 +186,10 @@ async def test_that_nothing_was_known_or_fitted_is_told_too(scene: Scene) -> Non
         ("DatabaseCostmapLocation", (), None, 0, None),
         ("DatabaseCostmapLocation", (), None, 1, None),
     ]
+    assert [[each.reason for each in refused] for refused in recording.refused] == [
+        [],
+        ["an obstacle is nearer than 0.3 m"],
+    ]
 
 
 async def test_a_loop_over_places_is_told_once_when_it_is_left(scene: Scene) -> None:

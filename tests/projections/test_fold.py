@@ -27,6 +27,7 @@ from pycrorm_async.events.types import (
     ObjectRemoved,
     ObjectValue,
     PoseValue,
+    RefusalValue,
     RobotValue,
     SeenValue,
     StateSampled,
@@ -288,7 +289,8 @@ def test_a_resolved_location_keeps_what_was_offered_and_what_was_taken() -> None
     script = Script()
     root = script.put(NodeStarted("root"))
     offered = (CandidateValue(pose(1, 1), ("LEFT", "RIGHT")), CandidateValue(pose(2, 2), ("LEFT",), "TOP", 0.25))
-    script.put(LocationResolved("CostmapLocation", offered, taken=1, considered=600, node=root))
+    refused = (RefusalValue(pose(3, 3), "LEFT: too far"), RefusalValue(pose(4, 4), "not visible"))
+    script.put(LocationResolved("CostmapLocation", offered, taken=1, considered=600, node=root, refused=refused))
     script.put(LocationResolved("AccessingLocation", considered=3))
     made = rows_of(script)
     assert made["location_resolution"] == [
@@ -298,6 +300,10 @@ def test_a_resolved_location_keeps_what_was_offered_and_what_was_taken() -> None
     assert made["location_candidate"] == [
         (row(2), 0, 1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT,RIGHT", False, None, None),
         (row(2), 1, 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT", True, "TOP", 0.25),
+    ]
+    assert made["location_refusal"] == [
+        (row(2), 0, 1, 3.0, 3.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT: too far"),
+        (row(2), 1, 1, 4.0, 4.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "not visible"),
     ]
     assert made["pose"] == [(row(2), 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
 

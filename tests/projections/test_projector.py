@@ -23,6 +23,7 @@ from pycrorm_async.events.types import (
     ObjectReference,
     ObjectRemoved,
     PoseValue,
+    RefusalValue,
     RobotValue,
 )
 from pycrorm_async.projections.projector import Projector
@@ -48,6 +49,8 @@ pytestmark = pytest.mark.slow
 
 VIA = declared("ViaAction", "via_action", field("via", "list", 2, item="pose"))
 
+REFUSED = RefusalValue(pose(2, 2), "LEFT: too far")
+
 
 def rich_episode(number: int) -> Script:
     """Everything that can happen, so that every table is filled."""
@@ -59,7 +62,7 @@ def rich_episode(number: int) -> Script:
     milk = put(ObjectAdded("milk", "MILK", pose(number, 2, 3)))
     state = RobotValue(pose(0.1, 0.2, 0), "ROBOT", 0.1, ObjectReference(robot, robot))
     drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(1, 1)}, state))
-    put(LocationResolved("CostmapLocation", (CandidateValue(pose(1, 1), ("LEFT",)),), 0, 10, drive))
+    put(LocationResolved("CostmapLocation", (CandidateValue(pose(1, 1), ("LEFT",)),), 0, 10, drive, (REFUSED,)))
     moved = put(ObjectMoved(robot, "pr2", "ROBOT", pose(1, 1), drive))
     put(NodeEnded(drive, "SUCCEEDED"))
     parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
@@ -81,6 +84,7 @@ async def test_every_table_is_filled_by_what_happens(log: EventLog) -> None:
     assert filled == {
         "process_metadata__1", "task_tree_node__1", "pose__1", "object__1", "object_removal__1", "attachment__1",
         "parameter_item__1", "joint_change__1", "location_resolution__1", "location_candidate__1",
+        "location_refusal__1",
         "navigate_action__1", "pick_up_action__1", "via_action__1",
     }  # fmt: skip
 
@@ -110,6 +114,7 @@ async def test_batches_of_any_size_show_the_same_rows(log: EventLog, batch_event
     assert counts == {
         "process_metadata": 2, "task_tree_node": 10, "pose": 16, "object": 6, "object_removal": 2,
         "parameter_item": 4, "attachment": 2, "joint_change": 2, "location_resolution": 2, "location_candidate": 2,
+        "location_refusal": 2,
         "navigate_action": 2, "pick_up_action": 2, "via_action": 2, "saying_action": 1,
     }  # fmt: skip
 

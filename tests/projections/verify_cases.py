@@ -30,6 +30,7 @@ from pycrorm_async.events.types import (
     ObjectReference,
     ObjectRemoved,
     ObjectValue,
+    RefusalValue,
     RobotValue,
     SeenValue,
     StateSampled,
@@ -83,7 +84,7 @@ def _round(script: Script, root: int, robot: int, *, simulated: bool) -> None:
     place = {"target_location": pose(1, 1)}
     drive = put(NodeStarted("action", root, name_of(NAVIGATE), place, state, simulated=simulated))
     candidates = (CandidateValue(pose(1, 1), ("LEFT",), "TOP", 0.3), CandidateValue(pose(2, 1), ("RIGHT", "LEFT")))
-    put(LocationResolved("CostmapLocation", candidates, 0, 10, drive))
+    put(LocationResolved("CostmapLocation", candidates, 0, 10, drive, (RefusalValue(pose(3, 1), "hidden"),)))
     moved = put(ObjectMoved(robot, "pr2", "ROBOT", pose(1, 1), drive))
     put(NodeEnded(drive, "SUCCEEDED", result={"metres": 2}))
     seen = (SeenValue("milk", "MILK", pose(1), it, 0.5), SeenValue("jug", "JUG", pose(2)))

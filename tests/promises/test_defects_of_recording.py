@@ -7,6 +7,7 @@ SQLite file, the mapped classes.
 from __future__ import annotations
 
 import asyncio
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -29,6 +30,7 @@ from pycrorm_async.orm import (
     Detection,
     JointChange,
     LocationCandidate,
+    LocationRefusal,
     LocationResolution,
     MoveAndPickUpAction,
     MoveArmJointsMotion,
@@ -49,6 +51,7 @@ from pycrorm_async.plan import (
     IKError,
     LookAtActionPerformable,
     MoveAndPickUpPerformable,
+    MoveTCPMotion,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     ObjectDesignator,
@@ -59,7 +62,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan import BelieveObject as Believed
 from pycrorm_async.plan import ObjectPart as Part
-from pycrorm_async.plan.failures import CollisionError, PerceptionObjectNotInWorld, ReasoningError
+from pycrorm_async.plan.failures import CollisionError, PerceptionObjectNotInWorld, ReachabilityFailure, ReasoningError
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
@@ -75,6 +78,7 @@ from tests.promises.lab import (
     nodes_of,
     remembered,
     statuses,
+    turned,
     url_of,
     written,
 )
@@ -332,12 +336,17 @@ async def test_all_times_are_moments_in_utc_whatever_the_local_time_is(
     assert begun - millisecond <= min(moments) <= max(moments) <= ended + millisecond
 
 
+TOO_HIGH = Pose([1.3, 1, 2.5])
+
+
 async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_path: Path) -> None:
     async with remembered(tmp_path):
         with lab() as scene:
             await ParkArmsActionPerformable(Arms.LEFT).perform()
             await MoveTorsoActionPerformable(0.3).perform()
             stand = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.LEFT).resolve()
+            with pytest.raises(ReachabilityFailure):
+                CostmapLocation(TOO_HIGH, reachable_for=scene.robot, reachable_arm=Arms.LEFT).resolve()
             await MoveAndPickUpPerformable(stand.pose, scene.milk, Arms.LEFT, Grasp.FRONT).perform()
             scene.robot.detach(scene.milk)
             await LookAtActionPerformable(scene.cereal.pose).perform()
@@ -358,9 +367,22 @@ async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_
         Arms.LEFT,
         Grasp.FRONT,
     )
-    (resolved,) = await asked(tmp_path, select(LocationResolution))
+    resolved, failed = await asked(tmp_path, select(LocationResolution).order_by(LocationResolution.id))
     assert (resolved.location, resolved.offered, resolved.taken) == ("CostmapLocation", 1, 0)
     assert resolved.considered >= 1
+    assert (failed.offered, failed.taken, failed.considered) == (0, None, 600)
+    refused = await asked(tmp_path, select(LocationRefusal).order_by(LocationRefusal.position))
+    refused = [each for each in refused if each.resolution_id == failed.id]
+    assert [each.position for each in refused] == list(range(600))
+    assert len({(each.x, each.y) for each in refused}) == 600
+    for each in refused:  # each on the floor, near the pose that is too high, facing it
+        assert math.dist((each.x, each.y, each.z), TOO_HIGH.position) < 4
+        assert math.isclose(math.atan2(1 - each.y, 1.3 - each.x), Pose((0, 0, 0), turned(each)).yaw, abs_tol=1e-9)
+    with pytest.raises(IKError) as unreachable, lab() as again:
+        again.robot.set_pose(Pose(at(refused[0]), turned(refused[0])))
+        await MoveTorsoActionPerformable(0.3).perform()
+        await MoveTCPMotion(TOO_HIGH, Arms.LEFT).perform()
+    assert refused[0].reason.removeprefix("LEFT: ") in str(unreachable.value)
     (candidate,) = await asked(tmp_path, select(LocationCandidate))
     assert ((candidate.x, candidate.y, candidate.z), candidate.arms) == (stand.pose.position, "LEFT")
     (seen,) = await asked(tmp_path, select(Detection))

@@ -11,7 +11,6 @@ from msgspec.structs import replace
 
 from pycrorm_async.events.codec import NotEncodable, encode
 from pycrorm_async.events.types import (
-    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
     FailureValue,
@@ -20,6 +19,7 @@ from pycrorm_async.events.types import (
     MissingValue,
     NodeEnded,
     ObjectDetected,
+    PoseValue,
 )
 from pycrorm_async.hooks.values.texts import clean, cut
 
@@ -97,19 +97,27 @@ def _shortened_failures(failure: FailureValue | None) -> Iterator[FailureValue]:
 
 
 def fit_resolution(resolved: LocationResolved, bytes_max: int) -> LocationResolved:
-    """Drop candidates until the event fits: first those with non-finite numbers, never the one that was taken.
+    """Drop places until the event fits: first those with non-finite numbers, then the last refused, then candidates.
 
-    A taken candidate that itself holds a non-finite number is dropped, and `taken` becomes None.
+    The candidate that was taken is kept, unless it holds a non-finite number; then `taken` becomes None.
     """
+    refused = tuple(each for each in resolved.refused if _is_finite(each.pose))
     taken = resolved.offered[resolved.taken] if resolved.taken is not None else None
-    others = [each for index, each in enumerate(resolved.offered) if index != resolved.taken and _is_finite(each)]
-    last = (taken,) if taken is not None and _is_finite(taken) else ()
+    others = [
+        each
+        for index, each in enumerate(resolved.offered)
+        if index != resolved.taken and _is_finite(each.pose, each.torso_height)
+    ]
+    last = (taken,) if taken is not None and _is_finite(taken.pose, taken.torso_height) else ()
     while True:
         offered = (*others, *last)
-        shorter = replace(resolved, offered=offered, taken=len(offered) - 1 if last else None)
-        if not others or fits(shorter, bytes_max):
+        shorter = replace(resolved, offered=offered, taken=len(offered) - 1 if last else None, refused=refused)
+        if not (others or refused) or fits(shorter, bytes_max):
             return shorter
-        others = others[: len(others) // 2]
+        if refused:
+            refused = refused[: len(refused) // 2]
+        else:
+            others = others[: len(others) // 2]
 
 
 def fit_detection(detected: ObjectDetected, bytes_max: int) -> ObjectDetected:
@@ -121,8 +129,7 @@ def fit_detection(detected: ObjectDetected, bytes_max: int) -> ObjectDetected:
     return shorter
 
 
-def _is_finite(candidate: CandidateValue) -> bool:
-    pose, height = candidate.pose, candidate.torso_height
+def _is_finite(pose: PoseValue, height: float | None = None) -> bool:
     numbers = (*pose.position, *pose.orientation, height if height is not None else 0.0)
     return all(map(math.isfinite, numbers))
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pycrorm_async.plan.task_tree import TaskTreeNode
     from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = ["PlanObserver", "Candidate", "Seen", "Thought", "recorder", "thinking"]
+__all__ = ["PlanObserver", "Candidate", "Refusal", "Seen", "Thought", "recorder", "thinking"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +34,14 @@ class Candidate:
     arms: tuple[Arms, ...] = ()
     grasp: Grasp | None = None
     torso_height: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A place that a location designator tried and does not offer, and the reason."""
+
+    pose: Pose
+    reason: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +93,7 @@ class PlanObserver(Protocol):
         offered: tuple[Candidate, ...],
         taken: int | None,
         considered: int,
+        refused: tuple[Refusal, ...],
         node: TaskTreeNode | None,
     ) -> None:
         """Called after a location designator was resolved or iterated.
@@ -94,6 +103,7 @@ class PlanObserver(Protocol):
             offered: the places it offered.
             taken: index of the offered place that was taken; None if none was.
             considered: number of places it tried.
+            refused: the first places that it tried in vain, in the order of the search.
 
         Called once per resolution, in another context if a loop over places was dropped.
         """

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from typing import NamedTuple
 
 from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_world
 from pycrorm_async.plan.errors import NoRobotHere
@@ -20,12 +21,19 @@ from pycrorm_async.world.pose import Pose, yaw_quaternion
 from pycrorm_async.world.queries.costmaps import Costmap, GaussianCostmap, OccupancyCostmap, VisibilityCostmap
 from pycrorm_async.world.robots.kinematics import Unreachable, solve
 
-__all__ = ["face", "reaching_arms", "resolve_robot", "base_poses"]
+__all__ = ["Reach", "face", "reaching_arms", "resolve_robot", "base_poses"]
 
 CELLS_MAX = 600
 """Bounds the cells checked per search, so that a search without a solution ends."""
 VISIBLE_SHARE_MIN = 0.5
 """Minimum visible share of an object that counts as seen from a place."""
+
+
+class Reach(NamedTuple):
+    """The arms that reach the target from a place; or, for an unsuitable place, none and the reason."""
+
+    arms: tuple[Arms, ...] = ()
+    refusal: str | None = None
 
 
 def base_poses(
@@ -34,8 +42,8 @@ def base_poses(
     reachable_for: ObjectLike | None,
     visible_for: ObjectLike | None,
     reachable_arm: Arms | None,
-) -> Iterator[tuple[Pose, tuple[Arms, ...] | None]]:
-    """Yield base poses that face the target, best first, each with the arms that reach it; None for unsuitable ones."""
+) -> Iterator[tuple[Pose, Reach]]:
+    """Yield base poses that face the target, best first, suitable or not."""
     reacher = resolve_robot(reachable_for) if reachable_for is not None else None
     viewer = resolve_robot(visible_for) if visible_for is not None else None
     goal = target if isinstance(target, Pose) else pose_of(target)
@@ -44,14 +52,14 @@ def base_poses(
     for cell in costmap.best(CELLS_MAX):
         base_pose = face(cell, goal)
         if viewer is not None and not _sees(viewer, base_pose, target, goal):
-            yield base_pose, None
+            yield base_pose, Reach(refusal="the target is not visible from here")
         elif reacher is not None:
             yield (
                 base_pose,
                 reaching_arms(reacher, reachable_arm, base_pose, partial(_goals, reacher, base_pose, target, goal)),
             )
         else:
-            yield base_pose, ()
+            yield base_pose, Reach()
 
 
 def resolve_robot(meant: ObjectLike) -> CurrentRobot:
@@ -76,8 +84,8 @@ def reaching_arms(
     goals: Callable[[Arms], Iterable[Pose]],
     *,
     torso_height: float | None = None,
-) -> tuple[Arms, ...] | None:
-    """Return the arms that reach all their goals from this base pose; None if the required ones do not.
+) -> Reach:
+    """Return the arms that reach all their goals from this base pose, or a refusal if the required ones do not.
 
     Args:
         arm: the required arm; BOTH requires both, None any.
@@ -87,16 +95,18 @@ def reaching_arms(
     """
     limits = chosen_limits()
     candidates = tuple(robot.description.arms if arm is None else robot.each_arm(arm))
-    reaching = []
+    reaching: list[Arms] = []
+    refusals: list[str] = []
     for candidate in candidates:
         try:
             for each in goals(candidate):
                 solve(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
-        except Unreachable:
-            continue
-        reaching.append(candidate)
-    enough = reaching == list(candidates) if arm is Arms.BOTH else bool(reaching)
-    return tuple(reaching) if enough else None
+        except Unreachable as unreachable:
+            refusals.append(f"{candidate.name}: {unreachable.reason}")
+        else:
+            reaching.append(candidate)
+    enough = not refusals if arm is Arms.BOTH else bool(reaching)
+    return Reach(tuple(reaching)) if enough else Reach(refusal="; ".join(refusals))
 
 
 def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[CurrentRobot], viewer: CurrentRobot | None) -> Costmap:

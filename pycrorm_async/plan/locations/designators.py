@@ -1,7 +1,8 @@
 """Location designators search places for the robot's base or for objects, and report the search to the observer.
 
 `resolve()` returns the best place; iterating yields one after another. Both search in the current state of the world.
-Each resolution or iteration is reported once: the places offered, the one taken, the number considered.
+Each resolution or iteration is reported once: the places offered, the one taken, the number considered, and the first
+refused ones with the reason for each.
 
 >>> stand = CostmapLocation(target=cereal, reachable_for=robot).resolve()
 >>> stand.reachable_arms
@@ -16,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn
 
 from pycrorm_async.plan.errors import NotResolved
-from pycrorm_async.plan.execution.observer import Candidate, recorder
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, recorder
 from pycrorm_async.plan.failures import (
     EnvironmentUnreachable,
     LookingHighLevelFailure,
@@ -26,7 +27,7 @@ from pycrorm_async.plan.failures import (
     ReachabilityFailure,
 )
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.locations.base_poses import base_poses
+from pycrorm_async.plan.locations.base_poses import Reach, base_poses
 from pycrorm_async.plan.locations.opening_poses import opening_poses
 from pycrorm_async.plan.locations.surfaces import surface_poses
 from pycrorm_async.plan.object_designators import ObjectLike, ObjectPart, pose_of
@@ -42,6 +43,10 @@ __all__ = [
     "ObjectRelativeLocation",
     "SemanticCostmapLocation",
 ]
+
+REFUSALS_MAX = 1_000
+"""Bounds the refused places that are reported of one search. A search for a pick-up tries at most 600 places, one for
+opening 9,600, whose record would be larger than a record may be."""
 
 
 class LocationDesignator(ABC):
@@ -61,8 +66,8 @@ class LocationDesignator(ABC):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
-    def _candidates(self) -> Iterator[Location | None]:
-        """Yield every candidate in order; None for one that is unsuitable."""
+    def _candidates(self) -> Iterator[Location | Refusal | None]:
+        """Yield every candidate in order; a refusal, or None, for one that is unsuitable."""
 
     @abstractmethod
     def _no_place_failure(self) -> PlanFailure:
@@ -87,12 +92,16 @@ class LocationDesignator(ABC):
         """Yield suitable places; the last one yielded counts as taken, or none if the iteration is exhausted."""
         observer, node = recorder.get(), current_node.get()
         offered: list[Candidate] = []
+        refused: list[Refusal] = []
         taken: int | None = None
         considered = 0
         try:
             for place in self._candidates():
                 considered += 1
-                if place is not None:
+                if isinstance(place, Refusal):
+                    if len(refused) < REFUSALS_MAX:
+                        refused.append(place)
+                elif place is not None:
                     taken = len(offered)
                     offered.append(Candidate(place.pose, place.reachable_arms, place.grasp, place.torso_height))
                     yield place
@@ -104,6 +113,7 @@ class LocationDesignator(ABC):
                     offered=tuple(offered),
                     taken=taken,
                     considered=considered,
+                    refused=tuple(refused),
                     node=node,
                 )
 
@@ -120,7 +130,7 @@ class Location(LocationDesignator):
     grasp: Grasp | None = None
     torso_height: float | None = None
 
-    def _candidates(self) -> Iterator[Location | None]:
+    def _candidates(self) -> Iterator[Location | Refusal]:
         yield self
 
     def _no_place_failure(self) -> PlanFailure:
@@ -134,7 +144,7 @@ class ObjectRelativeLocation(LocationDesignator):
     relative_pose: Pose
     reference_object: ObjectLike
 
-    def _candidates(self) -> Iterator[Location | None]:
+    def _candidates(self) -> Iterator[Location | Refusal]:
         yield Location(pose_of(self.reference_object) @ self.relative_pose)
 
     def _no_place_failure(self) -> PlanFailure:
@@ -163,14 +173,14 @@ class CostmapLocation(LocationDesignator):
     visible_for: ObjectLike | None = None
     reachable_arm: Arms | None = None
 
-    def _candidates(self) -> Iterator[Location | None]:
-        for pose, arms in base_poses(
+    def _candidates(self) -> Iterator[Location | Refusal]:
+        for pose, reach in base_poses(
             self.target,
             reachable_for=self.reachable_for,
             visible_for=self.visible_for,
             reachable_arm=self.reachable_arm,
         ):
-            yield Location(pose, arms) if arms is not None else None
+            yield _location_or_refusal(pose, reach)
 
     def _no_place_failure(self) -> PlanFailure:
         if self.reachable_for is None:
@@ -205,9 +215,9 @@ class AccessingLocation(LocationDesignator):
     robot: ObjectLike
     arm: Arms | None = None
 
-    def _candidates(self) -> Iterator[Location | None]:
-        for pose, arms in opening_poses(self.handle, self.robot, self.arm):
-            yield Location(pose, arms) if arms is not None else None
+    def _candidates(self) -> Iterator[Location | Refusal]:
+        for pose, reach in opening_poses(self.handle, self.robot, self.arm):
+            yield _location_or_refusal(pose, reach)
 
     def _no_place_failure(self) -> PlanFailure:
         name = self.handle.name
@@ -232,10 +242,14 @@ class SemanticCostmapLocation(LocationDesignator):
     part_of: ObjectLike
     for_object: ObjectLike | None = None
 
-    def _candidates(self) -> Iterator[Location | None]:
-        for pose in surface_poses(self.urdf_link_name, self.part_of, self.for_object):
-            yield Location(pose) if pose is not None else None
+    def _candidates(self) -> Iterator[Location | Refusal]:
+        for place in surface_poses(self.urdf_link_name, self.part_of, self.for_object):
+            yield place if isinstance(place, Refusal) else Location(place)
 
     def _no_place_failure(self) -> PlanFailure:
         name = self.for_object.name if self.for_object is not None else "anything"
         return ObjectUnavailable(f"there is no room for {name} on {self.urdf_link_name}", self.urdf_link_name, name)
+
+
+def _location_or_refusal(pose: Pose, reach: Reach) -> Location | Refusal:
+    return Location(pose, reach.arms) if reach.refusal is None else Refusal(pose, reach.refusal)

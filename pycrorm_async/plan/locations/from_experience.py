@@ -14,11 +14,12 @@ from dataclasses import dataclass, field
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan.current_robot import CurrentRobot, require_world
+from pycrorm_async.plan.execution.observer import Refusal
 from pycrorm_async.plan.experience import Experience, PastSuccess, experience
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses
-from pycrorm_async.plan.locations.base_poses import reaching_arms, resolve_robot
+from pycrorm_async.plan.locations.base_poses import Reach, reaching_arms, resolve_robot
 from pycrorm_async.plan.locations.designators import Location, LocationDesignator
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectLike, designator_of, pose_of
 from pycrorm_async.world.enums import Arms
@@ -119,7 +120,7 @@ class _ExperienceLocation(LocationDesignator):
     def _name(self) -> str:
         return DatabaseCostmapLocation.__name__
 
-    def _candidates(self) -> Iterator[Location | None]:
+    def _candidates(self) -> Iterator[Location | Refusal]:
         target_pose = pose_of(self.target)
         robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
         origin = Pose((target_pose.position.x, target_pose.position.y, 0.0))
@@ -128,12 +129,19 @@ class _ExperienceLocation(LocationDesignator):
             require_world(), origin, distance_to_obstacle_m=CLEARANCE_M, size_cells=_CELLS, ignore=ignored
         )
         for each in self.past:
-            base_pose = _upright_pose(target_pose @ each.stand)
-            if base_pose is None or not free.value_at(*base_pose.position[:2]):
-                yield None
+            pose = target_pose @ each.stand
+            base_pose = _upright_pose(pose)
+            if base_pose is None:
+                yield Refusal(pose, "the base would lean")
                 continue
-            reaches = robot is None or _reaches(robot, base_pose, target_pose, each)
-            yield Location(base_pose, (each.arm,), each.grasp, each.torso_height) if reaches else None
+            if not free.value_at(*base_pose.position[:2]):
+                yield Refusal(base_pose, f"an obstacle is nearer than {CLEARANCE_M} m")
+                continue
+            refusal = None if robot is None else _reach(robot, base_pose, target_pose, each).refusal
+            if refusal is not None:
+                yield Refusal(base_pose, refusal)
+            else:
+                yield Location(base_pose, (each.arm,), each.grasp, each.torso_height)
 
     def _no_place_failure(self) -> PlanFailure:
         name = self.target.name
@@ -147,18 +155,18 @@ def _upright_pose(base: Pose) -> Pose | None:
     return Pose((base.position.x, base.position.y, 0.0), yaw_quaternion(base.yaw), base.frame)
 
 
-def _reaches(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> bool:
-    """Return whether the arm reaches all three goals of the grasp from the base pose at the past torso height."""
+def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> Reach:
+    """Return the arm if it reaches all three goals of the grasp from the base pose at the past torso height."""
     body, description = robot
     if past.arm not in description.arms:
-        return False
+        return Reach(refusal=f"the robot has no {past.arm.name} arm")
     if past.torso_height is not None:
         lower, upper = body.joint_limits(description.torso_joint)
         if not lower <= past.torso_height <= upper:
-            return False
+            return Reach(refusal=f"the torso cannot be lifted to {past.torso_height:g} m")
 
     def goals(arm: Arms) -> tuple[Pose, ...]:
         tool = body.link_pose(description.arms[arm].tool_frame)
         return pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
 
-    return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height) is not None
+    return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height)

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pycrorm_async.plan.current_robot import CurrentRobot
 from pycrorm_async.plan.geometry.articulation import Handle, closed_position, hand_poses, handle_of, opened_position
 from pycrorm_async.plan.geometry.grasp_poses import approach
-from pycrorm_async.plan.locations.base_poses import face, reaching_arms, resolve_robot
+from pycrorm_async.plan.locations.base_poses import Reach, face, reaching_arms, resolve_robot
 from pycrorm_async.plan.object_designators import ObjectLike
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
@@ -31,10 +31,8 @@ _SIGMA_CELLS = 6.0  # 0.3 m, as for picking up
 _SWEEP_STEPS = 10
 
 
-def opening_poses(
-    part: ObjectLike, robot: ObjectLike, arm: Arms | None
-) -> Iterator[tuple[Pose, tuple[Arms, ...] | None]]:
-    """Yield base poses, best first, each with the arms that reach every goal; None for unsuitable ones.
+def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, Reach]]:
+    """Yield base poses, best first, suitable or not, each with the arms that reach every goal.
 
     Places that the opening part does not sweep come first, facing the handle and then rotated by each multiple of 45
     degrees; the places that it sweeps follow in the same order.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 
+from pycrorm_async.plan.execution.observer import Refusal
 from pycrorm_async.plan.object_designators import ObjectLike, in_world
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, yaw_quaternion
@@ -16,8 +17,8 @@ STEP_M = 0.02
 _POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
 
 
-def surface_poses(link: str, whole: ObjectLike, obj: ObjectLike | None) -> Iterator[Pose | None]:
-    """Yield poses for `obj` on top of the link, with the link's heading; None for occupied places."""
+def surface_poses(link: str, whole: ObjectLike, obj: ObjectLike | None) -> Iterator[Pose | Refusal]:
+    """Yield poses for `obj` on top of the link, with the link's heading, and refusals of occupied places."""
     support = in_world(whole)
     obj_to_put = in_world(obj) if obj is not None else None
     heading = yaw_quaternion(support.link_pose(link).yaw)
@@ -25,16 +26,16 @@ def surface_poses(link: str, whole: ObjectLike, obj: ObjectLike | None) -> Itera
     surface = support.bounding_box(link)
     z = surface.max.z - extent.min.z
     occupied = [
-        each.bounding_box()
+        (each.name, each.bounding_box())
         for each in support.world.objects
         if each is not support and not _moves_along(each, obj_to_put)
     ]
     for x, y in _grid_points(surface, extent):
         placed_box = _translate(extent, x, y, z)
-        if obj_to_put is not None and any(_overlap(placed_box, box) for box in occupied):
-            yield None
-        else:
-            yield Pose((x, y, z), heading)
+        pose = Pose((x, y, z), heading)
+        obstacles = (name for name, box in occupied if obj_to_put is not None and _overlap(placed_box, box))
+        obstacle = next(obstacles, None)
+        yield pose if obstacle is None else Refusal(pose, f"{obstacle} is in the way")
 
 
 def _grid_points(surface: BoundingBox, extent: BoundingBox) -> Iterator[tuple[float, float]]:

@@ -262,6 +262,9 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
         (own, rank, number, *pose_columns(each.pose), ",".join(each.arms), rank == taken, each.grasp, each.torso_height)
         for rank, each in enumerate(offered)
     )
+    rows.inserts["location_refusal"].extend(
+        (own, rank, number, *pose_columns(each.pose), each.reason) for rank, each in enumerate(resolved.refused)
+    )
 
 
 # --- perception and the state stream --------------------------------------------------------------------------

@@ -71,7 +71,7 @@ __all__ = [
     "show",
 ]
 
-PROJECTION_VERSION = 4
+PROJECTION_VERSION = 5
 """The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"

@@ -168,6 +168,13 @@ CORE: dict[str, dict[str, Storage]] = {
         "grasp": "text",
         "torso_height": "real",
     },
+    "location_refusal": {
+        "resolution_id": "key",
+        "position": "key",
+        "process_metadata_id": "row",
+        **_POSE,
+        "reason": "text",
+    },
     "detection": {
         "id": "key",
         "position": "key",
@@ -213,6 +220,7 @@ _INDEXED = {
     "joint_change": ("process_metadata_id", "object_id"),
     "location_resolution": ("process_metadata_id", "node_id"),
     "location_candidate": ("process_metadata_id",),
+    "location_refusal": ("process_metadata_id",),
     "detection": ("process_metadata_id", "node_id"),
     "state_sample": ("process_metadata_id", "node_id"),
 }
