@@ -1,8 +1,7 @@
 """Event types are frozen values, the payloads of the log.
 
-Each `Happening` class is one event type: its name is the type's name in the log and its `version` counts its shapes.
-The JSON omits fields that are null or empty. The sequence of its `ObjectAdded` identifies a world object, the sequence
-of its `NodeStarted` a node. The envelope holds the times.
+Each `Happening` class is an event type, named as in the log; `version` counts its shapes. The JSON omits null and empty
+fields. The sequence of `ObjectAdded` identifies an object, that of `NodeStarted` a node. The envelope holds the times.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Map the built-in actions: those of the thesis' table 4.1, and further ones of this package.
 
-Columns have the names of the designators' fields; `orm.parameters` has those of poses and objects. Enum columns return
+Columns have the names of the designators' fields; `orm.designators` has those of poses and objects. Enum columns return
 and accept members.
 """
 
@@ -10,15 +10,15 @@ from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, synonym
 
 from pycrorm_async.orm.base import Pose
-from pycrorm_async.orm.designators import Action
-from pycrorm_async.orm.objects import Object
-from pycrorm_async.orm.parameters import (
+from pycrorm_async.orm.designators import (
+    Action,
     ObjectDesignatorParameter,
     ObjectParameter,
     PoseParameter,
     TargetLocationParameter,
     TargetParameter,
 )
+from pycrorm_async.orm.objects import Object
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 
 __all__ = [

@@ -9,6 +9,11 @@ that of its base:
 
 >>> class ORMSaying(Action):
 ...     text: Mapped[str]
+
+A mixin declares a pose or an object parameter for each name that designators give it. The first pose of a designator is
+`pose` and its first object `object`, as in the thesis' queries. The name of the designator's field is a synonym, and
+names the column: `NavigateAction.target_location` is `NavigateAction.pose`. `sort_order` puts a column before those of
+the class itself, as in the designator.
 """
 
 from __future__ import annotations
@@ -17,10 +22,10 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Dialect, ForeignKey, String
-from sqlalchemy.orm import Mapped, declared_attr, mapped_column, relationship
+from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
 
-from pycrorm_async.orm.base import Base, ProcessMetaData, RobotState
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RobotState
 from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import JsonText
@@ -28,7 +33,20 @@ from pycrorm_async.orm.types import JsonText
 if TYPE_CHECKING:
     from pycrorm_async.orm.tree import TaskTreeNode
 
-__all__ = ["DesignatorType", "ParameterItem", "Designator", "Action", "Motion", "Language"]
+__all__ = [
+    "DesignatorType",
+    "ParameterItem",
+    "Designator",
+    "Action",
+    "Motion",
+    "Language",
+    "PoseParameter",
+    "TargetLocationParameter",
+    "TargetParameter",
+    "ObjectParameter",
+    "ObjectDesignatorParameter",
+    "ObjectPartParameter",
+]
 
 
 class DesignatorType(Base):
@@ -184,3 +202,78 @@ class Language(Designator):
     """A performed expression of the plan language. The nodes of its operands are children of its node."""
 
     __tablename__ = "language"
+
+
+# --- parameters of actions and motions --------------------------------------------------------------------------
+
+
+class PoseParameter(MappedAsDataclass, init=False, repr=False, eq=False):
+    """A pose; the class or a mixin declares `pose_id`."""
+
+    @declared_attr
+    def pose(cls) -> Mapped[Pose]:
+        return relationship(viewonly=True, lazy="selectin")
+
+
+class TargetLocationParameter(PoseParameter):
+    """A pose that the designator calls `target_location`."""
+
+    pose_id: Mapped[int] = mapped_column("target_location_id", ForeignKey("pose.id"))
+
+    @declared_attr
+    def target_location_id(cls) -> Mapped[int]:
+        return synonym("pose_id")
+
+    @declared_attr
+    def target_location(cls) -> Mapped[Pose]:
+        return synonym("pose")
+
+
+class TargetParameter(PoseParameter):
+    """A pose that the designator calls `target`."""
+
+    pose_id: Mapped[int] = mapped_column("target_id", ForeignKey("pose.id"), sort_order=-1)
+
+    @declared_attr
+    def target_id(cls) -> Mapped[int]:
+        return synonym("pose_id")
+
+    @declared_attr
+    def target(cls) -> Mapped[Pose]:
+        return synonym("pose")
+
+
+class ObjectParameter(MappedAsDataclass, init=False, repr=False, eq=False):
+    """An object, as its row from before the node started; the class or a mixin declares `object_id`."""
+
+    @declared_attr
+    def object(cls) -> Mapped[Object]:
+        return relationship(viewonly=True, lazy="selectin")
+
+
+class ObjectDesignatorParameter(ObjectParameter):
+    """An object that the designator calls `object_designator`."""
+
+    object_id: Mapped[int] = mapped_column("object_designator_id", ForeignKey("object.id"), sort_order=-1)
+
+    @declared_attr
+    def object_designator_id(cls) -> Mapped[int]:
+        return synonym("object_id")
+
+    @declared_attr
+    def object_designator(cls) -> Mapped[Object]:
+        return synonym("object")
+
+
+class ObjectPartParameter(ObjectParameter):
+    """An object's part that the designator calls `object_part`."""
+
+    object_id: Mapped[int] = mapped_column("object_part_id", ForeignKey("object.id"), sort_order=-1)
+
+    @declared_attr
+    def object_part_id(cls) -> Mapped[int]:
+        return synonym("object_id")
+
+    @declared_attr
+    def object_part(cls) -> Mapped[Object]:
+        return synonym("object")

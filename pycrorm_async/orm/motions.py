@@ -8,9 +8,8 @@ from __future__ import annotations
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, synonym
 
-from pycrorm_async.orm.designators import Motion
+from pycrorm_async.orm.designators import Motion, ObjectParameter, ObjectPartParameter, TargetParameter
 from pycrorm_async.orm.objects import Object
-from pycrorm_async.orm.parameters import ObjectParameter, ObjectPartParameter, TargetParameter
 from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 
 __all__ = [
