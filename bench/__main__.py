@@ -85,7 +85,7 @@ def main() -> int:
     failed = []
     try:
         for run in selected:
-            line = measured(run, quick=arguments.quick)
+            line = measure(run, quick=arguments.quick)
             if line is None:
                 failed.append(run.name)
                 continue
@@ -105,7 +105,7 @@ def _selects(word: str, name: str) -> bool:
     return name == word if any(run.name == word for run in RUNS) else name.startswith(word)
 
 
-def measured(run: Run, *, quick: bool) -> dict[str, Any] | None:
+def measure(run: Run, *, quick: bool) -> dict[str, Any] | None:
     """Run one script and return its line; return None if it failed, with the reason on stderr."""
     options = [*run.options, *(["--quick"] if quick else [])]
     command = shlex.join(["python", "-m", f"bench.{run.script}", *options])

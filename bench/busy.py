@@ -1,12 +1,12 @@
-"""Whether the writer inside a plan's process keeps up beside a plan that is always busy and never suspends.
+"""Measure the backlog of the writer inside a plan's process while the plan computes without ever suspending.
 
-    python -m bench.busy                 20 s at 2,000 events/s, on SQLite; --postgresql on a server of its own
+    python -m bench.busy                 20 s at 2,000 events/s, on SQLite; --postgresql on a new server
     python -m bench.busy --quick         1 s
 
-The plan computes all the time, in Python, so that it holds the interpreter whenever it is let; its actions start and
-end at an even rhythm. Prints one JSON line: the backlog, events that are not in the database yet, every half second,
-the largest seen at any action, and how long the rest took when the plan was over. A backlog that does not grow is kept
-up with.
+The plan computes in Python all the time, so that it holds the interpreter lock whenever it can; its actions start and
+end at a fixed rate. The script prints one JSON line: the backlog (events that are not in the database yet) every half
+second, its maximum over all actions, and the time that the writer needs after the end of the plan. If the backlog does
+not grow, the writer keeps up.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class ComputingActionPerformable(ActionAbstract):
             number = number * 3 % 1_000_003
 
 
-async def measured(url: str, spool: Path, seconds: float) -> dict[str, object]:
+async def measure(url: str, spool: Path, seconds: float) -> dict[str, object]:
     backlog: list[int] = []
-    largest = actions = 0
+    backlog_max = actions = 0
     async with Memory.open(url, spool=spool) as memory:
         async with memory.episode(description="bench"):
             began = time.perf_counter()
@@ -49,28 +49,28 @@ async def measured(url: str, spool: Path, seconds: float) -> dict[str, object]:
                 actions += 1
                 await ComputingActionPerformable(began + actions * 2 / _EVENTS_PER_S, f"action {actions}").perform()
                 status = memory.status
-                largest = max(largest, status.written - status.stored)
+                backlog_max = max(backlog_max, status.written - status.stored)
                 if now * _SAMPLES_PER_S >= len(backlog):
                     backlog.append(status.written - status.stored)
-            took = time.perf_counter() - began
-        left = memory.status.written - memory.status.stored
-        over = time.perf_counter()
+            plan_s = time.perf_counter() - began
+        backlog_at_end = memory.status.written - memory.status.stored
+        plan_end_s = time.perf_counter()
         await memory.flush()
-        flushed = time.perf_counter() - over
+        flush_s = time.perf_counter() - plan_end_s
     return {
-        "events_per_s": round(2 * actions / took),
+        "events_per_s": round(2 * actions / plan_s),
         "events": 2 * actions,
         "backlog": backlog,
-        "backlog_max": max(largest, left),
-        "backlog_at_the_end": left,
-        "stored_and_folded_after_s": round(flushed, 2),
+        "backlog_max": max(backlog_max, backlog_at_end),
+        "backlog_at_the_end": backlog_at_end,
+        "stored_and_folded_after_s": round(flush_s, 2),
     }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--quick", action="store_true", help="1 s instead of 20")
-    parser.add_argument("--postgresql", action="store_true", help="on a server of its own")
+    parser.add_argument("--postgresql", action="store_true", help="use a new PostgreSQL server")
     arguments = parser.parse_args()
     seconds = 1.0 if arguments.quick else 20.0
     with ExitStack() as stack:
@@ -79,7 +79,7 @@ def main() -> None:
         if arguments.postgresql:
             url = stack.enter_context(server_in(folder / "pg")).new_database()
         result = {"bench": "busy", "database": url.partition(":")[0], "asked_events_per_s": _EVENTS_PER_S}
-        print(json.dumps(result | asyncio.run(measured(url, folder / "spool", seconds))))
+        print(json.dumps(result | asyncio.run(measure(url, folder / "spool", seconds))))
 
 
 if __name__ == "__main__":

@@ -1,16 +1,16 @@
-"""What faults cost: each is made again and again, and what is found is compared with what was acknowledged.
+"""Inject each fault many times, and compare the events that exist afterwards with the acknowledged ones.
 
-    python -m bench.faults               the long version: 10,000 kills, 500 power cuts on a real disk, … half an hour
-    python -m bench.faults --quick       less than a minute
-    python -m bench.faults --only power  the faults whose name holds this word
-    python -m bench.faults --report faults.md --seed 7     a table there, and every line of numbers in faults.jsonl;
-                                                           called again it goes on where it was interrupted
+    python -m bench.faults               the long version: 10,000 kills, 500 power cuts on a real disk, …
+    python -m bench.faults --quick       a few rounds of every fault
+    python -m bench.faults --only power  the faults whose names contain this word
+    python -m bench.faults --report faults.md --seed 7     write a table to faults.md and a line for each slice to
+                                                           faults.md.jsonl; repeated, the command continues from them
 
-Prints one JSON line a fault; progress and the table are on stderr. Exit code 1 if anything was lost, doubled,
-misordered or changed, 130 when interrupted.
+The script prints one JSON line for each fault; progress and the table are on stderr. The exit code is 1 if an event
+was lost, duplicated, misordered or corrupted, and 130 if the run was interrupted.
 
-A long run is made in slices, each with random numbers of its own: `--only NAME --slice 7 --seed S` makes one of them
-again. The report keeps what each slice found.
+A long run consists of slices, each with its own random numbers: `--only NAME --slice 7 --seed S` repeats one slice.
+The report keeps the outcome of each slice.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from bench.breaking import (
-    crafted,
+    crafted_frames,
     databases,
     declarations,
     deletions,
@@ -51,21 +51,21 @@ from bench.breaking.report import Report, Slice, summed
 from pycrorm_async.store.temporary_database import usual_place
 from tests.databases import Server, server_in
 
-Make = Callable[[int, random.Random, Path, Step], Outcome]
+Inject = Callable[[int, random.Random, Path, Step], Outcome]
 
 
 class Fault(NamedTuple):
-    """A fault, how to make it, how often in the quick version and in the long one, and how often in one slice."""
+    """A fault, its injecting function, and its rounds in the quick version, in the long version, and in one slice."""
 
     name: str
-    make: Make
+    inject: Inject
     quick: int
     long: int
     slice: int
 
 
 def faults_on(server: Server) -> list[Fault]:
-    """All of them; `server` is killed by some."""
+    """Return all faults. Some of them kill `server`."""
 
     def on_the_server(_: Path) -> str:
         return server.new_database()
@@ -94,7 +94,7 @@ def faults_on(server: Server) -> list[Fault]:
         Fault("disk full, XFS", disks.FullDisksOn("xfs"), 2, 200, 50),
         Fault("disk full, btrfs", disks.FullDisksOn("btrfs"), 2, 200, 50),
         Fault("deleted spool", disks.deleted_spools, 6, 300, 50),
-        Fault("crafted frames", crafted.crafted_folders, 2, 300, 50),
+        Fault("crafted frames", crafted_frames.crafted_folders, 2, 300, 50),
         Fault("deleted database", deletions.deleted_databases, 3, 200, 20),
         Fault("disk full, database", databases.full_disks, 5, 500, 100),
         Fault("clock jumps", files.clock_jumps, 20, 1_000, 1_000),
@@ -118,7 +118,7 @@ def faults_on(server: Server) -> list[Fault]:
 
 
 def slices_of(fault: Fault, *, quick: bool) -> Iterator[tuple[int, int]]:
-    """The number and the rounds of each slice."""
+    """Yield number and rounds of each slice."""
     total = fault.quick if quick else fault.long
     for number, first in enumerate(range(0, total, fault.slice), start=1):
         yield number, min(fault.slice, total - first)
@@ -166,13 +166,13 @@ def main() -> int:
             report = Report(arguments.report, seed=seed, quick=arguments.quick, command=command, order=order)
             for fault in faults:
                 if not arguments.only or any(word in fault.name for word in arguments.only):
-                    found = _made(fault, arguments, report, Path(folder), progress, termination)
-                    outcomes[fault.name] = summed(found)
+                    slices = _outcomes(fault, arguments, report, Path(folder), progress, termination)
+                    outcomes[fault.name] = summed(slices)
                     print(json.dumps(Slice(fault.name, 0, outcomes[fault.name]).line(seed)), flush=True)
                     if not console.is_terminal:
-                        _tell(console, fault.name, outcomes[fault.name])
+                        _print_summary(console, fault.name, outcomes[fault.name])
     except KeyboardInterrupt:
-        console.print(f"interrupted; to go on: --seed {seed}" + ("" if arguments.report else " and --report FILE"))
+        console.print(f"interrupted; continue with --seed {seed}" + ("" if arguments.report else " and --report FILE"))
         return 130
     console.print(_table(outcomes, seed))
     return 0 if all(outcome.clean for outcome in outcomes.values()) else 1
@@ -180,15 +180,15 @@ def main() -> int:
 
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="less than a minute")
-    parser.add_argument("--seed", type=int, default=None, help="of all random choices; printed in every line")
-    parser.add_argument("--only", action="append", help="the faults whose name holds this word; may be repeated")
-    parser.add_argument("--slice", type=int, default=None, help="of the long version only the slice of this number")
-    parser.add_argument("--report", type=Path, default=None, help="a file for the table; FILE.jsonl beside it")
+    parser.add_argument("--quick", action="store_true", help="a few rounds of every fault")
+    parser.add_argument("--seed", type=int, default=None, help="seed of all random choices; every line contains it")
+    parser.add_argument("--only", action="append", help="faults whose names contain this word; can be repeated")
+    parser.add_argument("--slice", type=int, default=None, help="run only the slice with this number")
+    parser.add_argument("--report", type=Path, default=None, help="file for the table; the lines are in FILE.jsonl")
     return parser.parse_args()
 
 
-def _made(
+def _outcomes(
     fault: Fault,
     arguments: argparse.Namespace,
     report: Report,
@@ -196,7 +196,7 @@ def _made(
     progress: Progress,
     termination: _Termination,
 ) -> list[Outcome]:
-    """What each slice found, those that an earlier run with this seed and report had made included."""
+    """Run the slices of a fault that the report does not contain; return the outcomes of all its slices."""
     slices = [
         (number, rounds)
         for number, rounds in slices_of(fault, quick=arguments.quick)
@@ -208,27 +208,27 @@ def _made(
         termination.check()
         progress.advance(bar)
 
-    found: list[Outcome] = []
+    outcomes: list[Outcome] = []
     for number, rounds in slices:
-        outcome = report.known(fault.name, number)
+        outcome = report.finished(fault.name, number)
         if outcome is None:
-            # Each with its own numbers, so that one slice alone goes as it did among the others.
+            # Each slice has its own random numbers, so that it can be repeated without the others.
             rng = random.Random(f"{report.seed} {fault.name} {number}")
             outcome = _slice(fault, rounds, rng, folder, step)
             report.add(Slice(fault.name, number, outcome))
-        found.append(outcome)
+        outcomes.append(outcome)
         progress.update(bar, completed=sum(each for other, each in slices if other <= number))
-    return found
+    return outcomes
 
 
 def _slice(fault: Fault, rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
     began = time.perf_counter()
     with tempfile.TemporaryDirectory(dir=folder) as place:
         try:
-            outcome = fault.make(rounds, rng, Path(place), step)
-        except Exception as error:  # noqa: BLE001  what a fault may bring out is for the table, and the others go on
+            outcome = fault.inject(rounds, rng, Path(place), step)
+        except Exception as error:  # noqa: BLE001  the table shows the error; the other faults must still run
             traceback.print_exc()
-            outcome = Outcome(broke=f"{type(error).__name__}: {error}")
+            outcome = Outcome(error=f"{type(error).__name__}: {error}")
     outcome.took_s = round(time.perf_counter() - began, 1)
     return outcome
 
@@ -238,19 +238,23 @@ def _progress(console: Console) -> Progress:
     return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
-def _tell(console: Console, name: str, outcome: Outcome) -> None:
-    cost = f"lost {outcome.lost}, duplicated {outcome.duplicated}, misordered {outcome.misordered}"
-    console.print(f"{name}: {outcome.rounds:,} rounds, {cost}, changed {outcome.changed} ({outcome.took_s:.0f} s)")
+def _print_summary(console: Console, name: str, outcome: Outcome) -> None:
+    losses = f"lost {outcome.lost}, duplicated {outcome.duplicated}, misordered {outcome.misordered}"
+    console.print(
+        f"{name}: {outcome.rounds:,} rounds, {losses}, corrupted {outcome.corrupted} ({outcome.took_s:.0f} s)"
+    )
 
 
 def _table(outcomes: dict[str, Outcome], seed: int) -> Table:
-    table = Table(title=f"What faults cost (seed {seed})", title_justify="left")
+    table = Table(title=f"Injected faults (seed {seed})", title_justify="left")
     for name in ("fault", *Outcome.COUNTS, "note"):
-        words = name in ("fault", "note")
-        table.add_column(name, justify="left" if words else "right", no_wrap=name != "note", ratio=1 if words else None)
+        is_text = name in ("fault", "note")
+        table.add_column(
+            name, justify="left" if is_text else "right", no_wrap=name != "note", ratio=1 if is_text else None
+        )
     for name, outcome in outcomes.items():
-        bad = "" if outcome.clean else "bold red"
-        table.add_row(name, *(f"{each:,}" for each in outcome.counts), outcome.broke or outcome.note, style=bad)
+        style = "" if outcome.clean else "bold red"
+        table.add_row(name, *(f"{each:,}" for each in outcome.counts), outcome.error or outcome.note, style=style)
     return table
 
 

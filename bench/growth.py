@@ -1,14 +1,15 @@
-"""Where it stops: how fast spools become rows as episodes, nodes in an episode, recorders and daemons grow.
+"""Measure the rate from the spool to the tables as episodes, nodes in an episode, recorders and daemons grow.
 
     python -m bench.growth             half an hour: 100,000 nodes at a time, SQLite and PostgreSQL
-    python -m bench.growth --quick     a few hundred
+    python -m bench.growth --quick     a few hundred nodes
 
-*Nodes in an episode*: the same number of nodes in one episode, in ten … in one for each ten nodes. *Recorders*: the
-same nodes in the folders of 1 to 32 recorders that one daemon drains. *Daemons*: 1 to 4 of them, each with a spool of
-its own and the same number of nodes, into one PostgreSQL. *Episodes*: how fast a hundred episodes of a hundred nodes
-come on top when a hundred, a thousand … are there already. *Recording*: how large the recording process is after so
-many nodes. Prints one JSON line: nodes a second for each, and the knee, the largest of each kind that still has nine
-tenths of the best rate. Every point is measured `--turns` times, in turns; of these it tells median, least and most.
+*Nodes in an episode*: the same number of nodes in one episode, in ten, …, in one for each ten nodes. *Recorders*: the
+same nodes in the folders of 1 to 32 recorders, drained by one daemon. *Daemons*: 1 to 4 daemons, each with its own
+spool and the same number of nodes, on one PostgreSQL. *Episodes*: the rate of a hundred further episodes of a hundred
+nodes when the database already contains a hundred, a thousand, … episodes. *Recording*: the memory of the recording
+process after a number of nodes. The script prints one JSON line: nodes a second for each value, and the knee, which is
+the largest value with at least nine tenths of the best rate. Every point is measured `--turns` times, alternating with
+the others, and given as median, minimum and maximum.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from typing import Any, NamedTuple
 from rich.table import Table
 
 from bench.daemon import start_daemon, stop
-from bench.material.spooled import spool_rollouts
-from bench.material.watched import progress, until_folded
+from bench.material.fold_progress import progress, until_folded
+from bench.material.spool_recording import spool_rollouts
 from bench.reporting.figures import console, held_mb, spread
 from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
@@ -39,11 +40,11 @@ from tests.databases import Server, server_in
 
 _NODES_A_ROLLOUT = 9.76
 _SEED = 69
-_STILL_GOOD = 0.9
+_KNEE_SHARE = 0.9
 
 
 class Sizes(NamedTuple):
-    """How much of each."""
+    """The values of each parameter that grows."""
 
     nodes: int
     an_episode: tuple[int, ...]
@@ -64,8 +65,8 @@ LONG = Sizes(
 QUICK = Sizes(nodes=500, an_episode=(10,), recorders=(2,), daemons=(2,), episodes=(10, 20), recorded=(200, 400))
 
 
-class Place:
-    """New databases and folders of one kind."""
+class Databases:
+    """Create databases of one kind, and folders for their spools."""
 
     def __init__(self, folder: Path, server: Server | None) -> None:
         self._folder = folder
@@ -73,30 +74,32 @@ class Place:
         self._count = 0
 
     def new(self) -> tuple[str, Path]:
-        """The URL of an empty database, and where its spool will be."""
+        """Return the URL of an empty database, and the path of its spool."""
         self._count += 1
         spool = self._folder / f"{self._count}.spool"
         url = self._server.new_database() if self._server else f"sqlite:///{self._folder}/{self._count}.db"
         return url, spool
 
 
-# --- what is measured -----------------------------------------------------------------------------------------------
+# --- measurements ---------------------------------------------------------------------------------------------------
 
 
-def nodes_per_s(place: Place, nodes: int, *, an_episode: int = 1_000, recorders: int = 1, daemons: int = 1) -> float:
-    """By daemons that run already when the recorders' folders come, so many for each, with all events in them."""
-    url, folder = place.new()
-    spools, waiting, events = [], [], 0
+def nodes_per_s(
+    databases: Databases, nodes: int, *, an_episode: int = 1_000, recorders: int = 1, daemons: int = 1
+) -> float:
+    """Start the daemons, move complete recorders' folders into their spools, and wait until all events are folded."""
+    url, folder = databases.new()
+    spools, complete_folders, events = [], [], 0
     for number in range(daemons):
         spools.append(folder.with_suffix(f".{number}"))
         for recorder in range(recorders):
-            waiting.append((folder.with_suffix(f".{number}.{recorder}.made"), spools[-1]))
-            events += _spooled(waiting[-1][0], nodes // recorders, an_episode)
+            complete_folders.append((folder.with_suffix(f".{number}.{recorder}.made"), spools[-1]))
+            events += _spooled(complete_folders[-1][0], nodes // recorders, an_episode)
     running = [start_daemon(url, spool) for spool in spools]
     try:
         began = time.perf_counter()
-        for made, spool in waiting:
-            for recorder_folder in made.iterdir():
+        for complete, spool in complete_folders:
+            for recorder_folder in complete.iterdir():
                 recorder_folder.rename(spool / recorder_folder.name)
         until_folded(url, events)
         return nodes * daemons / (time.perf_counter() - began)
@@ -106,34 +109,34 @@ def nodes_per_s(place: Place, nodes: int, *, an_episode: int = 1_000, recorders:
 
 
 def _spooled(folder: Path, nodes: int, an_episode: int) -> int:
-    """About so many nodes, in episodes of about so many; the number of events."""
+    """Spool about `nodes` nodes in episodes of about `an_episode` nodes; return the number of events."""
     rollouts = max(1, round(nodes / _NODES_A_ROLLOUT))
     return spool_rollouts(rollouts, folder, seed=_SEED, an_episode=max(1, round(an_episode / _NODES_A_ROLLOUT)))
 
 
-def as_episodes_grow(place: Place, sizes: Sizes) -> dict[str, dict[str, float]]:
-    """Nodes a second of what comes on top, in one memory that grows."""
-    url, spool = place.new()
-    found: dict[str, dict[str, float]] = {}
-    there = 0
+def add_episodes(databases: Databases, sizes: Sizes) -> dict[str, dict[str, float]]:
+    """Add episodes to one growing memory, and return nodes a second by the number of earlier episodes."""
+    url, spool = databases.new()
+    rates_by_episodes: dict[str, dict[str, float]] = {}
+    stored_episodes = 0
     running = start_daemon(url, spool)
     try:
         for number, episodes in enumerate(sizes.episodes):
-            rates = []
-            for more in (max(1, episodes - there), *[sizes.episodes[0]] * 3):
-                made = spool.with_suffix(f".{number}.{len(rates)}.{more}")
-                events = _spooled(made, more * 100, 100)
-                shown = progress(url).folded
+            rates: list[float] = []
+            for more in (max(1, episodes - stored_episodes), *[sizes.episodes[0]] * 3):
+                complete = spool.with_suffix(f".{number}.{len(rates)}.{more}")
+                events = _spooled(complete, more * 100, 100)
+                folded = progress(url).folded
                 began = time.perf_counter()
-                for recorder_folder in made.iterdir():
+                for recorder_folder in complete.iterdir():
                     recorder_folder.rename(spool / recorder_folder.name)
-                until_folded(url, shown + events)
+                until_folded(url, folded + events)
                 rates.append(more * 100 / (time.perf_counter() - began))
-                there += more
-            found[str(episodes)] = spread(rates[1:])
+                stored_episodes += more
+            rates_by_episodes[str(episodes)] = spread(rates[1:])
     finally:
         stop(running)
-    return found
+    return rates_by_episodes
 
 
 @dataclass
@@ -144,9 +147,9 @@ class NoteActionPerformable(ActionAbstract):
     async def perform(self) -> None: ...
 
 
-async def record_and_weigh(url: str, spool: Path, counts: tuple[int, ...]) -> dict[str, dict[str, float]]:
-    """MB of this process when so many nodes are recorded and in the tables: all, and what is no file's."""
-    found: dict[str, dict[str, float]] = {}
+async def record_and_measure(url: str, spool: Path, counts: tuple[int, ...]) -> dict[str, dict[str, float]]:
+    """Record nodes, and return the resident MB of this process by count: all pages, and those without a file."""
+    memory_mb: dict[str, dict[str, float]] = {}
     recorded = 0
     async with Memory.open(url, spool=spool) as memory:
         for count in counts:
@@ -156,56 +159,60 @@ async def record_and_weigh(url: str, spool: Path, counts: tuple[int, ...]) -> di
                         await NoteActionPerformable(f"note {index}", index / 7).perform()
                         recorded += 1
                 await memory.flush()
-            found[str(count)] = {"mb": held_mb("VmRSS"), "mb_without_files": held_mb("RssAnon")}
-    return found
+            memory_mb[str(count)] = {"mb": held_mb("VmRSS"), "mb_without_files": held_mb("RssAnon")}
+    return memory_mb
 
 
-def recording(place: Place, sizes: Sizes) -> dict[str, Any]:
-    """In a process of its own."""
-    url, spool = place.new()
+def recording(databases: Databases, sizes: Sizes) -> dict[str, Any]:
+    """Measure the memory of recording in a new process."""
+    url, spool = databases.new()
     command = [sys.executable, "-m", "bench.growth", "--record", url, str(spool)]
     command += ["--counts", *map(str, sizes.recorded)]
-    found = dict(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout))
-    first, last = (found[str(count)] for count in (sizes.recorded[0], sizes.recorded[-1]))
+    memory_mb = dict(json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout))
+    first, last = (memory_mb[str(count)] for count in (sizes.recorded[0], sizes.recorded[-1]))
     nodes = sizes.recorded[-1] - sizes.recorded[0]
-    found["bytes_a_node"] = round((last["mb_without_files"] - first["mb_without_files"]) * 2**20 / nodes, 1)
-    return found
+    memory_mb["bytes_a_node"] = round((last["mb_without_files"] - first["mb_without_files"]) * 2**20 / nodes, 1)
+    return memory_mb
 
 
-# --- all of it ------------------------------------------------------------------------------------------------------
+# --- curves ---------------------------------------------------------------------------------------------------------
 
 
 def curve(values: tuple[int, ...], turns: int, rate: Callable[[int], float]) -> dict[str, Any]:
-    """Each value as often as there are turns, in turns; and the knee."""
+    """Measure each value once in every turn; return the spreads and the knee."""
     rates: dict[int, list[float]] = {each: [] for each in values}
     for _ in range(turns):
-        for value, found in rates.items():
-            found.append(rate(value))
-            console().print(f"    {value:,}: {found[-1]:,.0f} nodes/s")
-    medians = {value: statistics.median(found) for value, found in rates.items()}
-    good = [value for value, median in medians.items() if median >= _STILL_GOOD * max(medians.values())]
-    return {**{str(value): spread(found) for value, found in rates.items()}, "knee": max(good)}
+        for value, measured_rates in rates.items():
+            measured_rates.append(rate(value))
+            console().print(f"    {value:,}: {measured_rates[-1]:,.0f} nodes/s")
+    medians = {value: statistics.median(measured_rates) for value, measured_rates in rates.items()}
+    good = [value for value, median in medians.items() if median >= _KNEE_SHARE * max(medians.values())]
+    return {**{str(value): spread(measured_rates) for value, measured_rates in rates.items()}, "knee": max(good)}
 
 
-def measured(place: Place, sizes: Sizes, turns: int, *, postgresql: bool) -> dict[str, Any]:
-    def say(what: str) -> None:
-        console().print(f"  {what}")
+def measure(databases: Databases, sizes: Sizes, turns: int, *, postgresql: bool) -> dict[str, Any]:
+    def print_progress(parameter: str) -> None:
+        console().print(f"  {parameter}")
 
-    answer: dict[str, Any] = {}
-    say("nodes in an episode")
-    answer["nodes_in_an_episode"] = curve(
-        sizes.an_episode, turns, lambda each: nodes_per_s(place, sizes.nodes, an_episode=each)
+    result: dict[str, Any] = {}
+    print_progress("nodes in an episode")
+    result["nodes_in_an_episode"] = curve(
+        sizes.an_episode, turns, lambda each: nodes_per_s(databases, sizes.nodes, an_episode=each)
     )
-    say("recorders")
-    answer["recorders"] = curve(sizes.recorders, turns, lambda each: nodes_per_s(place, sizes.nodes, recorders=each))
+    print_progress("recorders")
+    result["recorders"] = curve(
+        sizes.recorders, turns, lambda each: nodes_per_s(databases, sizes.nodes, recorders=each)
+    )
     if postgresql:
-        say("daemons")
-        answer["daemons"] = curve(sizes.daemons, turns, lambda each: nodes_per_s(place, sizes.nodes // 4, daemons=each))
-    say("episodes")
-    answer["episodes"] = as_episodes_grow(place, sizes)
-    say("recording")
-    answer["recording"] = recording(place, sizes)
-    return answer
+        print_progress("daemons")
+        result["daemons"] = curve(
+            sizes.daemons, turns, lambda each: nodes_per_s(databases, sizes.nodes // 4, daemons=each)
+        )
+    print_progress("episodes")
+    result["episodes"] = add_episodes(databases, sizes)
+    print_progress("recording")
+    result["recording"] = recording(databases, sizes)
+    return result
 
 
 def main() -> None:
@@ -215,34 +222,34 @@ def main() -> None:
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
     parser.add_argument("--record", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--counts", type=int, nargs="+", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.record:
-        url, spool = asked.record
-        print(json.dumps(asyncio.run(record_and_weigh(url, Path(spool), tuple(asked.counts)))))
+    arguments = parser.parse_args()
+    if arguments.record:
+        url, spool = arguments.record
+        print(json.dumps(asyncio.run(record_and_measure(url, Path(spool), tuple(arguments.counts)))))
         return
-    sizes, turns = (QUICK, 1) if asked.quick else (LONG, asked.turns)
-    answer: dict[str, Any] = {"bench": "growth", "sizes": sizes._asdict(), "turns": turns, "seed": _SEED}
+    sizes, turns = (QUICK, 1) if arguments.quick else (LONG, arguments.turns)
+    result: dict[str, Any] = {"bench": "growth", "sizes": sizes._asdict(), "turns": turns, "seed": _SEED}
     with ExitStack() as stack:
-        for database in asked.databases:
+        for database in arguments.databases:
             console().print(database)
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
             server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
-            answer[database] = measured(Place(folder, server), sizes, turns, postgresql=server is not None)
-    print(json.dumps(answer))
-    console().print(_table(answer, asked.databases))
+            result[database] = measure(Databases(folder, server), sizes, turns, postgresql=server is not None)
+    print(json.dumps(result))
+    console().print(_table(result, arguments.databases))
 
 
-def _table(answer: dict[str, Any], databases: list[str]) -> Table:
+def _table(result: dict[str, Any], databases: list[str]) -> Table:
     table = Table(title="Nodes a second from the spool to every row", title_justify="left")
-    for name in ("database", "what grows", "to", "nodes/s", "least", "most", ""):
-        table.add_column(name, justify="left" if name in ("database", "what grows", "") else "right")
+    for name in ("database", "parameter", "value", "nodes/s", "least", "most", ""):
+        table.add_column(name, justify="left" if name in ("database", "parameter", "") else "right")
     for database in databases:
-        for what, points in answer[database].items():
+        for parameter, points in result[database].items():
             for value, rate in points.items():
-                if what != "recording" and isinstance(rate, dict):
-                    note = "the knee" if str(points.get("knee")) == value else ""
+                if parameter != "recording" and isinstance(rate, dict):
+                    note = "knee" if str(points.get("knee")) == value else ""
                     table.add_row(
-                        database, what.replace("_", " "), value, *(f"{each:,}" for each in rate.values()), note
+                        database, parameter.replace("_", " "), value, *(f"{each:,}" for each in rate.values()), note
                     )
     return table
 

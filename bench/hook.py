@@ -1,16 +1,16 @@
-"""What a perform costs with a memory, while its database is up, slow or gone: the plan is not to feel it.
+"""Measure the cost of a `perform` with a memory while its database is up, slow or unavailable.
 
     python -m bench.hook            20 turns of a second for each of seven plans, about five minutes
-    python -m bench.hook --quick    two short ones
+    python -m bench.hook --quick    two short turns
 
 An action with object, arm and grasp that does nothing is performed in a Bullet world with a robot, whose state is read
-and recorded; between two of them the plan computes, so that 2,000 events a second are recorded. One process holds all
-plans, each in a task and a world of its own: one without a memory; three whose memory writes by a thread, to a
-PostgreSQL that is up, that answers 20 ms late each time it is spoken to, and that went away; three for the daemon. They
-take turns in random order, and a turn is over when its writer has nothing left to do. A percentile is the median over
-the turns of that of a turn, and what a perform costs more is compared within a round, so a busy moment of the machine
-counts little. Of performs in which the kernel gave the processor to somebody else only their number is told, and the
-longest of all. Prints one JSON line, in µs; half of what a perform costs more is one hook. The table is on stderr.
+and recorded. Between two actions the plan computes, so that 2,000 events a second are recorded. One process runs all
+plans, each in its own task and world: one without a memory; three with a writer thread, whose PostgreSQL is up, or
+answers each request 20 ms late, or is unavailable; and three with the daemon. The plans take turns in random order, and
+a turn ends when its writer is idle. Each percentile is the median of the percentile over all turns, and the additional
+cost is the difference within one round, so that a busy moment of the machine has little influence. Performs during
+which the kernel preempted the thread are only counted, and included in the maximum. The script prints one JSON line, in
+µs; one hook is half of the additional cost of a perform. The table is on stderr.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from urllib.parse import urlsplit
 from rich.console import Console
 from rich.table import Table
 
-from bench.breaking.speaking import Speaker
+from bench.breaking.child_process import ChildProcess
 from bench.daemon import start_daemon, stop
-from bench.material.turns import InTurns, NothingActionPerformable, nothing_action
+from bench.material.turns import NothingActionPerformable, TurnTaker, nothing_action
 from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import FlushTimeout
 from pycrorm_async.settings import Writer
@@ -52,7 +52,7 @@ _PERCENTILES = {"median": 0.5, "p99": 0.99, "p99.9": 0.999}
 
 
 class Kind(NamedTuple):
-    """A memory to be measured: who writes, the state of its database, and where that is."""
+    """A memory to measure: its writer, the state of its database, its URL and its spool."""
 
     writer: Writer
     state: str
@@ -65,14 +65,14 @@ class Kind(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """What each perform took, ns: those that nobody interrupted, and the others."""
+    """Durations of performs, ns: those without a preemption, and the interrupted ones."""
 
-    whole: list[int]
+    uninterrupted: list[int]
     interrupted: list[int]
 
 
-class Plan(InTurns):
-    """With a memory or none; a turn is over when all of it is stored, if the database is there."""
+class Plan(TurnTaker):
+    """A plan with or without a memory; a turn ends when its events are stored, or synced if the database is down."""
 
     def __init__(self, kind: Kind | None) -> None:
         super().__init__()
@@ -81,7 +81,7 @@ class Plan(InTurns):
         self._kind = kind
 
     async def begin(self, stack: AsyncExitStack) -> Callable[[int], Awaitable[None]]:
-        memory = None if self._kind is None else await stack.enter_async_context(_remembering(self._kind))
+        memory = None if self._kind is None else await stack.enter_async_context(_open_memory(self._kind))
         stack.enter_context(BulletWorld())
         action = nothing_action()
 
@@ -94,7 +94,7 @@ class Plan(InTurns):
 
 
 @asynccontextmanager
-async def _remembering(kind: Kind) -> AsyncIterator[Memory]:
+async def _open_memory(kind: Kind) -> AsyncIterator[Memory]:
     settings = Settings(flush_timeout_s=1.0 if kind.is_down else 300.0)
     memory = Memory.open(kind.url, spool=kind.spool, writer=kind.writer, settings=settings)
     with suppress(FlushTimeout) if kind.is_down else nullcontext():
@@ -110,13 +110,13 @@ async def _turn(action: NothingActionPerformable, performs: int) -> Turn:
         before = _interruptions()
         began = time.perf_counter_ns()
         await action.perform()
-        took = time.perf_counter_ns() - began
-        (turn.whole if _interruptions() == before else turn.interrupted).append(took)
+        elapsed_ns = time.perf_counter_ns() - began
+        (turn.uninterrupted if _interruptions() == before else turn.interrupted).append(elapsed_ns)
     return turn
 
 
 def _interruptions() -> int:
-    """How often the kernel took the processor from this thread. Waiting, as for the interpreter, is none."""
+    """Return how often the kernel preempted this thread; waiting, as for the interpreter lock, does not count."""
     return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
 
 
@@ -126,17 +126,17 @@ def _compute(until_ns: int) -> None:
         number = number * 3 % 1_000_003
 
 
-# --- databases that are slow, or gone -------------------------------------------------------------------------------
+# --- slow and unavailable databases ---------------------------------------------------------------------------------
 
 
-class _Way:
-    """A process between us and the server: all that goes through it is late, until it is killed."""
+class _Proxy:
+    """A proxy process in front of the server that delays all data, until it is killed."""
 
     def __init__(self, server: Server, late_s: float) -> None:
         self._server = server
-        self._process = Speaker(_pass_on, str(server.folder / ".s.PGSQL.5432"), late_s)
+        self._process = ChildProcess(_run_proxy, str(server.folder / ".s.PGSQL.5432"), late_s)
         self._process.wait_for("\n")
-        [[_, self._port]] = self._process.said
+        [[_, self._port]] = self._process.lines
 
     def new_database(self) -> str:
         return f"postgresql://postgres@127.0.0.1:{self._port}{urlsplit(self._server.new_database()).path}"
@@ -145,7 +145,7 @@ class _Way:
         self._process.stop()
 
 
-def _pass_on(server_socket: str, late_s: float) -> None:
+def _run_proxy(server_socket: str, late_s: float) -> None:
     async def carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with suppress(OSError):
             while chunk := await reader.read(1 << 16):
@@ -155,26 +155,26 @@ def _pass_on(server_socket: str, late_s: float) -> None:
         writer.close()
 
     async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        there, back = await asyncio.open_unix_connection(server_socket)
-        await asyncio.gather(carry(reader, back), carry(there, writer))
+        server_reader, server_writer = await asyncio.open_unix_connection(server_socket)
+        await asyncio.gather(carry(reader, server_writer), carry(server_reader, writer))
 
-    async def pass_on() -> None:
-        listening = await asyncio.start_server(accept, "127.0.0.1", 0)
-        say("port", listening.sockets[0].getsockname()[1])
-        await listening.serve_forever()
+    async def serve() -> None:
+        proxy = await asyncio.start_server(accept, "127.0.0.1", 0)
+        say("port", proxy.sockets[0].getsockname()[1])
+        await proxy.serve_forever()
 
-    asyncio.run(pass_on())
+    asyncio.run(serve())
 
 
 # --- measuring ------------------------------------------------------------------------------------------------------
 
 
-async def measured(stack: ExitStack, *, turns: int, performs: int, late_s: float) -> dict[str, object]:
+async def measure(stack: ExitStack, *, turns: int, performs: int, late_s: float) -> dict[str, object]:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="h")))
     server = stack.enter_context(server_in(folder / "pg"))
-    slow, gone = _Way(server, late_s), _Way(server, 0.0)
+    slow, unavailable = _Proxy(server, late_s), _Proxy(server, 0.0)
     stack.callback(slow.end)
-    databases = {"up": server.new_database, "slow": slow.new_database, "down": gone.new_database}
+    databases = {"up": server.new_database, "slow": slow.new_database, "down": unavailable.new_database}
     kinds = [
         Kind(writer, state, new_database(), folder / f"{writer}.{state}")
         for writer in _WRITERS
@@ -187,10 +187,10 @@ async def measured(stack: ExitStack, *, turns: int, performs: int, late_s: float
     async with asyncio.TaskGroup() as tasks:
         for plan in plans:
             tasks.create_task(plan.run(), name=plan.name)
-        for plan in plans:  # whatever happens only once
+        for plan in plans:  # warm up: connections, tables, declarations
             await plan.take_turn(10)
             plan.turns.clear()
-        gone.end()
+        unavailable.end()
         order = random.Random(1)
         for _ in range(turns):
             for plan in order.sample(plans, len(plans)):
@@ -207,25 +207,27 @@ async def measured(stack: ExitStack, *, turns: int, performs: int, late_s: float
 
 
 def _figures(plan: Plan, without: Plan) -> dict[str, object]:
-    """µs."""
-    spreads, plain = [_spread(turn) for turn in plan.turns], [_spread(turn) for turn in without.turns]
+    """Return the figures of one plan, in µs."""
+    spreads, spreads_without = [_spread(turn) for turn in plan.turns], [_spread(turn) for turn in without.turns]
     typical = {name: statistics.median(each[name] for each in spreads) for name in _PERCENTILES}
-    longest = max(max(turn.whole + turn.interrupted) for turn in plan.turns) / 1e3
+    longest = max(max(turn.uninterrupted + turn.interrupted) for turn in plan.turns) / 1e3
     figures: dict[str, object] = {
         "perform_us": _rounded(typical | {"max": longest}),
         "interrupted": sum(len(turn.interrupted) for turn in plan.turns),
     }
     if plan is not without:
-        more = {
-            name: statistics.median(with_it[name] - none[name] for with_it, none in zip(spreads, plain, strict=True))
+        additional = {
+            name: statistics.median(
+                with_it[name] - without_it[name] for with_it, without_it in zip(spreads, spreads_without, strict=True)
+            )
             for name in _PERCENTILES
         }
-        figures |= {"more_us": _rounded(more), "hook_us": round(more["median"] / 2, 1)}
+        figures |= {"more_us": _rounded(additional), "hook_us": round(additional["median"] / 2, 1)}
     return figures
 
 
 def _spread(turn: Turn) -> dict[str, float]:
-    ordered = sorted(turn.whole)
+    ordered = sorted(turn.uninterrupted)
     return {name: ordered[round(share * (len(ordered) - 1))] / 1e3 for name, share in _PERCENTILES.items()}
 
 
@@ -239,21 +241,21 @@ def _table(result: dict[str, object]) -> Table:
     table = Table(title="A whole perform, µs, by writer and state of the database", title_justify="left")
     for name in columns:
         table.add_column(name, justify="left" if name == "memory" else "right")
-    for name, found in result.items():
-        if isinstance(found, dict):
-            figures = [*found["perform_us"].values(), found["interrupted"], *found.get("more_us", {}).values()]
-            table.add_row(name, *(f"{each:,}" for each in figures), str(found.get("hook_us", "")))
+    for name, figures in result.items():
+        if isinstance(figures, dict):
+            cells = [*figures["perform_us"].values(), figures["interrupted"], *figures.get("more_us", {}).values()]
+            table.add_row(name, *(f"{each:,}" for each in cells), str(figures.get("hook_us", "")))
     return table
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--quick", action="store_true", help="two short turns each")
+    parser.add_argument("--quick", action="store_true", help="two short turns for each plan")
     quick = parser.parse_args().quick
-    logging.disable(logging.WARNING)  # that the database is away is known here
+    logging.disable(logging.WARNING)  # the memory warns that the database is unavailable, which is intended here
     with ExitStack() as stack:
         turns, performs, late_s = (2, 100, _LATE_S / 20) if quick else (20, 1_000, _LATE_S)
-        result = asyncio.run(measured(stack, turns=turns, performs=performs, late_s=late_s))
+        result = asyncio.run(measure(stack, turns=turns, performs=performs, late_s=late_s))
     print(json.dumps(result))
     Console(stderr=True, width=None if sys.stderr.isatty() else 140).print(_table(result))
 

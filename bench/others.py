@@ -1,18 +1,18 @@
-"""The same events by what people would pick instead, and by the raw limits.
+"""Store the same events with this package, with other libraries, and with plain SQL.
 
     python -m bench.others             100,000 events into SQLite and PostgreSQL, 20,000 into queues; three turns each
-    python -m bench.others --quick     1,000
+    python -m bench.others --quick     1,000 events, one turn
 
-*Into the database*: events that lie ready (ours in the spool of a recorder that is gone, read from there; theirs as
-objects in memory) until all are committed, by one process. The libraries get them in batches, as they are quickest:
-`eventsource-py` 1,000 a call, `eventsourcing` 5,000 (PostgreSQL: 1,000). The raw ways write our very rows, 10,000 a
-transaction: `executemany`, `json_each` and COPY.
+*Into the database*: one process commits all events. This package reads them from the spool of a dead recorder; for the
+libraries they are objects in memory, passed in the batches that were fastest: 1,000 a call for `eventsource-py`, 5,000
+for `eventsourcing` (1,000 on PostgreSQL). Plain SQL writes the rows of our log, 10,000 a transaction, by `executemany`,
+`json_each` and COPY.
 
-*Into a durable queue*: one event after the other, until putting it has returned and it survives the death of the
-process; beside it the raw cost of encoding, checksum and memory copy, without which there is no queue.
+*Into a durable queue*: events are put one by one, each until it survives the death of the process. The cost of
+encoding, checksum and memory copy alone is a lower bound for every queue.
 
-A library that is not installed is said to be missing (`pip install '.[bench]'`). Who is measured takes turns. Prints
-one JSON line: events a second (median, least, most), and how often that is of ours.
+All contenders take turns. If a library is not installed, its figure says so (`pip install '.[bench]'`). The script
+prints one JSON line: events a second (median, minimum, maximum), and our rate divided by theirs.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from sqlalchemy.engine import make_url
 from sqlalchemy.ext.asyncio import create_async_engine
 
 from bench.material.rollouts import tree
-from bench.material.spooled import Recording, spool_tree
+from bench.material.spool_recording import Recording, spool_tree
 from bench.reporting.figures import MISSING, console, spread
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK
@@ -61,7 +61,7 @@ from pycrorm_async.writer.drain import Drain
 from tests.databases import Server, server_in
 
 _RAW_BATCH = 10_000
-_PATIENCE_S = 600
+_SECONDS_MAX = 600
 _INSERT = "INSERT INTO event (episode, sequence, type, version, wall_ns, monotonic_ns, payload) VALUES (?,?,?,?,?,?,?)"
 _INSERT_AS_JSON = """
 INSERT INTO event (episode, sequence, type, version, wall_ns, monotonic_ns, payload)
@@ -70,7 +70,7 @@ _COLUMNS = ("episode", "sequence", "type", "version", "wall_ns", "monotonic_ns",
 
 
 class Material(NamedTuple):
-    """The events, and the spool that holds them; `folder` is for whatever a contender makes."""
+    """The events, the spool that contains them, and a folder for the files of the contenders."""
 
     records: list[Record]
     spool: Path
@@ -82,7 +82,7 @@ class Material(NamedTuple):
 
 
 Contender = Callable[[Material, str], float]
-"""Stores all of it at this URL, and says how many seconds that took."""
+"""Store all events at this URL, and return the seconds this took."""
 
 
 def _batches(values: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
@@ -95,13 +95,13 @@ def _batches(values: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
 def ours(material: Material, url: str) -> float:
     spool = Path(tempfile.mkdtemp(dir=material.folder)) / "spool"
     shutil.copytree(material.spool, spool)
-    return asyncio.run(_drained(spool, url))
+    return asyncio.run(_drain_spool(spool, url))
 
 
-async def _drained(spool: Path, url: str) -> float:
-    place, settings = Spool(spool), Settings()
-    async with open_destination(DatabaseAddress.parse(url), place, clock=SYSTEM_CLOCK) as destination:
-        [folder] = place.recorders()
+async def _drain_spool(spool: Path, url: str) -> float:
+    spool_folder, settings = Spool(spool), Settings()
+    async with open_destination(DatabaseAddress.parse(url), spool_folder, clock=SYSTEM_CLOCK) as destination:
+        [folder] = spool_folder.recorders()
         began = time.perf_counter()
         queue = open_dead(folder.path)
         assert queue is not None
@@ -121,26 +121,26 @@ def eventsource_py(material: Material, url: str) -> float:
     aggregate = uuid.uuid4()
     events = [Happened(aggregate_id=aggregate, body=each.payload.decode()) for each in material.records]
 
-    async def appended() -> float:
+    async def append_all() -> float:
         if url.startswith("postgresql:"):
             engine = create_async_engine(url.replace("postgresql:", "postgresql+asyncpg:"))
             store = eventsource.PostgreSQLEventStore(engine, create_schema=True, owns_engine=True)
         else:
             store = eventsource.SQLiteEventStore(url.removeprefix("sqlite:///"))
-        stream, anything = eventsource.StreamId(aggregate, "Episode"), eventsource.ExpectedVersion.any_()
-        await store.append(eventsource.StreamId(uuid.uuid4(), "Warm"), [_warming(Happened)], anything)
+        stream, any_version = eventsource.StreamId(aggregate, "Episode"), eventsource.ExpectedVersion.any_()
+        await store.append(eventsource.StreamId(uuid.uuid4(), "Warm"), [_warm_up_event(Happened)], any_version)
         began = time.perf_counter()
         for batch in _batches(events, 1_000):
-            await store.append(stream, batch, anything)
+            await store.append(stream, batch, any_version)
         took = time.perf_counter() - began
         await store.close()
         return took
 
-    return asyncio.run(appended())
+    return asyncio.run(append_all())
 
 
-def _warming(kind: Any) -> Any:
-    """Something to store first, so that connecting and making tables is not measured."""
+def _warm_up_event(kind: Any) -> Any:
+    """Return an event to store first, so that connecting and creating tables is not measured."""
     return kind(aggregate_id=uuid.uuid4(), body="{}")
 
 
@@ -148,11 +148,11 @@ def eventsourcing(material: Material, url: str) -> float:
     persistence = importlib.import_module("eventsourcing.persistence")
     if url.startswith("postgresql:"):
         importlib.import_module("eventsourcing.postgres")
-        place = make_url(url)
+        address = make_url(url)
         environment = {
             "PERSISTENCE_MODULE": "eventsourcing.postgres",
-            "POSTGRES_DBNAME": str(place.database),
-            "POSTGRES_HOST": str(place.query["host"]),
+            "POSTGRES_DBNAME": str(address.database),
+            "POSTGRES_HOST": str(address.query["host"]),
             "POSTGRES_PORT": "5432",
             "POSTGRES_USER": "postgres",
             "POSTGRES_PASSWORD": "none",
@@ -162,14 +162,14 @@ def eventsourcing(material: Material, url: str) -> float:
         environment = {"PERSISTENCE_MODULE": "eventsourcing.sqlite", "SQLITE_DBNAME": path}
     factory = persistence.InfrastructureFactory.construct(persistence.Environment("bench", environment))
     recorder = factory.application_recorder()
-    name, warm = uuid.uuid4(), persistence.StoredEvent(uuid.uuid4(), 1, "warm", b"{}")
+    name, warm_up = uuid.uuid4(), persistence.StoredEvent(uuid.uuid4(), 1, "warm", b"{}")
     events = [
         persistence.StoredEvent(name, number, each.type, each.payload)
         for number, each in enumerate(material.records, 1)
     ]
-    recorder.insert_events([warm])
+    recorder.insert_events([warm_up])
     began = time.perf_counter()
-    # With 5,000 a call psycopg and the server wait for each other for ever.
+    # With 5,000 a call psycopg and the server deadlock.
     for batch in _batches(events, 1_000 if url.startswith("postgresql:") else 5_000):
         recorder.insert_events(batch)
     took = time.perf_counter() - began
@@ -193,7 +193,7 @@ def raw_json_each(material: Material, url: str) -> float:
 
 def _raw_sqlite(material: Material, url: str, insert: Callable[[sqlite3.Connection, Any], None]) -> float:
     rows = material.rows
-    _make_log(url)
+    _create_log(url)
     connection = sqlite3.connect(url.removeprefix("sqlite:///"), isolation_level=None)
     connection.execute("PRAGMA synchronous = FULL")
     connection.execute("PRAGMA wal_autocheckpoint = 4000")
@@ -208,7 +208,7 @@ def _raw_sqlite(material: Material, url: str, insert: Callable[[sqlite3.Connecti
 
 
 def raw_copy(material: Material, url: str) -> float:
-    async def copied() -> float:
+    async def copy_all() -> float:
         connection = await asyncpg.connect(url)
         began = time.perf_counter()
         for batch in _batches(rows, _RAW_BATCH):
@@ -218,12 +218,12 @@ def raw_copy(material: Material, url: str) -> float:
         return took
 
     rows = material.rows
-    _make_log(url)
-    return asyncio.run(copied())
+    _create_log(url)
+    return asyncio.run(copy_all())
 
 
 def raw_executemany_postgresql(material: Material, url: str) -> float:
-    async def inserted() -> float:
+    async def insert_all() -> float:
         connection = await asyncpg.connect(url)
         statement = f"INSERT INTO pycrorm.event ({', '.join(_COLUMNS)}) VALUES ($1, $2, $3, $4, $5, $6, $7)"
         began = time.perf_counter()
@@ -234,17 +234,17 @@ def raw_executemany_postgresql(material: Material, url: str) -> float:
         return took
 
     rows = material.rows
-    _make_log(url)
-    return asyncio.run(inserted())
+    _create_log(url)
+    return asyncio.run(insert_all())
 
 
-def _make_log(url: str) -> None:
-    """Our own table, with its key and its triggers."""
+def _create_log(url: str) -> None:
+    """Create the table of our log, with its key and its triggers."""
 
-    async def made() -> None:
+    async def create() -> None:
         await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
 
-    asyncio.run(made())
+    asyncio.run(create())
 
 
 # --- into a durable queue -------------------------------------------------------------------------------------------
@@ -262,19 +262,19 @@ def our_queue(material: Material, _url: str) -> float:
 
 
 def encode_checksum_and_copy(material: Material, _url: str) -> float:
-    """From the value to its bytes in a mapped file, with a checksum: what no queue on disk is without."""
+    """Encode each event, compute its checksum and copy both into a mapped file; every queue on disk must do this."""
     events: list[Happening] = [decode(each.type, each.payload, each.version) for each in material.records]
     size = sum(len(each.payload) + 8 for each in material.records)
     with (material.folder / "raw").open("w+b") as file:
         os.posix_fallocate(file.fileno(), 0, size)
-        with mmap.mmap(file.fileno(), size) as there:
+        with mmap.mmap(file.fileno(), size) as memory:
             began = time.perf_counter()
-            at = 0
+            start = 0
             for event in events:
                 payload = encode(event)
-                end = at + 8 + len(payload)
-                there[at:end] = zlib.crc32(payload).to_bytes(8, "little") + payload
-                at = end
+                end = start + 8 + len(payload)
+                memory[start:end] = zlib.crc32(payload).to_bytes(8, "little") + payload
+                start = end
             return time.perf_counter() - began
 
 
@@ -291,7 +291,7 @@ def persist_queue_file(material: Material, _url: str) -> float:
 
 
 def sqlite_autocommit(material: Material, _url: str) -> float:
-    """WAL with synchronous NORMAL: a commit survives the process, and the machine only after a checkpoint."""
+    """Commit each event; with WAL and synchronous=NORMAL it survives power loss only after a checkpoint."""
     connection = sqlite3.connect(f"{tempfile.mkdtemp(dir=material.folder)}/queue.db", isolation_level=None)
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
@@ -311,7 +311,7 @@ def _put_all(put: Callable[[tuple[str, bytes]], Any], records: Iterable[Record])
     return time.perf_counter() - began
 
 
-# --- all of them ----------------------------------------------------------------------------------------------------
+# --- all contenders -------------------------------------------------------------------------------------------------
 
 CONTENDERS: dict[str, dict[str, Contender]] = {
     "sqlite": {
@@ -338,8 +338,8 @@ CONTENDERS: dict[str, dict[str, Contender]] = {
 }
 
 
-def measured(contenders: dict[str, Contender], material: Material, turns: int, new_url: Callable[[], str]) -> Any:
-    """Each as often as there are turns, in turns; events a second and its share of ours."""
+def measure(contenders: dict[str, Contender], material: Material, turns: int, new_url: Callable[[], str]) -> Any:
+    """Run every contender once in each turn; return events a second, and our rate divided by that."""
     rates: dict[str, list[float]] = {}
     missing: dict[str, str] = {}
     for turn, (name, contender) in itertools.product(range(turns), contenders.items()):
@@ -347,32 +347,32 @@ def measured(contenders: dict[str, Contender], material: Material, turns: int, n
             continue
         console().print(f"  {name}, turn {turn + 1}")
         try:
-            signal.alarm(_PATIENCE_S)
+            signal.alarm(_SECONDS_MAX)
             rates.setdefault(name, []).append(len(material.records) / contender(material, new_url()))
         except ModuleNotFoundError:
             missing[name] = MISSING
         except TimeoutError:
-            missing[name] = f"not done after {_PATIENCE_S} s"
+            missing[name] = f"not finished after {_SECONDS_MAX} s"
         finally:
             signal.alarm(0)
-    own = rates["ours"]  # ours is never missing
+    our_rates = rates["ours"]  # ours needs no other library
     return {
         name: missing.get(name)
         or {
             "events_per_s": spread(rates[name]),
-            "ours_is": spread([one / other for one, other in zip(own, rates[name], strict=True)]),
+            "ours_is": spread([one / other for one, other in zip(our_rates, rates[name], strict=True)]),
         }
         for name in contenders
     }
 
 
 def material_of(events: int, folder: Path) -> Material:
-    """About so many events of one episode, from `EpisodeStarted` to `EpisodeEnded`."""
+    """Spool about `events` events of one episode, from `EpisodeStarted` to `EpisodeEnded`."""
     spool = folder / "spooled"
     spool_tree(tree(events // 2, seed=69), spool)
-    again = folder / "read"
-    shutil.copytree(spool, again)
-    return Material([each for each in asyncio.run(_read(again)) if each.episode is not None], spool, folder)
+    copy = folder / "read"
+    shutil.copytree(spool, copy)
+    return Material([each for each in asyncio.run(_read(copy)) if each.episode is not None], spool, folder)
 
 
 async def _read(spool: Path) -> list[Record]:
@@ -398,30 +398,32 @@ def main() -> None:
     parser.add_argument("--events", type=int, default=100_000)
     parser.add_argument("--queued", type=int, default=20_000)
     parser.add_argument("--turns", type=int, default=3)
-    asked = parser.parse_args()
-    events, queued, turns = (1_000, 1_000, 1) if asked.quick else (asked.events, asked.queued, asked.turns)
+    arguments = parser.parse_args()
+    events, queued, turns = (
+        (1_000, 1_000, 1) if arguments.quick else (arguments.events, arguments.queued, arguments.turns)
+    )
     packages = ("eventsource-py", "eventsourcing", "persist-queue", "asyncpg", "psycopg")
-    collect_seldom()  # as `pycrorm writer` does; for all of them
-    signal.signal(signal.SIGALRM, _give_up)
-    answer: dict[str, Any] = {
+    collect_seldom()  # as in `pycrorm writer`; applies to all contenders
+    signal.signal(signal.SIGALRM, _raise_timeout)
+    result: dict[str, Any] = {
         "bench": "others",
         "turns": turns,
         "versions": {each: _version(each) for each in packages},
     }
-    for place, contenders in CONTENDERS.items():
-        console().print(place)
+    for target, contenders in CONTENDERS.items():
+        console().print(target)
         with ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-            server = stack.enter_context(server_in(folder / "pg")) if place == "postgresql" else None
-            material = material_of(queued if place == "queue" else events, folder)
+            server = stack.enter_context(server_in(folder / "pg")) if target == "postgresql" else None
+            material = material_of(queued if target == "queue" else events, folder)
             numbers = itertools.count()
-            found = measured(contenders, material, turns, partial(_new_url, folder, server, numbers))
-            answer[place] = {"events": len(material.records), **found}
-    print(json.dumps(answer))
-    console().print(_table(answer))
+            rates = measure(contenders, material, turns, partial(_new_url, folder, server, numbers))
+            result[target] = {"events": len(material.records), **rates}
+    print(json.dumps(result))
+    console().print(_table(result))
 
 
-def _give_up(*_: object) -> None:
+def _raise_timeout(*_: object) -> None:
     raise TimeoutError
 
 
@@ -429,19 +431,19 @@ def _new_url(folder: Path, server: Server | None, numbers: Iterator[int]) -> str
     return server.new_database() if server else f"sqlite:///{folder}/{next(numbers)}.db"
 
 
-def _table(answer: dict[str, Any]) -> Table:
-    table = Table(title="The same events, by others", title_justify="left")
-    for name in ("into", "by", "events/s", "least", "most", "ours is"):
-        table.add_column(name, justify="left" if name in ("into", "by") else "right")
-    for place, contenders in CONTENDERS.items():
+def _table(result: dict[str, Any]) -> Table:
+    table = Table(title="Events stored by each contender", title_justify="left")
+    for name in ("into", "contender", "events/s", "least", "most", "ours / theirs"):
+        table.add_column(name, justify="left" if name in ("into", "contender") else "right")
+    for target, contenders in CONTENDERS.items():
         for name in contenders:
-            found = answer[place][name]
-            if isinstance(found, str):
-                table.add_row(place, name, found)
+            figures = result[target][name]
+            if isinstance(figures, str):
+                table.add_row(target, name, figures)
                 continue
-            rate = found["events_per_s"]
-            figures = (rate["median"], rate["least"], rate["most"], found["ours_is"]["median"])
-            table.add_row(place, name, *(f"{each:,}" for each in figures))
+            rate = figures["events_per_s"]
+            cells = (rate["median"], rate["least"], rate["most"], figures["ours_is"]["median"])
+            table.add_row(target, name, *(f"{each:,}" for each in cells))
     return table
 
 

@@ -1,8 +1,10 @@
-"""A plan with memory against the same plan without: navigate, face, look and try to pick up, as fast as it goes.
+"""Compare a plan with a memory and the same plan without: navigate, face, look and try to pick up, without pauses.
 
-Prints one JSON line: rollouts a second without, with a memory that writes by a thread, and with one whose events a
-daemon writes meanwhile, paired in turns within one run; what either costs, and how many events a rollout has.
-Run it with `python -m bench.plan`; `--quick` for two short turns.
+    python -m bench.plan               ten turns of 300 rollouts
+    python -m bench.plan --quick       two short turns
+
+The script prints one JSON line: rollouts a second without a memory, with a writer thread, and with a daemon that runs
+at the same time; the cost of both writers; and the number of events in a rollout. The three variants take turns.
 """
 
 import asyncio
@@ -30,14 +32,14 @@ ROLLOUTS = 10 if QUICK else 300
 TURNS = 2 if QUICK else 10
 
 
-class Took(NamedTuple):
-    """Seconds of one turn, on the wall and of the plan's thread on a processor."""
+class Duration(NamedTuple):
+    """Duration of one turn in seconds: wall time, and CPU time of the plan's thread."""
 
     wall: float
     thread: float
 
 
-async def rollouts(world: BulletWorld, milk: Object, generator: np.random.Generator) -> Took:
+async def rollouts(world: BulletWorld, milk: Object, generator: np.random.Generator) -> Duration:
     target = designator_of(milk)
     began, began_thread = time.perf_counter(), time.thread_time()
     for _ in range(ROLLOUTS):
@@ -47,13 +49,13 @@ async def rollouts(world: BulletWorld, milk: Object, generator: np.random.Genera
         with simulated_robot, suppress(PlanFailure):
             await MoveAndPickUpPerformable(Pose([1.3 + x, 1.0 + y, 0.0]), target, arm, grasp).perform()
         world.reset()
-    return Took(time.perf_counter() - began, time.thread_time() - began_thread)
+    return Duration(time.perf_counter() - began, time.thread_time() - began_thread)
 
 
-async def turn(url: str | None, seed: int, *, writer: Writer = "thread") -> Took:
-    """One turn in a world of its own, while the memory is written beside it.
+async def turn(url: str | None, seed: int, *, writer: Writer = "thread") -> Duration:
+    """Run one turn in a new world, with a memory at `url`.
 
-    A thread folds afterwards, a daemon meanwhile, on another core where there is one.
+    A writer thread folds after the turn; a daemon folds during it, on another core if there is one.
     """
     async with AsyncExitStack() as stack:
         if url is not None:
@@ -65,7 +67,7 @@ async def turn(url: str | None, seed: int, *, writer: Writer = "thread") -> Took
         return await rollouts(world, milk, np.random.default_rng(seed))
 
 
-async def measured() -> dict[str, object]:
+async def measure() -> dict[str, object]:
     with_memory, by_daemon, without = [], [], []
     with tempfile.TemporaryDirectory() as folder:
         url = f"sqlite:///{folder}/daemon.db"
@@ -88,12 +90,12 @@ async def measured() -> dict[str, object]:
     }
 
 
-def rate(turns: list[Took]) -> int:
+def rate(turns: list[Duration]) -> int:
     return round(ROLLOUTS / statistics.median(each.wall for each in turns))
 
 
-def cost(turns: list[Took], without: list[Took]) -> dict[str, object]:
-    """Shares, each turn against the one without memory beside it; the thread's hardly depend on who else is at work."""
+def cost(turns: list[Duration], without: list[Duration]) -> dict[str, object]:
+    """Return the additional time as a share of the turn without memory; other processes hardly affect CPU shares."""
     wall = [one.wall / other.wall - 1 for one, other in zip(turns, without, strict=True)]
     thread = [one.thread / other.thread - 1 for one, other in zip(turns, without, strict=True)]
     return {
@@ -104,4 +106,4 @@ def cost(turns: list[Took], without: list[Took]) -> dict[str, object]:
 
 
 if __name__ == "__main__":
-    print(json.dumps(asyncio.run(measured())))
+    print(json.dumps(asyncio.run(measure())))

@@ -1,15 +1,14 @@
-"""What the questions that are asked all the time cost, on memories of 1,000, 50,000 and 500,000 pick-ups.
+"""Measure common queries on memories of 1,000, 50,000 and 500,000 pick-ups.
 
     python -m bench.questions                     1,000 and 50,000 pick-ups, SQLite and PostgreSQL
     python -m bench.questions --pick-ups 500000   4.9 million nodes: some minutes to fill, 4 GB
-    python -m bench.questions --quick             100, once
+    python -m bench.questions --quick             100 pick-ups, one round
 
-The memories hold the rollouts of the thesis, 9 to 13 nodes each, a hundred in an episode. Each question is asked seven
-times after a first time that is not counted, all in turns, and the collector has been by before each. A server is asked
-when it has counted what it holds, as it does by itself within a minute or two, for before that it guesses how to go
-about a question. The same rows are asked for as a frame and as mapped objects, and from the plain view and from one
-whose rows are kept. Prints one JSON line: ms (median, least, most) and how many rows there were, by database, size and
-question.
+The memories contain the rollouts of the thesis, 9 to 13 nodes each, a hundred in an episode. Each query runs seven
+times after a first run that is not counted; the queries take turns, and garbage is collected before each. PostgreSQL is
+queried after autovacuum has analysed the tables, within a minute or two, because before that its planner lacks
+statistics. The same rows are queried as a data frame and as mapped objects, and from a plain and a materialised view.
+The script prints one JSON line: ms (median, minimum, maximum) and the number of rows, by database, size and query.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from typing import Any
 from rich.table import Table
 from sqlalchemy import func, select
 
-from bench.material.spooled import spool_rollouts
+from bench.material.spool_recording import spool_rollouts
 from bench.reporting.figures import console, spread
 from pycrorm_async import Memory, Reading, UserView
 from pycrorm_async.operations.recovery import recover
@@ -39,7 +38,7 @@ from pycrorm_async.world import ObjectType
 from tests.databases import ask, server_in
 
 _ROUNDS = 7
-_COUNTED_S_MAX = 600
+_ANALYSED_S_MAX = 600
 _OBJECTS_MAX = 10_000
 _SEED = 69
 _View = PickUpWithContextView
@@ -64,27 +63,27 @@ FAILURES = (
 )
 PICKED = select(Pose).join(PickUpAction.object).join(Object.pose)
 
-Question = Callable[[], Awaitable[int]]
-"""Asks, and says how many rows the answer had."""
+Query = Callable[[], Awaitable[int]]
+"""Run a query and return the number of its rows."""
 
 
-def questions_of(reading: Reading, pick_ups: int) -> dict[str, Question]:
-    """By name; `n` of them are objects at most `_OBJECTS_MAX`."""
+def queries_of(reading: Reading, pick_ups: int) -> dict[str, Query]:
+    """Return the queries by name; those limited in rows return at most `_OBJECTS_MAX`."""
     last = (pick_ups + 99) // 100
-    some = min(_OBJECTS_MAX, pick_ups)
+    limit = min(_OBJECTS_MAX, pick_ups)
 
-    def frame(statement: Any) -> Question:
-        async def asked() -> int:
+    def frame(statement: Any) -> Query:
+        async def rows() -> int:
             return len(await reading.dataframe(statement))
 
-        return asked
+        return rows
 
-    def objects(statement: Any) -> Question:
-        async def asked() -> int:
+    def objects(statement: Any) -> Query:
+        async def rows() -> int:
             async with reading.session() as session:
                 return len((await session.scalars(statement)).all())
 
-        return asked
+        return rows
 
     async def tree() -> int:
         return len(await reading.tree(last))
@@ -99,9 +98,9 @@ def questions_of(reading: Reading, pick_ups: int) -> dict[str, Question]:
         "learning, frame": frame(LEARNING),
         "learning, kept rows, frame": frame(KEPT_LEARNING),
         "all pick-ups with context, frame": frame(select(_View)),
-        f"{some:,} pick-ups, frame": frame(select(PickUpAction).limit(some)),
-        f"{some:,} pick-ups, objects": objects(select(PickUpAction).limit(some)),
-        f"where {some:,} were picked, objects": objects(PICKED.limit(some)),
+        f"{limit:,} pick-ups, frame": frame(select(PickUpAction).limit(limit)),
+        f"{limit:,} pick-ups, objects": objects(select(PickUpAction).limit(limit)),
+        f"where {limit:,} were picked, objects": objects(PICKED.limit(limit)),
         "why things failed, frame": frame(FAILURES),
         "nodes of an episode, frame": frame(select(TaskTreeNode).where(TaskTreeNode.process_metadata_id == last)),
         "nodes of an episode, objects": objects(select(TaskTreeNode).where(TaskTreeNode.process_metadata_id == last)),
@@ -113,78 +112,82 @@ def questions_of(reading: Reading, pick_ups: int) -> dict[str, Question]:
 
 
 async def fill(url: str, spool: Path, pick_ups: int) -> dict[str, float]:
-    """The memory, and the kept view; how long that took."""
-    began = time.perf_counter()
+    """Fill the memory and its materialised view; return the number of events and the durations in seconds."""
+    begin_s = time.perf_counter()
     events = await asyncio.to_thread(spool_rollouts, pick_ups, spool, seed=_SEED)
-    spooled = time.perf_counter()
+    spooled_s = time.perf_counter()
     report = await recover(url, spool=spool)
     assert not report.failed, report.failed
     assert not report.drained.stopped, report.drained.stopped
-    there = time.perf_counter()
+    folded_s = time.perf_counter()
     async with Memory.open(url, spool=spool, views=[KEPT]) as memory:
         await memory.flush()
-    took = {"spooled": spooled - began, "stored_and_folded": there - spooled, "kept": time.perf_counter() - there}
-    return {"events": events, **{name: round(each, 1) for name, each in took.items()}}
+    durations = {
+        "spooled": spooled_s - begin_s,
+        "stored_and_folded": folded_s - spooled_s,
+        "kept": time.perf_counter() - folded_s,
+    }
+    return {"events": events, **{name: round(each, 1) for name, each in durations.items()}}
 
 
-def await_counted(url: str) -> None:
-    """Until PostgreSQL's autovacuum has been by all tables that have changed by more than it lets pass."""
-    uncounted = "SELECT count(*) FROM pg_stat_user_tables WHERE n_mod_since_analyze > 50 + 0.1 * n_live_tup"
-    until = time.monotonic() + _COUNTED_S_MAX
-    while ask(url, uncounted) != [(0,)]:
-        if time.monotonic() > until:
-            raise TimeoutError(f"the server did not count its rows within {_COUNTED_S_MAX} s")
+def wait_for_autovacuum(url: str) -> None:
+    """Wait until PostgreSQL's autovacuum has analysed all tables that changed by more than its threshold."""
+    not_analysed = "SELECT count(*) FROM pg_stat_user_tables WHERE n_mod_since_analyze > 50 + 0.1 * n_live_tup"
+    deadline = time.monotonic() + _ANALYSED_S_MAX
+    while ask(url, not_analysed) != [(0,)]:
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"autovacuum did not analyse all tables within {_ANALYSED_S_MAX} s")
         time.sleep(1)
 
 
-async def asked(url: str, pick_ups: int, rounds: int) -> dict[str, Any]:
-    """All questions in turns, so many times after a first one that is not counted."""
-    took: dict[str, list[float]] = {}
+async def measure(url: str, pick_ups: int, rounds: int) -> dict[str, Any]:
+    """Run all queries `rounds` times, alternating, after a first round that is not counted."""
+    durations_ms: dict[str, list[float]] = {}
     rows: dict[str, int] = {}
     async with Reading.open(url) as reading:
-        questions = questions_of(reading, pick_ups)
+        queries = queries_of(reading, pick_ups)
         for number in range(1 + rounds):
-            for name, question in questions.items():
+            for name, query in queries.items():
                 gc.collect()
                 began = time.perf_counter()
-                rows[name] = await question()
+                rows[name] = await query()
                 if number:
-                    took.setdefault(name, []).append((time.perf_counter() - began) * 1000)
-    return {name: {"ms": spread(took[name]), "rows": rows[name]} for name in questions}
+                    durations_ms.setdefault(name, []).append((time.perf_counter() - began) * 1000)
+    return {name: {"ms": spread(durations_ms[name]), "rows": rows[name]} for name in queries}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="100 pick-ups, asked once")
+    parser.add_argument("--quick", action="store_true", help="100 pick-ups, one round")
     parser.add_argument("--pick-ups", type=int, nargs="+", default=[1_000, 50_000])
     parser.add_argument("--databases", nargs="+", default=["sqlite", "postgresql"])
-    given = parser.parse_args()
-    sizes, rounds = ([100], 1) if given.quick else (given.pick_ups, _ROUNDS)
-    answer: dict[str, Any] = {"bench": "questions", "rounds": rounds, "seed": _SEED}
+    arguments = parser.parse_args()
+    sizes, rounds = ([100], 1) if arguments.quick else (arguments.pick_ups, _ROUNDS)
+    result: dict[str, Any] = {"bench": "questions", "rounds": rounds, "seed": _SEED}
     with ExitStack() as stack:
-        place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
-        for database in given.databases:
-            server = stack.enter_context(server_in(place / "pg")) if database == "postgresql" else None
-            answer[database] = {}
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
+        for database in arguments.databases:
+            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
+            result[database] = {}
             for size in sizes:
                 console().print(f"{database}, {size:,} pick-ups …")
-                url = server.new_database() if server else f"sqlite:///{place}/{size}.db"
-                filled = asyncio.run(fill(url, place / f"{database}{size}", size))
+                url = server.new_database() if server else f"sqlite:///{folder}/{size}.db"
+                filled = asyncio.run(fill(url, folder / f"{database}{size}", size))
                 console().print(f"  filled: {filled}")
-                if server and not given.quick:
-                    await_counted(url)
-                answer[database][str(size)] = {"filled_s": filled, **asyncio.run(asked(url, size, rounds))}
-    print(json.dumps(answer))
-    console().print(_table(answer, given.databases))
+                if server and not arguments.quick:
+                    wait_for_autovacuum(url)
+                result[database][str(size)] = {"filled_s": filled, **asyncio.run(measure(url, size, rounds))}
+    print(json.dumps(result))
+    console().print(_table(result, arguments.databases))
 
 
-def _table(answer: dict[str, Any], databases: list[str]) -> Table:
-    table = Table(title="Questions, ms", title_justify="left")
-    for name in ("database", "pick-ups", "question", "rows", "median", "least", "most"):
-        table.add_column(name, justify="left" if name in ("database", "question") else "right")
+def _table(result: dict[str, Any], databases: list[str]) -> Table:
+    table = Table(title="Queries, ms", title_justify="left")
+    for name in ("database", "pick-ups", "query", "rows", "median", "least", "most"):
+        table.add_column(name, justify="left" if name in ("database", "query") else "right")
     for database in databases:
-        for size, found in answer[database].items():
-            for name, each in found.items():
+        for size, queries in result[database].items():
+            for name, each in queries.items():
                 if name != "filled_s":
                     figures = (f"{figure:,}" for figure in each["ms"].values())
                     table.add_row(database, f"{int(size):,}", name, f"{each['rows']:,}", *figures)

@@ -1,14 +1,14 @@
-"""What a hook is made of, and what a perform costs with one task and with a hundred, with and without state samples.
+"""Measure the stages of a hook, and a `perform` in one task and in a hundred, with and without state samples.
 
     python -m bench.stages            20 turns of 1,000 performs each, a minute
-    python -m bench.stages --quick    two short ones
+    python -m bench.stages --quick    two short turns
 
-The action of `bench.hook`, performed one after the other without a pause: where that one has the plan compute for a
-millisecond in between, after which a processor has forgotten what a hook needs, here it has it at hand. The plans take
-turns in random order; the hundred tasks give each other a turn after each perform, which is in their figure, a mean of
-each turn. *Stages* are measured by themselves, each in a loop of its own, with the same action, world and episode: so
-much of the two hooks of a perform each of them is. Prints one JSON line, in µs: of a perform median, p99, p99.9 and the
-longest; of a stage median, least and most over the turns.
+The action of `bench.hook` is performed without pauses. In `bench.hook` the plan computes for a millisecond between two
+performs, which evicts the code of the hook from the processor's caches; here it stays cached. The plans take turns in
+random order. The hundred tasks yield to each other after each perform; their figure is the mean of each turn and
+includes this switch. Each *stage* is measured in its own loop, with the same action, world and episode, to show its
+share of both hooks of a perform. The script prints one JSON line, in µs: median, p99, p99.9 and maximum of a perform;
+median, minimum and maximum of a stage over the turns.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 
 from rich.table import Table
 
-from bench.material.turns import InTurns, NothingActionPerformable, nothing_action
+from bench.material.turns import NothingActionPerformable, TurnTaker, nothing_action
 from bench.reporting.figures import console, percentiles, spread
 from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
@@ -49,33 +49,33 @@ _SAMPLED = Settings(sample_interval_ms=50)
 
 
 class NothingMotion(BaseMotion):
-    """No parameters, and nothing done: samples of the robot's state are taken while a motion runs."""
+    """A motion without parameters that does nothing; the robot's state is sampled while a motion runs."""
 
     async def perform(self) -> None:
         return
 
 
 class Kind(NamedTuple):
-    """How it is performed."""
+    """One way to perform: with or without memory, tasks, action or motion, settings."""
 
-    remembered: bool
+    recorded: bool
     tasks: int = 1
     motion: bool = False
     settings: Settings | None = None
 
 
 KINDS = {
-    "none": Kind(remembered=False),
-    "memory": Kind(remembered=True),
-    f"none, {_TASKS} tasks": Kind(remembered=False, tasks=_TASKS),
-    f"memory, {_TASKS} tasks": Kind(remembered=True, tasks=_TASKS),
-    "memory, motions": Kind(remembered=True, motion=True),
-    "memory, motions sampled": Kind(remembered=True, motion=True, settings=_SAMPLED),
+    "none": Kind(recorded=False),
+    "memory": Kind(recorded=True),
+    f"none, {_TASKS} tasks": Kind(recorded=False, tasks=_TASKS),
+    f"memory, {_TASKS} tasks": Kind(recorded=True, tasks=_TASKS),
+    "memory, motions": Kind(recorded=True, motion=True),
+    "memory, motions sampled": Kind(recorded=True, motion=True, settings=_SAMPLED),
 }
 
 
-class Plan(InTurns):
-    """In an episode of its own; a turn is over when all of it is stored."""
+class Plan(TurnTaker):
+    """A plan in its own episode; a turn ends when all its events are stored."""
 
     def __init__(self, kind: Kind, url: str) -> None:
         super().__init__()
@@ -84,7 +84,7 @@ class Plan(InTurns):
         self._url = url
 
     async def begin(self, stack: AsyncExitStack) -> Callable[[int], Awaitable[None]]:
-        memory = await _remembering(stack, self._url, self._kind) if self._kind.remembered else None
+        memory = await _open_memory(stack, self._url, self._kind) if self._kind.recorded else None
         stack.enter_context(BulletWorld())
         action = NothingMotion() if self._kind.motion else nothing_action()
 
@@ -98,27 +98,27 @@ class Plan(InTurns):
     async def _turn(self, action: NothingActionPerformable | NothingMotion, performs: int) -> list[float]:
         if self._kind.tasks > 1:
             return [await self._turn_of_many(action, performs)]
-        took: list[float] = []
+        durations_us: list[float] = []
         for _ in range(performs):
             began = time.perf_counter_ns()
             await action.perform()
-            took.append((time.perf_counter_ns() - began) / 1e3)
-        return took
+            durations_us.append((time.perf_counter_ns() - began) / 1e3)
+        return durations_us
 
     async def _turn_of_many(self, action: NothingActionPerformable | NothingMotion, performs: int) -> float:
-        """The mean: a perform lets the others have their turn now and then, so one by itself cannot be told."""
+        """Return the mean duration; single performs cannot be measured, because a perform may yield to other tasks."""
 
-        async def some(count: int) -> None:
+        async def perform(count: int) -> None:
             for _ in range(count):
                 await action.perform()
                 await asyncio.sleep(0)
 
         began = time.perf_counter_ns()
-        await asyncio.gather(*(some(performs // self._kind.tasks) for _ in range(self._kind.tasks)))
+        await asyncio.gather(*(perform(performs // self._kind.tasks) for _ in range(self._kind.tasks)))
         return (time.perf_counter_ns() - began) / performs / 1e3
 
 
-async def _remembering(stack: AsyncExitStack, url: str, kind: Kind) -> Memory:
+async def _open_memory(stack: AsyncExitStack, url: str, kind: Kind) -> Memory:
     memory = await stack.enter_async_context(Memory.open(url, settings=kind.settings))
     await stack.enter_async_context(memory.episode(description="bench"))
     return memory
@@ -128,24 +128,24 @@ async def _remembering(stack: AsyncExitStack, url: str, kind: Kind) -> Memory:
 
 
 async def stages(folder: Path, *, turns: int, performs: int) -> dict[str, dict[str, float]]:
-    """Each of them a median, µs: how long it took on average in each of the turns."""
+    """Return the spread over the turns of each stage's mean duration, in µs."""
     async with AsyncExitStack() as stack:
-        memory = await _remembering(stack, f"sqlite:///{folder}/stages.db", Kind(remembered=True))
+        memory = await _open_memory(stack, f"sqlite:///{folder}/stages.db", Kind(recorded=True))
         stack.enter_context(BulletWorld())
         queue = RecorderQueue.create(
             folder / "queue", settings=Settings(), clock=SYSTEM_CLOCK, recorder=_identity(b"recorder..")
         )
         stack.callback(queue.release)
         parts = _parts(nothing_action(), queue)
-        took: dict[str, list[float]] = {name: [] for name in parts}
+        durations_us: dict[str, list[float]] = {name: [] for name in parts}
         for _ in range(turns):
             for name, part in parts.items():
                 began = time.perf_counter_ns()
                 for _ in range(performs):
                     part()
-                took[name].append((time.perf_counter_ns() - began) / performs / 1e3)
+                durations_us[name].append((time.perf_counter_ns() - began) / performs / 1e3)
             await memory.flush()
-        return {name: spread(values) for name, values in took.items()}
+        return {name: spread(values) for name, values in durations_us.items()}
 
 
 def _parts(action: NothingActionPerformable, queue: RecorderQueue) -> dict[str, Callable[[], Any]]:
@@ -189,12 +189,12 @@ def _identity(randomness: bytes) -> EpisodeId:
 # --- measuring ------------------------------------------------------------------------------------------------------
 
 
-async def measured(folder: Path, *, turns: int, performs: int) -> dict[str, Any]:
+async def measure(folder: Path, *, turns: int, performs: int) -> dict[str, Any]:
     plans = {name: Plan(kind, f"sqlite:///{folder}/{place}.db") for place, (name, kind) in enumerate(KINDS.items())}
     async with asyncio.TaskGroup() as tasks:
         for name, plan in plans.items():
             tasks.create_task(plan.run(), name=name)
-        for plan in plans.values():  # whatever happens only once
+        for plan in plans.values():  # warm up: connections, tables, declarations
             await plan.take_turn(_TASKS)
             plan.took_us.clear()
         order = random.Random(1)
@@ -207,32 +207,32 @@ async def measured(folder: Path, *, turns: int, performs: int) -> dict[str, Any]
         name: percentiles([each for turn in plan.took_us for each in turn]) for name, plan in plans.items()
     }
     for name, without in (("memory", "none"), (f"memory, {_TASKS} tasks", f"none, {_TASKS} tasks")):
-        more = [
+        additional = [
             statistics.median(one) - statistics.median(other)
             for one, other in zip(plans[name].took_us, plans[without].took_us, strict=True)
         ]
-        figures[f"one hook, {name}"] = spread([each / 2 for each in more])
+        figures[f"one hook, {name}"] = spread([each / 2 for each in additional])
     return figures | {"stages": await stages(folder, turns=turns, performs=performs)}
 
 
 def _table(result: dict[str, Any]) -> Table:
     table = Table(title="A perform without a pause before it, and its stages, µs", title_justify="left")
-    for name in ("what", "median", "…"):
-        table.add_column(name, justify="left" if name == "what" else "right")
-    for name, found in {**result, **result["stages"]}.items():
-        if isinstance(found, dict) and "median" in found:
-            median, *rest = found.items()
-            table.add_row(name, f"{median[1]:,}", ", ".join(f"{which} {each:,}" for which, each in rest))
+    for name in ("operation", "median", "spread"):
+        table.add_column(name, justify="left" if name == "operation" else "right")
+    for name, figures in {**result, **result["stages"]}.items():
+        if isinstance(figures, dict) and "median" in figures:
+            median, *others = figures.items()
+            table.add_row(name, f"{median[1]:,}", ", ".join(f"{statistic} {each:,}" for statistic, each in others))
     return table
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="two short turns each")
+    parser.add_argument("--quick", action="store_true", help="two short turns for each plan")
     quick = parser.parse_args().quick
     turns, performs = (2, 100) if quick else (20, 1_000)
     with tempfile.TemporaryDirectory(prefix="b") as folder:
-        figures = asyncio.run(measured(Path(folder), turns=turns, performs=performs))
+        figures = asyncio.run(measure(Path(folder), turns=turns, performs=performs))
     result = {"bench": "stages", "turns": turns, "performs_a_turn": performs, **figures}
     print(json.dumps(result))
     console().print(_table(result))

@@ -1,17 +1,17 @@
-"""From task trees to every row in every table: as the system of the thesis did it, and as ours does.
+"""Store task trees with the system of the thesis and with this package, until every row is in every table.
 
-    python -m bench.thesis                    about 1,000, 10,000 and 50,000 nodes, SQLite; --postgresql on a server
+    python -m bench.thesis                    about 1,000, 10,000 and 50,000 nodes, SQLite; --postgresql on a new server
     python -m bench.thesis --nodes 488043 --repeat 1
     python -m bench.thesis --quick            300 nodes, on both databases
 
-The trees are the same values on both sides. The baseline (`bench/baseline`) has the whole tree in memory, adds an
-object for each row to a session and commits once; ours has it as events in the folder of a recorder that is gone, which
-a daemon finds, appends and folds. The clock runs from there until every row is in every table, without starting
-processes and without making the tables of the baseline; those of ours for the types of nodes are made in that time,
-and finding the folder takes a fifth of a second at most. The sides take turns, each in its own process. Prints one JSON
-line: by size nodes a second, how many times faster ours is (median, least and most over the turns) and how much less of
-the processor it takes (on PostgreSQL without the server's), rows and insert statements a node, and MB of the processes,
-of ours those of both, in which what they share counts twice.
+Both sides store the same values. The baseline (`bench/baseline`) has the whole tree in memory, adds an object for each
+row to a session and commits once. This package has the tree as events in the folder of a dead recorder, which a daemon
+discovers, appends and folds. The measured time ends when every row is in every table. It excludes the start of
+processes and the creation of the baseline's tables; it includes the creation of our tables for the types of nodes, and
+the discovery of the folder, which takes up to a fifth of a second. The sides take turns, each in its own process. The
+script prints one JSON line: for each size nodes a second, the ratios of wall and of CPU time (median, minimum and
+maximum over the turns; without the CPU time of a PostgreSQL server), rows and insert statements for a node, and MB of
+the processes. Ours has two processes, whose shared memory is counted twice.
 """
 
 from __future__ import annotations
@@ -31,31 +31,31 @@ from typing import Any
 
 from rich.table import Table
 
-from bench.baseline.storing import Statements, engine_of, store
+from bench.baseline.store import Statements, engine_of, store
 from bench.baseline.tables import BaselineBase
 from bench.daemon import start_daemon, stop
+from bench.material.fold_progress import until_folded
 from bench.material.rollouts import Tree, tree
-from bench.material.spooled import spool_tree
-from bench.material.watched import until_folded
+from bench.material.spool_recording import spool_tree
 from bench.reporting.figures import MISSING, console, cpu_s_of, held_mb, memory_free_gb, peak_mb, spread, with_children
 from tests.databases import Server, ask, server_in
 
 _BYTES_A_NODE = 36_000
-"""Of the baseline, which has all rows as objects until it commits."""
+"""Memory of the baseline for a node, because it keeps all rows as objects until it commits."""
 _COMPARED = ("baseline_nodes_per_s", "ours_nodes_per_s", "times_faster", "times_less_cpu")
 
 
-# --- one side, in a process of its own ------------------------------------------------------------------------------
+# --- one side, in its own process -----------------------------------------------------------------------------------
 
 
-def stored_by_baseline(url: str, nodes: int, seed: int) -> dict[str, Any]:
-    """What it takes the baseline, with the whole tree in memory."""
-    made = tree(nodes, seed)
+def store_by_baseline(url: str, nodes: int, seed: int) -> dict[str, Any]:
+    """Store a tree with the baseline; return time, memory, rows and statements."""
+    task_tree = tree(nodes, seed)
     engine = engine_of(url)
     statements = Statements(engine)
     before_mb = peak_mb()
     began, began_cpu = time.perf_counter(), time.process_time()
-    store(made, engine)
+    store(task_tree, engine)
     seconds, cpu_s = time.perf_counter() - began, time.process_time() - began_cpu
     rows = sum(ask(url, f"SELECT count(*) FROM {_quoted(each, url)}")[0][0] for each in BaselineBase.metadata.tables)
     return {
@@ -72,8 +72,8 @@ def _quoted(table: str, url: str) -> str:
     return f'public."{table}"' if url.startswith("postgresql:") else f'"{table}"'
 
 
-def stored_by_us(url: str, recorded: Path, spool: Path, events: int) -> dict[str, Any]:
-    """What it takes a daemon that runs already, from the moment the folder with all events is in its spool."""
+def store_by_us(url: str, recorded: Path, spool: Path, events: int) -> dict[str, Any]:
+    """Store the events with a running daemon, measured from the move of their folder into its spool."""
     daemon = start_daemon(url, spool)
     try:
         processes = with_children(daemon.pid)
@@ -86,58 +86,60 @@ def stored_by_us(url: str, recorded: Path, spool: Path, events: int) -> dict[str
         used_s, mb = sum(map(cpu_s_of, processes)) - cpu_s, sum(held_mb("VmHWM", each) for each in processes)
     finally:
         stop(daemon)
-    return {"seconds": seconds, "cpu_s": used_s, "appended_s": appended_s, "mb": mb, "rows": rows_shown(url)}
+    return {"seconds": seconds, "cpu_s": used_s, "appended_s": appended_s, "mb": mb, "rows": count_rows(url)}
 
 
-def rows_shown(url: str) -> int:
-    """Rows in all our tables but the log and the bookkeeping."""
+def count_rows(url: str) -> int:
+    """Count the rows of all our tables except the log and the bookkeeping."""
     if url.startswith("postgresql:"):
-        named = "SELECT 'memory_tables.\"' || tablename || '\"' FROM pg_tables WHERE schemaname = 'memory_tables'"
-        named += " AND tablename NOT LIKE 'pycrorm_%'"
+        tables_query = (
+            "SELECT 'memory_tables.\"' || tablename || '\"' FROM pg_tables WHERE schemaname = 'memory_tables'"
+        )
+        tables_query += " AND tablename NOT LIKE 'pycrorm_%'"
     else:
-        named = (
+        tables_query = (
             "SELECT '\"' || name || '\"' FROM sqlite_master WHERE type = 'table' AND name LIKE '%\\_\\_%' ESCAPE '\\'"
         )
-        named += " AND name NOT LIKE 'pycrorm_%'"
-    return sum(int(ask(url, f"SELECT count(*) FROM {name}")[0][0]) for (name,) in ask(url, named))
+        tables_query += " AND name NOT LIKE 'pycrorm_%'"
+    return sum(int(ask(url, f"SELECT count(*) FROM {name}")[0][0]) for (name,) in ask(url, tables_query))
 
 
-# --- the two, in turns ----------------------------------------------------------------------------------------------
+# --- both sides, in turns -------------------------------------------------------------------------------------------
 
 
-def by_baseline(url: str, nodes: int, seed: int) -> dict[str, Any]:
-    """What its process says."""
+def run_baseline(url: str, nodes: int, seed: int) -> dict[str, Any]:
+    """Run the baseline in a new process and return its figures."""
     command = [sys.executable, "-m", "bench.thesis", "--baseline", url, "--nodes", str(nodes), "--seed", str(seed)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return dict(json.loads(done.stdout))
+    completed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return dict(json.loads(completed.stdout))
 
 
-def compared(made: Tree, folder: Path, *, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
-    """One size."""
+def compare(task_tree: Tree, folder: Path, *, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
+    """Measure both sides with one tree."""
     spooled = folder / "spooled"
-    events = spool_tree(made, spooled)
-    new = partial(_new_url, folder, server)
-    theirs, ours = [], []
-    nodes = made.nodes
+    events = spool_tree(task_tree, spooled)
+    new_url = partial(_new_url, folder, server)
+    baseline, ours = [], []
+    nodes = task_tree.nodes
     for turn in range(repeat):
-        theirs.append(by_baseline(new(f"baseline{turn}"), nodes, seed))
+        baseline.append(run_baseline(new_url(f"baseline{turn}"), nodes, seed))
         spool = folder / f"spool{turn}"
         shutil.copytree(spooled, spool)
-        ours.append(stored_by_us(new(f"ours{turn}"), spool, folder / f"drained{turn}", events))
+        ours.append(store_by_us(new_url(f"ours{turn}"), spool, folder / f"drained{turn}", events))
     shutil.rmtree(spooled)
-    faster = [one["seconds"] / other["seconds"] for one, other in zip(theirs, ours, strict=True)]
+    times_faster = [one["seconds"] / other["seconds"] for one, other in zip(baseline, ours, strict=True)]
     return {
         "nodes": nodes,
         "events": events,
-        "baseline_nodes_per_s": spread([nodes / each["seconds"] for each in theirs]),
+        "baseline_nodes_per_s": spread([nodes / each["seconds"] for each in baseline]),
         "ours_nodes_per_s": spread([nodes / each["seconds"] for each in ours]),
-        "times_faster": spread(faster),
-        "times_less_cpu": spread([one["cpu_s"] / other["cpu_s"] for one, other in zip(theirs, ours, strict=True)]),
-        "baseline_rows_per_node": round(theirs[0]["rows"] / nodes, 2),
-        "baseline_statements_per_node": round(theirs[0]["statements"] / nodes, 2),
+        "times_faster": spread(times_faster),
+        "times_less_cpu": spread([one["cpu_s"] / other["cpu_s"] for one, other in zip(baseline, ours, strict=True)]),
+        "baseline_rows_per_node": round(baseline[0]["rows"] / nodes, 2),
+        "baseline_statements_per_node": round(baseline[0]["statements"] / nodes, 2),
         "ours_rows_per_node": round(ours[0]["rows"] / nodes, 2),
-        "baseline_mb": round(max(each["mb"] for each in theirs)),
-        "baseline_tree_mb": round(max(each["tree_mb"] for each in theirs)),
+        "baseline_mb": round(max(each["mb"] for each in baseline)),
+        "baseline_tree_mb": round(max(each["tree_mb"] for each in baseline)),
         "ours_mb": round(max(each["mb"] for each in ours)),
         "ours_appended_share": spread([each["appended_s"] / each["seconds"] for each in ours]),
     }
@@ -150,40 +152,42 @@ def _new_url(folder: Path, server: Server | None, name: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="300 nodes, on both databases")
-    parser.add_argument("--postgresql", action="store_true", help="on a server of its own")
+    parser.add_argument("--postgresql", action="store_true", help="use a new PostgreSQL server")
     parser.add_argument("--nodes", type=int, nargs="+", default=[1_000, 10_000, 50_000])
-    parser.add_argument("--repeat", type=int, default=3, help="how often each side has its turn")
+    parser.add_argument("--repeat", type=int, default=3, help="turns of each side")
     parser.add_argument("--seed", type=int, default=69)
     parser.add_argument("--baseline", metavar="URL", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.baseline:
-        print(json.dumps(stored_by_baseline(asked.baseline, asked.nodes[0], asked.seed)))
+    arguments = parser.parse_args()
+    if arguments.baseline:
+        print(json.dumps(store_by_baseline(arguments.baseline, arguments.nodes[0], arguments.seed)))
         return
-    sizes, repeat = ([300], 1) if asked.quick else (asked.nodes, asked.repeat)
+    sizes, repeat = ([300], 1) if arguments.quick else (arguments.nodes, arguments.repeat)
     if (needed_gb := max(sizes) * _BYTES_A_NODE / 1e9) > (free_gb := memory_free_gb()):
-        parser.error(f"the baseline needs about {needed_gb:.0f} GB and {free_gb:.0f} are free: ask for fewer nodes")
-    databases = ["sqlite", "postgresql"] if asked.quick else ["postgresql" if asked.postgresql else "sqlite"]
-    answer: dict[str, Any] = {"bench": "thesis", "seed": asked.seed, "repeat": repeat}
+        parser.error(
+            f"the baseline needs about {needed_gb:.0f} GB of memory, and {free_gb:.0f} GB are free; use fewer --nodes"
+        )
+    databases = ["sqlite", "postgresql"] if arguments.quick else ["postgresql" if arguments.postgresql else "sqlite"]
+    result: dict[str, Any] = {"bench": "thesis", "seed": arguments.seed, "repeat": repeat}
     with ExitStack() as stack:
-        place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
         for database in databases:
             if database == "postgresql" and find_spec("psycopg") is None:
-                answer[database] = MISSING
+                result[database] = MISSING
                 continue
-            server = stack.enter_context(server_in(place / "pg")) if database == "postgresql" else None
-            answer[database] = [_one_size(size, place, asked.seed, repeat, server) for size in sizes]
-    print(json.dumps(answer))
-    console().print(_table(answer))
+            server = stack.enter_context(server_in(folder / "pg")) if database == "postgresql" else None
+            result[database] = [measure_size(size, folder, arguments.seed, repeat, server) for size in sizes]
+    print(json.dumps(result))
+    console().print(_table(result))
 
 
-def _one_size(size: int, place: Path, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
+def measure_size(size: int, parent: Path, seed: int, repeat: int, server: Server | None) -> dict[str, Any]:
     console().print(f"{size:,} nodes …")
-    with tempfile.TemporaryDirectory(dir=place) as folder:
-        return compared(tree(size, seed), Path(folder), seed=seed, repeat=repeat, server=server)
+    with tempfile.TemporaryDirectory(dir=parent) as folder:
+        return compare(tree(size, seed), Path(folder), seed=seed, repeat=repeat, server=server)
 
 
-def _table(answer: dict[str, Any]) -> Table:
-    table = Table(title="From trees to every row in every table", title_justify="left")
+def _table(result: dict[str, Any]) -> Table:
+    table = Table(title="Task trees to rows in all tables", title_justify="left")
     for name in (
         "database",
         "nodes",
@@ -196,13 +200,13 @@ def _table(answer: dict[str, Any]) -> Table:
     ):
         table.add_column(name, justify="left" if name == "database" else "right")
     for database in ("sqlite", "postgresql"):
-        if answer.get(database) == MISSING:
+        if result.get(database) == MISSING:
             table.add_row(database, MISSING)
             continue
-        for each in answer.get(database, ()):
+        for each in result.get(database, ()):
             rates = [each[name]["median"] for name in _COMPARED]
-            figures = [each["nodes"], *rates, each["baseline_mb"], each["ours_mb"]]
-            table.add_row(database, *(f"{figure:,}" for figure in figures))
+            cells = [each["nodes"], *rates, each["baseline_mb"], each["ours_mb"]]
+            table.add_row(database, *(f"{figure:,}" for figure in cells))
     return table
 
 

@@ -1,11 +1,11 @@
-"""How long after a `perform` has returned it shows in the tables, when a daemon writes them.
+"""Measure the time from the return of a `perform` until its rows are visible, when a daemon writes them.
 
     python -m bench.visible            at 100, 1,000 and 10,000 events a second, 10 s each; SQLite and PostgreSQL
     python -m bench.visible --quick    at 100 and 1,000, half a second each
 
-Actions that do nothing are performed at an even rhythm with a memory for the daemon; a third process asks the database
-every 2 ms how far the tables of the episode are, which commit together with that number. Of each perform it is the time
-from its return to the first answer that has its end. Prints one JSON line: ms, and the rate that was reached.
+Actions that do nothing are performed at a fixed rate. A third process reads the episode's checkpoint every 2 ms; the
+checkpoint commits together with the rows. The latency of a perform is the time from its return to the first reading
+that includes its end. The script prints one JSON line: latencies in ms, and the rate that was reached.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
 from tests.databases import ask, server_in
 
-_LOOK_S = 0.002
+_POLL_S = 0.002
 _RATES = (100, 1_000, 10_000)
-_SHOWN = "SELECT folded, head, ended_wall_ns FROM episode ORDER BY number DESC LIMIT 1"
+_CHECKPOINT = "SELECT folded, head, ended_wall_ns FROM episode ORDER BY number DESC LIMIT 1"
 
 
 @dataclass
@@ -47,106 +47,111 @@ class NoteActionPerformable(ActionAbstract):
     async def perform(self) -> None: ...
 
 
-async def recorded(url: str, spool: Path, rate: int, seconds: float) -> dict[str, Any]:
-    """One rate: performs, and when each showed."""
+async def record(url: str, spool: Path, rate: int, seconds: float) -> dict[str, Any]:
+    """Record at one rate, and return the latencies of the performs."""
     returned_ns: list[int] = []
     performs = max(1, round(rate / 2 * seconds))
     async with Memory.open(url, spool=spool, writer="daemon") as memory:
         async with memory.episode(description="bench"):
             await NoteActionPerformable("first", 0.0).perform()
-            await memory.flush()  # the daemon has found this recorder
+            await memory.flush()  # the daemon has discovered this recorder
             first = ask(url, "SELECT head FROM episode ORDER BY number DESC LIMIT 1")[0][0]
-            watching = _start_watching(url)
-            began = time.perf_counter()
+            watcher = _start_watching(url)
+            begin_s = time.perf_counter()
             for number in range(performs):
-                due = began + number * 2 / rate
-                if (ahead_s := due - time.perf_counter()) > 0:
+                due_s = begin_s + number * 2 / rate
+                if (ahead_s := due_s - time.perf_counter()) > 0:
                     await asyncio.sleep(ahead_s)
                 await NoteActionPerformable(f"note {number}", number / 7).perform()
                 returned_ns.append(time.monotonic_ns())
-            took = time.perf_counter() - began
+            elapsed_s = time.perf_counter() - begin_s
         await memory.flush()
-        seen = json.loads((await asyncio.to_thread(watching.communicate))[0])
-    moments, shown = [each[0] for each in seen], [each[1] for each in seen]
+        readings = json.loads((await asyncio.to_thread(watcher.communicate))[0])
+    times_ns, checkpoints = [each[0] for each in readings], [each[1] for each in readings]
     last = first + 2 * performs
-    assert shown[-1] == last + 2, f"{shown[-1]} events show, {last} and two ends were recorded"
-    waited_ms = [
-        (moments[bisect_left(shown, first + 2 * number)] - at) / 1e6 for number, at in enumerate(returned_ns, 1)
+    assert checkpoints[-1] == last + 2, (
+        f"{checkpoints[-1]} events are visible, but {last} events and two ends were recorded"
+    )
+    latencies_ms = [
+        (times_ns[bisect_left(checkpoints, first + 2 * number)] - returned) / 1e6
+        for number, returned in enumerate(returned_ns, 1)
     ]
-    return {"events_per_s": round(2 * performs / took), "performs": performs, "ms": percentiles(waited_ms)}
+    return {"events_per_s": round(2 * performs / elapsed_s), "performs": performs, "ms": percentiles(latencies_ms)}
 
 
 def _start_watching(url: str) -> subprocess.Popen[str]:
-    """A process that watches already when this returns."""
+    """Start the watching process, and wait until it polls."""
     command = [sys.executable, "-m", "bench.visible", "--watch", url]
-    watching = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert watching.stdout is not None
-    assert watching.stdout.readline() == "watching\n"
-    return watching
+    watcher = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert watcher.stdout is not None
+    assert watcher.stdout.readline() == "watching\n"
+    return watcher
 
 
 async def watch(url: str) -> None:
-    """Says when more showed, until the episode has ended and all of it shows: pairs of a moment in ns and a number."""
-    seen: list[tuple[int, int]] = []
-    answer: Callable[[], Any]
+    """Poll the checkpoint until the ended episode is fully visible; print pairs of a time in ns and a checkpoint."""
+    readings: list[tuple[int, int]] = []
+    read_checkpoint: Callable[[], Any]
     if url.startswith("postgresql:"):
         connection = await asyncpg.connect(url, server_settings={"search_path": "pycrorm"})
-        asked = await connection.prepare(_SHOWN)
-        answer = asked.fetchrow
+        statement = await connection.prepare(_CHECKPOINT)
+        read_checkpoint = statement.fetchrow
     else:
         file = sqlite3.connect(f"file:{url.removeprefix('sqlite:///')}?mode=ro", uri=True, isolation_level=None)
 
-        async def answer() -> Any:
-            return file.execute(_SHOWN).fetchone()
+        async def read_checkpoint() -> Any:
+            return file.execute(_CHECKPOINT).fetchone()
 
     print("watching", flush=True)
     while True:
-        folded, head, ended = await answer()
-        if not seen or folded != seen[-1][1]:
-            seen.append((time.monotonic_ns(), folded))
+        folded, head, ended = await read_checkpoint()
+        if not readings or folded != readings[-1][1]:
+            readings.append((time.monotonic_ns(), folded))
         if ended is not None and folded == head:
             break
-        await asyncio.sleep(_LOOK_S)
-    print(json.dumps(seen))
+        await asyncio.sleep(_POLL_S)
+    print(json.dumps(readings))
 
 
-def measured(rates: tuple[int, ...], seconds: float, stack: ExitStack) -> dict[str, Any]:
+def measure(rates: tuple[int, ...], seconds: float, stack: ExitStack) -> dict[str, Any]:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
     server = stack.enter_context(server_in(folder / "pg"))
-    answer: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for database in ("sqlite", "postgresql"):
-        answer[database] = {}
+        result[database] = {}
         for rate in rates:
             console().print(f"{database}, {rate:,} events/s …")
             url = server.new_database() if database == "postgresql" else f"sqlite:///{folder}/{rate}.db"
             spool = folder / f"{database}{rate}.spool"
             daemon = start_daemon(url, spool)
             try:
-                answer[database][str(rate)] = asyncio.run(recorded(url, spool, rate, seconds))
+                result[database][str(rate)] = asyncio.run(record(url, spool, rate, seconds))
             finally:
                 stop(daemon)
-    return answer
+    return result
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="two rates, half a second each")
-    parser.add_argument("--seconds", type=float, default=10.0, help="how long each rate is held")
+    parser.add_argument("--seconds", type=float, default=10.0, help="duration of each rate")
     parser.add_argument("--watch", help=argparse.SUPPRESS)
-    asked = parser.parse_args()
-    if asked.watch:
-        asyncio.run(watch(asked.watch))
+    arguments = parser.parse_args()
+    if arguments.watch:
+        asyncio.run(watch(arguments.watch))
         return
-    rates, seconds = (_RATES[:2], 0.5) if asked.quick else (_RATES, asked.seconds)
+    rates, seconds = (_RATES[:2], 0.5) if arguments.quick else (_RATES, arguments.seconds)
     with ExitStack() as stack:
-        answer = {"bench": "visible", "seconds": seconds, **measured(rates, seconds, stack)}
-    print(json.dumps(answer))
+        result = {"bench": "visible", "seconds": seconds, **measure(rates, seconds, stack)}
+    print(json.dumps(result))
     table = Table(title="From the return of a perform to its rows, ms", title_justify="left")
-    for name in ("database", "asked, events/s", "reached", "median", "p99", "p99.9", "max"):
+    for name in ("database", "requested, events/s", "reached", "median", "p99", "p99.9", "max"):
         table.add_column(name, justify="left" if name == "database" else "right")
     for database in ("sqlite", "postgresql"):
-        for rate, found in answer[database].items():
-            table.add_row(database, rate, str(found["events_per_s"]), *(f"{each:,}" for each in found["ms"].values()))
+        for rate, figures in result[database].items():
+            table.add_row(
+                database, rate, str(figures["events_per_s"]), *(f"{each:,}" for each in figures["ms"].values())
+            )
     console().print(table)
 
 

@@ -1,7 +1,7 @@
-"""The tables in which the system of the thesis kept a task tree, as far as pick-up rollouts fill them.
+"""Tables of the system of the thesis, as far as pick-up rollouts fill them.
 
 Joined-table inheritance, one mapped class for each designator, a pose in three rows, an autoincrement key and the
-episode's metadata in every root table, no index but those of the keys. Names are the original's; the code is ours.
+episode's metadata in every root table, and indexes on keys only. The names are those of the original; the code is new.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ __all__ = [
 
 
 class NodeStatus(enum.Enum):
-    """The original's four."""
+    """The four states of the original."""
 
     CREATED = 0
     RUNNING = 1
@@ -40,13 +40,13 @@ class NodeStatus(enum.Enum):
 
 
 class BaselineBase(MappedAsDataclass, DeclarativeBase):
-    """The root: texts have 255 characters."""
+    """The declarative base; texts have 255 characters."""
 
     type_annotation_map = {str: String(255)}  # noqa: RUF012  read by the mapper
 
 
 class MetaDataRow(BaselineBase):
-    """One an episode."""
+    """Metadata, one row for each episode."""
 
     __tablename__ = "ProcessMetaData"
 
@@ -57,8 +57,8 @@ class MetaDataRow(BaselineBase):
     pycram_version: Mapped[str | None]
 
 
-class _OfAnEpisode(MappedAsDataclass):
-    """A row of a root table: has a key of its own and belongs to the metadata."""
+class _EpisodeRow(MappedAsDataclass):
+    """A row of a root table, with its own key and the metadata of its episode."""
 
     id: Mapped[int] = mapped_column(init=False, primary_key=True, autoincrement=True)
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("ProcessMetaData.id"), init=False)
@@ -84,14 +84,14 @@ class _WithObject(MappedAsDataclass):
         return relationship(init=False, foreign_keys=[cls.object_id])  # type: ignore[list-item]
 
 
-class PositionRow(_OfAnEpisode, BaselineBase):
+class PositionRow(_EpisodeRow, BaselineBase):
     __tablename__ = "Position"
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]
 
 
-class QuaternionRow(_OfAnEpisode, BaselineBase):
+class QuaternionRow(_EpisodeRow, BaselineBase):
     __tablename__ = "Quaternion"
     x: Mapped[float]
     y: Mapped[float]
@@ -99,7 +99,7 @@ class QuaternionRow(_OfAnEpisode, BaselineBase):
     w: Mapped[float]
 
 
-class PoseRow(_OfAnEpisode, BaselineBase):
+class PoseRow(_EpisodeRow, BaselineBase):
     __tablename__ = "Pose"
     time: Mapped[datetime]
     frame: Mapped[str]
@@ -109,13 +109,13 @@ class PoseRow(_OfAnEpisode, BaselineBase):
     orientation: Mapped[QuaternionRow] = relationship(init=False)
 
 
-class RobotStateRow(_OfAnEpisode, _WithPose, BaselineBase):
+class RobotStateRow(_EpisodeRow, _WithPose, BaselineBase):
     __tablename__ = "RobotState"
     torso_height: Mapped[float]
     type: Mapped[ObjectType]
 
 
-class ObjectRow(_OfAnEpisode, _WithPose, BaselineBase):
+class ObjectRow(_EpisodeRow, _WithPose, BaselineBase):
     __tablename__ = "Object"
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012
     dtype: Mapped[str] = mapped_column(init=False)
@@ -123,13 +123,13 @@ class ObjectRow(_OfAnEpisode, _WithPose, BaselineBase):
     name: Mapped[str]
 
 
-class DesignatorRow(_OfAnEpisode, BaselineBase):
+class DesignatorRow(_EpisodeRow, BaselineBase):
     __tablename__ = "Designator"
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Designator"}  # noqa: RUF012
     dtype: Mapped[str] = mapped_column(init=False)
 
 
-class TaskTreeNodeRow(_OfAnEpisode, BaselineBase):
+class TaskTreeNodeRow(_EpisodeRow, BaselineBase):
     __tablename__ = "TaskTreeNode"
     start_time: Mapped[datetime]
     end_time: Mapped[datetime | None]
@@ -216,4 +216,4 @@ LEAVES: dict[str, type[DesignatorRow]] = {
     each.__tablename__: each
     for each in (NavigateRow, FaceAtRow, LookAtRow, PickUpRow, MoveRow, LookingRow, MoveTCPRow, MoveGripperRow)
 }
-"""By the name that is the table's and the designator's."""
+"""Mapped classes by their name, which table and designator share."""

@@ -1,1 +1,1 @@
-"""Faults that are made, one file a kind of thing that breaks; the truth is kept outside of what is broken."""
+"""Faults to inject, one file for each part that fails. Acknowledged events are noted outside of that part."""

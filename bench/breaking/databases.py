@@ -1,4 +1,4 @@
-"""The database and the way to it: lost replies, cut connections, a server killed under load, cancellation."""
+"""Faults of the database and of the connection: lost replies, cut connections, killed servers, cancelled appends."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ __all__ = [
     "cancelled_appends",
 ]
 
-_QUICKLY = Backoff(first_s=0.002, longest_s=0.02)
+_SHORT_BACKOFF = Backoff(first_s=0.002, longest_s=0.02)
 _BATCH = 100
 _PAGE = 4096
 _STORED = (
@@ -56,12 +56,12 @@ def _events(records: Sequence[Record]) -> list[Event]:
     ]
 
 
-def _found(url: str) -> list[Event]:
+def _stored_events(url: str) -> list[Event]:
     return [(name, sequence, payload) for name, sequence, payload in ask(url, _STORED)]
 
 
 def _interleaved(batches: int) -> list[Record]:
-    """Batches of two episodes."""
+    """Return records in batches; each batch holds events of two episodes."""
     half = _BATCH // 2
     records: list[Record] = []
     for first in range(1, batches * half + 1, half):
@@ -70,15 +70,15 @@ def _interleaved(batches: int) -> list[Record]:
     return records
 
 
-def _compared(outcome: Outcome, rounds: int, records: list[Record], url: str) -> None:
-    outcome.compare(_events(records), _found(url))
+def _compare(outcome: Outcome, rounds: int, records: list[Record], url: str) -> None:
+    outcome.compare(_events(records), _stored_events(url))
     outcome.rounds += rounds - 1
 
 
 def lost_replies(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """Every COMMIT is done, and its reply is lost; then the batch is appended again."""
+    """Execute each COMMIT, drop its reply, and append the same batch again."""
 
-    async def swallowed(rounds: int, step: Step, url: str, records: list[Record]) -> None:
+    async def append_all(rounds: int, step: Step, url: str, records: list[Record]) -> None:
         async with proxy_before(server.folder) as proxy:
             log = await EventLog.open(_through(proxy, url), create=True)
             for first in range(0, rounds * _BATCH, _BATCH):
@@ -93,22 +93,22 @@ def lost_replies(server: Server) -> Callable[[int, random.Random, Path, Step], O
     def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
         del rng, folder
         outcome, url, records = Outcome(note="PostgreSQL behind a proxy"), server.new_database(), _interleaved(rounds)
-        asyncio.run(swallowed(rounds, step, url, records))
-        _compared(outcome, rounds, records, url)
+        asyncio.run(append_all(rounds, step, url, records))
+        _compare(outcome, rounds, records, url)
         return outcome
 
     return run
 
 
 def cut_connections(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """A writer's connection ends after a random number of bytes, is reset or closed, again and again."""
+    """Close or reset a writer's connection repeatedly, at once or after a random number of bytes."""
 
-    async def drained(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> None:
+    async def drain_all(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> None:
         async with proxy_before(server.folder) as proxy:
             log = await EventLog.open(_through(proxy, url), create=True, busy_timeout_s=2.0)
             source = KeptSource(records, closed=True)
             settings = Settings(batch_events_max=_BATCH)
-            drain = Drain(source, log.append, settings=settings, backoff=_QUICKLY)
+            drain = Drain(source, log.append, settings=settings, backoff=_SHORT_BACKOFF)
             running = asyncio.create_task(drain.run())
             for _ in range(rounds):
                 retries = drain.state.retries
@@ -123,17 +123,18 @@ def cut_connections(server: Server) -> Callable[[int, random.Random, Path, Step]
         del folder
         outcome, url = Outcome(note="PostgreSQL behind a proxy"), server.new_database()
         records = _interleaved(rounds * 4)
-        asyncio.run(drained(rounds, rng, step, url, records))
-        _compared(outcome, rounds, records, url)
+        asyncio.run(drain_all(rounds, rng, step, url, records))
+        _compare(outcome, rounds, records, url)
         return outcome
 
     return run
 
 
 def start_again(server: Server) -> None:
-    """Until it answers: on a busy machine that may be after the patience of the command that starts it.
+    """Start the server and wait until it answers.
 
-    That gives up after ten seconds, and asserts that a server which is there is ready.
+    On a busy machine the start takes longer than the ten seconds that `Server.start` waits, and its assertion that the
+    server is ready fails; therefore it is repeated.
     """
     deadline = time.monotonic() + 300
     while True:
@@ -149,14 +150,14 @@ def start_again(server: Server) -> None:
 
 
 def ended_servers(server: Server, *, killed: bool) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """The server ends while a writer appends, and comes back: killed with all its processes, or stopped for a while."""
+    """Kill all processes of the server, or stop it for a while, while a writer appends; then start it again."""
 
-    async def drained(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> int:
+    async def drain_all(rounds: int, rng: random.Random, step: Step, url: str, records: list[Record]) -> int:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True, busy_timeout_s=2.0)
         source = KeptSource(records, closed=True)
-        drain = Drain(source, log.append, settings=Settings(batch_events_max=_BATCH), backoff=_QUICKLY)
+        drain = Drain(source, log.append, settings=Settings(batch_events_max=_BATCH), backoff=_SHORT_BACKOFF)
         running = asyncio.create_task(drain.run())
-        forgotten = 0
+        missing = 0
         for round_ in range(1, rounds + 1):
             while drain.state.appended < round_ * len(records) // (rounds + 1):  # noqa: ASYNC110
                 await asyncio.sleep(0.001)
@@ -166,42 +167,42 @@ def ended_servers(server: Server, *, killed: bool) -> Callable[[int, random.Rand
             await asyncio.sleep(0.0 if killed else rng.random() * 0.3)
             await asyncio.to_thread(start_again, server)
             [[count]] = await asyncio.to_thread(ask, url, "SELECT count(*) FROM event")
-            forgotten += max(0, acknowledged - count)
+            missing += max(0, acknowledged - count)
             step()
         await running
         await log.close()
-        return forgotten
+        return missing
 
     def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
         del folder
         url, records = server.new_database(), _interleaved(rounds * 40)
         outcome = Outcome(
-            note="PostgreSQL: SIGKILL of every process of it" if killed else "PostgreSQL: stopped at once"
+            note="PostgreSQL: SIGKILL of all server processes" if killed else "PostgreSQL: immediate shutdown"
         )
-        outcome.lost += asyncio.run(drained(rounds, rng, step, url, records))
-        _compared(outcome, rounds, records, url)
+        outcome.lost += asyncio.run(drain_all(rounds, rng, step, url, records))
+        _compare(outcome, rounds, records, url)
         return outcome
 
     return run
 
 
 def locked_files(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """Another program holds the lock of the SQLite file for longer than a writer waits, again and again."""
+    """Lock the SQLite file from another connection, repeatedly, for longer than a writer waits."""
     outcome = Outcome(note="SQLite: BEGIN EXCLUSIVE by another connection")
     url, records = f"sqlite:///{folder}/memory.db", _interleaved(rounds * 4)
 
-    async def drained() -> None:
+    async def drain_all() -> None:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True, busy_timeout_s=0.005)
         drain = Drain(
             KeptSource(records, closed=True),
             log.append,
             settings=Settings(batch_events_max=_BATCH),
-            backoff=_QUICKLY,
+            backoff=_SHORT_BACKOFF,
         )
         other = sqlite3.connect(folder / "memory.db", isolation_level=None, timeout=300, check_same_thread=False)
         running = None
         for _ in range(rounds):
-            # In a thread: who holds the lock meanwhile needs this loop to let go of it.
+            # Execute it in a thread: the writer may hold the lock, and it needs this loop to release it.
             await asyncio.to_thread(other.execute, "BEGIN EXCLUSIVE")
             running = running or asyncio.create_task(drain.run())
             retries = drain.state.retries
@@ -217,24 +218,24 @@ def locked_files(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
         other.close()
         await log.close()
 
-    asyncio.run(drained())
-    _compared(outcome, rounds, records, url)
+    asyncio.run(drain_all())
+    _compare(outcome, rounds, records, url)
     return outcome
 
 
 def full_disks(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """The disk that holds the database is full, and has room again, while a writer appends."""
+    """Fill the disk of the database and free it again, while a writer appends."""
     outcome = Outcome(note="SQLite on a tmpfs that another file fills")
     url, records = f"sqlite:///{folder}/disk/memory.db", _interleaved(rounds * 4)
     size = 2**21 + 2 * sum(len(each.payload) + 200 for each in records)
 
-    async def drained() -> None:
+    async def drain_all() -> None:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True)
         drain = Drain(
             KeptSource(records, closed=True),
             log.append,
             settings=Settings(batch_events_max=_BATCH),
-            backoff=_QUICKLY,
+            backoff=_SHORT_BACKOFF,
         )
         running = None
         ballast = folder / "disk" / "ballast"
@@ -257,15 +258,15 @@ def full_disks(rounds: int, rng: random.Random, folder: Path, step: Step) -> Out
 
     with small_disk(folder / "disk", f"{size}") as mounted:
         if not mounted:
-            outcome.note = "not made: there is no right to mount a small disk here"
+            outcome.note = "skipped: no permission to mount a small disk"
             return outcome
-        asyncio.run(drained())
-        _compared(outcome, rounds, records, url)
+        asyncio.run(drain_all())
+        _compare(outcome, rounds, records, url)
     return outcome
 
 
 def cancelled_appends(server: Server) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """An append is cancelled at its first await, its second, its third …, on SQLite and on PostgreSQL."""
+    """Cancel an append at its first await, its second, its third …, on SQLite and on PostgreSQL."""
 
     def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
         del rng
@@ -274,23 +275,23 @@ def cancelled_appends(server: Server) -> Callable[[int, random.Random, Path, Ste
         while outcome.rounds < rounds:
             file = Path(tempfile.mkdtemp(dir=folder)) / "memory.db"
             urls = (f"sqlite:///{file}", server.new_database())
-            awaits += [asyncio.run(_cancelled_everywhere(outcome, url, step)) for url in urls]
+            awaits += [asyncio.run(_cancel_at_each_await(outcome, url, step)) for url in urls]
         outcome.note = f"{min(awaits)} to {max(awaits)} awaits each time; whole batches or nothing"
         return outcome
 
     return run
 
 
-async def _cancelled_everywhere(outcome: Outcome, url: str, step: Step) -> int:
+async def _cancel_at_each_await(outcome: Outcome, url: str, step: Step) -> int:
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    known = at = 0
+    stored = awaits = 0
     cancelled = True
     while cancelled:
-        at += 1
-        batch = run_of(episode(1), known + 1, known + _BATCH)
+        awaits += 1
+        batch = run_of(episode(1), stored + 1, stored + _BATCH)
         appending = asyncio.create_task(log.append(batch))
         awaited: list[object] = []
-        while len(awaited) < at and not appending.done():
+        while len(awaited) < awaits and not appending.done():
             waiter = getattr(appending, "_fut_waiter", None)
             if waiter is not None and waiter not in awaited[-1:]:
                 awaited.append(waiter)
@@ -298,12 +299,14 @@ async def _cancelled_everywhere(outcome: Outcome, url: str, step: Step) -> int:
         appending.cancel()
         await asyncio.wait([appending])
         cancelled = appending.cancelled()
-        head = await log.append(batch[:1]) or (await log.episodes())[0].head  # nobody holds what it needs
-        known += _BATCH if head == known + _BATCH or not cancelled else 1
-        outcome.compare(_events(run_of(episode(1), 1, known)), _found(url))
+        head = (
+            await log.append(batch[:1]) or (await log.episodes())[0].head
+        )  # raises if the cancelled append still holds a lock
+        stored += _BATCH if head == stored + _BATCH or not cancelled else 1
+        outcome.compare(_events(run_of(episode(1), 1, stored)), _stored_events(url))
         step()
     await log.close()
-    return at
+    return awaits
 
 
 def _through(proxy: Proxy, url: str) -> DatabaseAddress:

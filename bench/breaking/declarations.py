@@ -1,4 +1,4 @@
-"""Declarations of other programs: good types among hostile ones, written straight into the log by the append port."""
+"""Append declarations of other programs to the log: valid types among hostile ones."""
 
 from __future__ import annotations
 
@@ -47,9 +47,9 @@ _NO_DECLARATIONS = (b"[]", b"{", b"5", b'{"kind":"action"}', b'"\\u0000"', b"no 
 
 
 def foreign_declarations(new: Callable[[Path], str]) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """Each round a memory of its own: all that good types recorded must be in its tables, live and rebuilt."""
+    """Fill one memory a round; the events of valid types must be in its tables, after live folding and a rebuild."""
 
-    def broken(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
         outcome = Outcome()
         parked = 0
         for number in range(rounds):
@@ -60,75 +60,75 @@ def foreign_declarations(new: Callable[[Path], str]) -> Callable[[int, random.Ra
         outcome.note = f"{parked} episodes of hostile types parked with a reason"
         return outcome
 
-    return broken
+    return run
 
 
 async def _round(url: str, rng: random.Random, outcome: Outcome) -> int:
-    """Episodes of good and hostile types in random order; how many were parked."""
-    good = [*_good(rng)]
-    episodes = [*good, *_hostile(rng, good)]
+    """Append episodes of valid and hostile types in random order; return the number of parked episodes."""
+    valid = [*_valid(rng)]
+    episodes = [*valid, *_hostile(rng, valid)]
     rng.shuffle(episodes)
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     try:
         projector = Projector(log)
         await projector.open()
-        await log.append([*map(_declared, rng.sample(good, len(good)))])
+        await log.append([*map(_declared, rng.sample(valid, len(valid)))])
         expected: list[Event] = []
-        left = [*enumerate(episodes, 1)]
-        while left:
+        remaining = [*enumerate(episodes, 1)]
+        while remaining:
             count = rng.randint(3, 12)
-            some, left = left[:count], left[count:]
-            await log.append([each for number, payload in some for each in _episode(number, payload)])
+            chunk, remaining = remaining[:count], remaining[count:]
+            await log.append([each for number, payload in chunk for each in _episode(number, payload)])
             await projector.catch_up()
-            expected += [_event(number, payload) for number, payload in some if payload in good]
-        stopped = await _compared(log, outcome, expected, good)
+            expected += [_event(number, payload) for number, payload in chunk if payload in valid]
+        parked = await _compare_and_verify(log, outcome, expected, valid)
         await rebuild_memory(url)
-        again = await _compared(log, outcome, expected, good)
-        assert again == stopped, f"live {stopped} episodes are parked, rebuilt {again}"
-        outcome.rounds -= 1  # it was one memory
-        return stopped
+        rebuilt = await _compare_and_verify(log, outcome, expected, valid)
+        assert rebuilt == parked, f"{parked} episodes are parked after live folding, {rebuilt} after the rebuild"
+        outcome.rounds -= 1  # both comparisons belong to one round
+        return parked
     finally:
         await log.close()
 
 
-async def _compared(log: EventLog, outcome: Outcome, expected: list[Event], good: list[bytes]) -> int:
-    """What the views show of good types; and that the memory is whole. How many episodes are parked."""
-    outcome.compare(expected, await asyncio.to_thread(_found, str(log.address.to_type), good))
-    found = await verify(log)
-    assert (found.damage, found.drift) == (0, 0), f"{found.damages[:1]} {found.differences[:1]}"
-    assert all(each.reason for each in found.stopped)
-    return len(found.stopped)
+async def _compare_and_verify(log: EventLog, outcome: Outcome, expected: list[Event], valid: list[bytes]) -> int:
+    """Compare the rows of valid types, and verify the memory; return the number of parked episodes."""
+    outcome.compare(expected, await asyncio.to_thread(_rows, str(log.address.to_type), valid))
+    result = await verify(log)
+    assert (result.damage, result.drift) == (0, 0), f"{result.damages[:1]} {result.differences[:1]}"
+    assert all(each.reason for each in result.stopped)
+    return len(result.stopped)
 
 
 def _event(number: int, payload: bytes) -> Event:
-    """What the tables must show of the only node of this episode."""
+    """Return the row that the tables must contain for the only node of this episode."""
     script = Script(number)
     return episode_text(script.episode), 1, f"{len(_columns(payload))} values {number}"
 
 
-def _found(url: str, good: list[bytes]) -> list[Event]:
-    found: list[Event] = []
-    for payload in good:
-        declared = declaration_of(payload)
+def _rows(url: str, valid: list[bytes]) -> list[Event]:
+    events: list[Event] = []
+    for payload in valid:
+        declaration = declaration_of(payload)
         columns = ", ".join(f'leaf."{each}"' for each in _columns(payload))
         rows = ask(
             url,
-            f'SELECT uuid, {columns} FROM "{declared.table}" AS leaf JOIN designator ON designator.id = leaf.id'
+            f'SELECT uuid, {columns} FROM "{declaration.table}" AS leaf JOIN designator ON designator.id = leaf.id'
             " JOIN process_metadata ON process_metadata.id = designator.process_metadata_id"
-            f" WHERE dtype = '{declared.dtype}'",
+            f" WHERE dtype = '{declaration.dtype}'",
         )
         for uuid, *values in rows:
-            same = str(values[0]) if len({*values}) == 1 else str(values)
-            found.append((uuid, 1, f"{len(values)} values {same}"))
-    return found
+            text = str(values[0]) if len({*values}) == 1 else str(values)
+            events.append((uuid, 1, f"{len(values)} values {text}"))
+    return events
 
 
 def _columns(payload: bytes) -> list[str]:
     return [each.column for each in declaration_of(payload).fields if each.type == "integer"]
 
 
-def _good(rng: random.Random) -> Iterator[bytes]:
-    """As the hooks declare classes, also with names that a database has its own use for."""
+def _valid(rng: random.Random) -> Iterator[bytes]:
+    """Yield declarations as the hooks make them, also with names that are keywords of a database."""
     yield _payload(rng, "RootAction", ())
     for number in range(rng.randint(3, 6)):
         name = "".join(rng.choices(string.ascii_lowercase, k=rng.choice([3, 20, 44, 70, 200])))
@@ -145,25 +145,25 @@ def _payload(rng: random.Random, dtype: str, bases: tuple[str, ...]) -> bytes:
     return encode(DesignatorTypeDeclared("action", dtype, table_name(dtype), bases=bases, fields=tuple(fields)))
 
 
-def _hostile(rng: random.Random, good: list[bytes]) -> Iterator[bytes]:
-    """Past every check of ours."""
+def _hostile(rng: random.Random, valid: list[bytes]) -> Iterator[bytes]:
+    """Yield declarations that the hooks would refuse."""
     field = {"name": "size", "column": "size", "type": "real", "slot": 2}
     for number in range(rng.randint(3, 8)):
-        known = msgspec.to_builtins(declaration_of(rng.choice(good)))
-        one: dict[str, Any] = {"kind": "action", "dtype": f"Evil{number}Action", "table": f"evil{number}_action"}
-        kinds: list[dict[str, Any]] = [
-            one | {"fields": [field | dict.fromkeys(("name", "column"), rng.choice(_CRAFTED))]},
-            one | {"fields": [field | {"name": f"f{n}", "column": f"f{n}", "slot": n} for n in range(3_000)]},
-            one | {"fields": [field, field | {"name": "SIZE", "column": "SIZE", "slot": 3}]},
-            one | {"fields": [field | {"slot": rng.choice([-1, 0, 1, 32, 2**40])}]},
-            one | {"dtype": rng.choice(_DTYPES)},
-            one | {"table": rng.choice(["pose", "Task_Tree_Node", "pose__7", "pycrorm_log", "a\0", "", "t" * 99])},
-            one | {"bases": [f"Base{n}" for n in range(2_000)]},
-            one | {"table": rng.choice([known["table"], known["table"].upper()])},
-            known | {"kind": rng.choice(["motion", "language", "root"])},
-            known | {"fields": [each | {"type": "text"} for each in known["fields"]]},
+        existing = msgspec.to_builtins(declaration_of(rng.choice(valid)))
+        evil: dict[str, Any] = {"kind": "action", "dtype": f"Evil{number}Action", "table": f"evil{number}_action"}
+        variants: list[dict[str, Any]] = [
+            evil | {"fields": [field | dict.fromkeys(("name", "column"), rng.choice(_CRAFTED))]},
+            evil | {"fields": [field | {"name": f"f{n}", "column": f"f{n}", "slot": n} for n in range(3_000)]},
+            evil | {"fields": [field, field | {"name": "SIZE", "column": "SIZE", "slot": 3}]},
+            evil | {"fields": [field | {"slot": rng.choice([-1, 0, 1, 32, 2**40])}]},
+            evil | {"dtype": rng.choice(_DTYPES)},
+            evil | {"table": rng.choice(["pose", "Task_Tree_Node", "pose__7", "pycrorm_log", "a\0", "", "t" * 99])},
+            evil | {"bases": [f"Base{n}" for n in range(2_000)]},
+            evil | {"table": rng.choice([existing["table"], existing["table"].upper()])},
+            existing | {"kind": rng.choice(["motion", "language", "root"])},
+            existing | {"fields": [each | {"type": "text"} for each in existing["fields"]]},
         ]
-        yield rng.choice([*map(msgspec.json.encode, kinds), rng.choice(_NO_DECLARATIONS)])
+        yield rng.choice([*map(msgspec.json.encode, variants), rng.choice(_NO_DECLARATIONS)])
 
 
 def _declared(payload: bytes) -> Record:
@@ -171,14 +171,14 @@ def _declared(payload: bytes) -> Record:
 
 
 def _episode(number: int, payload: bytes) -> list[Record]:
-    """Its declaration, and an episode that performs this type once, with the number in every field."""
+    """Return the declaration, and an episode that performs this type once, with the number in every field."""
     script = Script(number)
     script.put(EpisodeStarted("foreign", "bench", "host", "1", "3.11"))
     try:
-        given = {each.name: number for each in declaration_of(payload).fields if each.type == "integer"}
+        parameters = {each.name: number for each in declaration_of(payload).fields if each.type == "integer"}
     except (ValueError, msgspec.DecodeError):
-        given = {}
-    node = script.put(NodeStarted("action", None, fingerprint(payload), given))
+        parameters = {}
+    node = script.put(NodeStarted("action", None, fingerprint(payload), parameters))
     script.put(NodeEnded(node, "SUCCEEDED"))
     script.put(EpisodeEnded("SUCCEEDED"))
     return [_declared(payload), *script.records]

@@ -1,4 +1,4 @@
-"""A disk that fills up under a recorder, on each kind of file system, and a spool that is deleted under one."""
+"""Fill the disk of a recorder, on each kind of file system, and delete the spool of a running recorder."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from itertools import count
 from pathlib import Path
 from typing import Final
 
+from bench.breaking.child_process import ChildProcess
 from bench.breaking.files import events_of, put
 from bench.breaking.images import NOT_MADE, DiskImage
 from bench.breaking.outcome import Event, Outcome, Step
-from bench.breaking.speaking import Speaker
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
@@ -30,28 +30,28 @@ from tests.queue.test_deleted_files import DELETIONS
 __all__ = ["FullDisksOn", "deleted_spools"]
 
 _SIZE: Final = {"ext4": "64M", "xfs": "320M", "btrfs": "128M"}
-"""As small as its mkfs makes it."""
+"""The smallest size that each mkfs accepts."""
 _SETTINGS: Final = Settings(
     sync_interval_ms=1, segment_bytes=2**17, spool_bytes_max=2**24, spool_reserve_bytes=2**18, record_bytes_max=2**12
 )
 _LONGEST_LIFE_S: Final = 0.2
-_UNDISTURBED: Final = 25
-"""So many events are safe before the first file goes."""
-_DELETIONS_APART: Final = 40
-"""After how many puts the files go once more, on the average."""
+_EVENTS_BEFORE_DELETION: Final = 25
+"""Events that are synced before the first deletion."""
+_PUTS_PER_DELETION: Final = 40
+"""Mean number of puts between two deletions."""
 
 
 # --- a full disk ---------------------------------------------------------------------------------------------------
 
 
 class FullDisksOn:
-    """The fault on one kind of file system: a full disk is an error for a put, and never the end of the process."""
+    """Fill a disk of one kind of file system: a put must fail with an error, and the process must survive."""
 
     def __init__(self, kind: str) -> None:
         self._kind = kind
 
     def __call__(self, rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-        outcome = Outcome(note=f"{self._kind} on a loop image, filled up to the last block under a recorder")
+        outcome = Outcome(note=f"{self._kind} on a loop image, filled to the last block while a recorder puts events")
         try:
             if not DiskImage.can_make(self._kind):
                 raise FileNotFoundError(self._kind)
@@ -69,31 +69,33 @@ class FullDisksOn:
                     _filled(outcome, disk.root, rng)
                 step()
         if self._kind == "btrfs":
-            outcome.note = "a spool on btrfs is refused when it is opened; the events are of one beside the full btrfs"
+            outcome.note = "a spool on btrfs is refused; the events are of a second recorder on another disk"
         return outcome
 
 
 def _filled(outcome: Outcome, root: Path, rng: random.Random) -> None:
     spool = root / "spool"
-    recorder = Speaker(_record_on_a_full_disk, str(spool), rng.randrange(2**31))
+    recorder = ChildProcess(_record_on_a_full_disk, str(spool), rng.randrange(2**31))
     try:
         recorder.wait_for("ready")
         _fill(root)
         recorder.wait_for("full")
         time.sleep(rng.random() * _LONGEST_LIFE_S / 4)
-        said = recorder.kill()  # raises if it ended by itself, as a SIGBUS ends it
+        lines = recorder.kill()  # raises if the recorder ended by itself, for example by SIGBUS
     finally:
         recorder.stop()
-    put_before = [(episode_text(_EPISODE), int(words[1]), words[2]) for words in said if words[0] == "put"]
+    put_before = [(episode_text(_EPISODE), int(words[1]), words[2]) for words in lines if words[0] == "put"]
     (root / "filler").unlink()
-    found = [each for folder in Spool(spool).recorders() for each in events_of(asyncio.run(_recovered(folder.path)))]
-    trying = [(episode_text(_EPISODE), len(put_before) + 1, each[2]) for each in found[len(put_before) :][:1]]
-    outcome.compare(put_before, found, put=trying)
+    recovered = [
+        each for folder in Spool(spool).recorders() for each in events_of(asyncio.run(_recovered(folder.path)))
+    ]
+    attempted = [(episode_text(_EPISODE), len(put_before) + 1, each[2]) for each in recovered[len(put_before) :][:1]]
+    outcome.compare(put_before, recovered, put=attempted)
     shutil.rmtree(spool)
 
 
 def _fill(root: Path) -> None:
-    """Takes the last block, without writing any."""
+    """Allocate all free blocks of the disk without writing to them."""
     with (root / "filler").open("wb") as file:
         end, size = 0, 2**26
         while size >= 2**12:
@@ -111,38 +113,38 @@ def _refused(outcome: Outcome, root: Path, folder: Path, rng: random.Random) -> 
         if "lies on btrfs" not in str(refusal):
             raise
     else:
-        outcome.changed += 1
+        outcome.corrupted += 1
     queue = _queue(folder / "spool")
     _fill(root)
-    sure = [put(queue, "EpisodeStarted", b"{}")]
-    sure += [put(queue, "NodeStarted", rng.randbytes(40).hex().encode()) for _ in range(rng.randrange(10, 60))]
+    expected = [put(queue, "EpisodeStarted", b"{}")]
+    expected += [put(queue, "NodeStarted", rng.randbytes(40).hex().encode()) for _ in range(rng.randrange(10, 60))]
     queue.release()
-    outcome.compare(sure, events_of(asyncio.run(_recovered(queue.folder))))
+    outcome.compare(expected, events_of(asyncio.run(_recovered(queue.folder))))
     shutil.rmtree(folder / "spool")
     (root / "filler").unlink()
 
 
 def _record_on_a_full_disk(spool: str, seed: int) -> None:
-    """Puts until it may not, tries again for ever, and says what it put."""
+    """Put events and print each one; when the disk is full, print `full` once and retry without end."""
     rng = random.Random(seed)
     queue = _queue(Path(spool))
-    _say_put(put(queue, "EpisodeStarted", b"{}"))
-    said_full = False
+    _print_put(put(queue, "EpisodeStarted", b"{}"))
+    is_full = False
     for number in count():
         try:
-            _say_put(put(queue, "NodeStarted", rng.randbytes(rng.randrange(1, 900)).hex().encode()))
+            _print_put(put(queue, "NodeStarted", rng.randbytes(rng.randrange(1, 900)).hex().encode()))
         except SpoolFull:
-            if not said_full:
+            if not is_full:
                 print("full", flush=True)
-            said_full = True
+            is_full = True
             time.sleep(0.001)
         if number == 20:
             print("ready", flush=True)
         if 20 < number < 200:
-            time.sleep(0.0005)  # the disk fills up meanwhile
+            time.sleep(0.0005)  # slow enough that the disk is filled in the meantime
 
 
-def _say_put(event: Event) -> None:
+def _print_put(event: Event) -> None:
     print("put", event[1], event[2], flush=True)
 
 
@@ -150,47 +152,52 @@ def _say_put(event: Event) -> None:
 
 
 def deleted_spools(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """Files go at random under a recorder that is killed: what it was told is safe is there, or named as lost."""
-    outcome = Outcome(note="folder, segment, lock or spool deleted, replaced or renamed; told: named as lost")
+    """Delete files at random under a recorder and kill it: synced events exist or are reported as lost."""
+    outcome = Outcome(note="folder, segment, lock or spool deleted, replaced or renamed")
     for _ in range(rounds):
         place = Path(tempfile.mkdtemp(dir=folder))
-        recorder = Speaker(_record_while_files_go, str(place / "spool"), rng.randrange(2**31))
+        recorder = ChildProcess(_record_during_deletions, str(place / "spool"), rng.randrange(2**31))
         try:
             recorder.wait_for("synced")
             time.sleep(rng.random() * _LONGEST_LIFE_S)
-            said = recorder.kill()
+            lines = recorder.kill()
         finally:
             recorder.stop()
-        unnoticed = said[-1][0] == "deleting"
-        _compare(outcome, said, asyncio.run(_folders(place / "spool", unnoticed=unnoticed)))
+        is_unnoticed = lines[-1][0] == "deleting"
+        _compare(outcome, lines, asyncio.run(_folders(place / "spool", unnoticed=is_unnoticed)))
         shutil.rmtree(place)
         step()
     return outcome
 
 
-def _compare(outcome: Outcome, said: list[list[str]], folders: list[tuple[list[Record], bool]]) -> None:
-    """`folders` in the order of recovery: the records of each, and whether an episode is open in it."""
-    safe, lost, deleting = 0, set[int](), False
-    for word, *numbers in said:
+def _compare(outcome: Outcome, lines: list[list[str]], folders: list[tuple[list[Record], bool]]) -> None:
+    """Count one round. `folders` holds, in order of recovery, the records of each and if an episode is open in it."""
+    synced, lost, deleting = 0, set[int](), False
+    for word, *numbers in lines:
         if word == "synced":
-            safe, deleting = int(numbers[0]), False
+            synced, deleting = int(numbers[0]), False
         elif word == "lost":
             lost |= set(range(int(numbers[0]), int(numbers[1]) + 1))
         else:
             deleting = True
-    if deleting:  # killed before it could notice: no process is left that could say so
-        safe = 0
-    found: dict[int, Event] = {}
+    if deleting:  # killed before it could notice the deletion and report it
+        synced = 0
+    by_sequence: dict[int, Event] = {}
     for number, (records, is_open) in enumerate(folders):
-        found |= {each[1]: each for each in events_of(records)}
-        outcome.changed += is_open and any(later for later, _ in folders[number + 1 :])  # ended, though it goes on
-    whole = [_event(sequence) for sequence in range(1, safe + 1)]
-    last = max(found, default=0)
-    gone = [each for each in range(1, max(last, safe) + 1) if each not in found and (deleting or each in lost)]
-    outcome.told += sum(each <= safe for each in gone)
-    # What is named stands in its place, so that the order of the others is compared all the same.
-    there = found | {each: _event(each) for each in gone}
-    outcome.compare(whole, [there[each] for each in sorted(there)], put=[_event(each) for each in range(1, last + 1)])
+        by_sequence |= {each[1]: each for each in events_of(records)}
+        # A later folder continues an episode that recovery closed.
+        outcome.corrupted += is_open and any(later for later, _ in folders[number + 1 :])
+    expected = [_event(sequence) for sequence in range(1, synced + 1)]
+    last = max(by_sequence, default=0)
+    missing = [
+        each for each in range(1, max(last, synced) + 1) if each not in by_sequence and (deleting or each in lost)
+    ]
+    outcome.reported += sum(each <= synced for each in missing)
+    # Insert the reported events at their positions, so that the order of the others can be compared.
+    events = by_sequence | {each: _event(each) for each in missing}
+    outcome.compare(
+        expected, [events[each] for each in sorted(events)], put=[_event(each) for each in range(1, last + 1)]
+    )
 
 
 def _event(sequence: int) -> Event:
@@ -207,13 +214,13 @@ async def _folders(spool: Path, *, unnoticed: bool = False) -> list[tuple[list[R
         except SpoolDamaged:
             if not unnoticed:
                 raise
-            continue  # reported, and so not silent: of its files some are gone, and no process has seen that
+            continue  # some files are missing, and no process noticed it before; the damage is reported, not silent
         recovered.append((records, bool(queue.lost)))
         queue.release()
     return recovered
 
 
-def _record_while_files_go(spool: str, seed: int) -> None:
+def _record_during_deletions(spool: str, seed: int) -> None:
     rng = random.Random(seed)
     settings = Settings(
         sync_interval_ms=rng.choice((1, 1000)),
@@ -224,23 +231,23 @@ def _record_while_files_go(spool: str, seed: int) -> None:
     )
     queue = _queue(Path(spool), settings)
     queue.put_nowait(started(), _payload(1))
-    asyncio.run(_go_on(queue, rng))
+    asyncio.run(_put_and_delete(queue, rng))
 
 
-async def _go_on(queue: RecorderQueue, rng: random.Random) -> None:
+async def _put_and_delete(queue: RecorderQueue, rng: random.Random) -> None:
     reported = 0
     for sequence in count(2):
         while True:
             try:
                 queue.put_nowait(node(), _payload(sequence))
                 break
-            except SpoolUnavailable:  # its segments are full, and no folder was made yet
+            except SpoolUnavailable:  # its segments are full, and the new folder does not exist yet
                 await asyncio.sleep(0.001)
-        if sequence > _UNDISTURBED and rng.random() < 1 / _DELETIONS_APART:
+        if sequence > _EVENTS_BEFORE_DELETION and rng.random() < 1 / _PUTS_PER_DELETION:
             print("deleting", flush=True)
-            with suppress(OSError):  # it is moving at this moment
+            with suppress(OSError):  # the recorder moves to a new folder at this moment
                 rng.choice(DELETIONS)(queue)
-        if sequence == _UNDISTURBED or (sequence > _UNDISTURBED and rng.random() < 0.2):
+        if sequence == _EVENTS_BEFORE_DELETION or (sequence > _EVENTS_BEFORE_DELETION and rng.random() < 0.2):
             with suppress(SpoolUnavailable):
                 await queue.synced_to()
                 for line in queue.lost[reported:]:
@@ -262,6 +269,6 @@ def _queue(spool: Path, settings: Settings = _SETTINGS) -> RecorderQueue:
 
 
 async def _recovered(folder: Path) -> list[Record]:
-    """Of the only recorder there."""
+    """Recover the only recorder of the spool, and return its records."""
     [(records, _)] = await _folders(folder.parent)
     return records

@@ -1,4 +1,4 @@
-"""The queue's files and their disk: torn writes, flipped bits, power cuts, failed syncs, a full disk, clocks."""
+"""Faults of the queue's files and disk: torn writes, flipped bits, power cuts, failed syncs, full disks, clocks."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
 
 
 def events_of(records: Iterable[Record]) -> list[Event]:
-    """Without the ends that recovery computes."""
+    """Return the events of the records, without the `EpisodeEnded` events that recovery computes."""
     return [
         (episode_text(each.episode), each.sequence, each.payload.hex())
         for each in records
@@ -51,31 +51,31 @@ def events_of(records: Iterable[Record]) -> list[Event]:
 
 
 def torn_writes(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """What was not synced is torn at every byte, once into zeros and once into garbage."""
-    outcome = Outcome(note="every byte of three records that no sync covers; zeros, ones, noise behind")
+    """Cut the unsynced bytes at every byte, and replace the rest with zeros, ones or noise."""
+    outcome = Outcome(note="cut at every byte of three unsynced records; zeros, ones or noise behind the cut")
     author = Author(folder / "spool")
     author.put(started())
     for size in (6, 0, 33):
         author.put(node(), b"s" * size)
     author.sync()
-    safe = len(author.records)
+    synced = len(author.records)
     first = author.end
     for size in (0, 1, 200):
         author.put(node(), rng.randbytes(size).hex().encode())
-    path, whole = author.segments[0], author.segments[0].read_bytes()
+    path, content = author.segments[0], author.segments[0].read_bytes()
     cuts = range(first, author.end + 1)
     for cut in cuts[:: max(1, 3 * len(cuts) // rounds)]:
-        for filling in (bytes(len(whole) - cut), b"\xff" * (len(whole) - cut), rng.randbytes(len(whole) - cut)):
-            path.write_bytes(whole[:cut] + filling)
-            whole_ones = sum(offset + size <= cut for _, offset, size in author.places)
-            sure = events_of(author.records[: max(safe, whole_ones)])
-            outcome.compare(sure, events_of(asyncio.run(recover(author.folder))), put=events_of(author.records))
+        for filling in (bytes(len(content) - cut), b"\xff" * (len(content) - cut), rng.randbytes(len(content) - cut)):
+            path.write_bytes(content[:cut] + filling)
+            complete = sum(offset + size <= cut for _, offset, size in author.places)
+            expected = events_of(author.records[: max(synced, complete)])
+            outcome.compare(expected, events_of(asyncio.run(recover(author.folder))), put=events_of(author.records))
             step()
     return outcome
 
 
 def flipped_bits(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """Each bit of a journal is flipped; damage is refused, mended, and every record found or told."""
+    """Flip each bit of a spool folder and repair it; every record must be read back or be reported as unreadable."""
     refused = 0
     outcome = Outcome()
     author = _journal(folder / "first", rng)
@@ -85,25 +85,28 @@ def flipped_bits(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
         for bit in range(len(path.read_bytes().rstrip(b"\0")) * 8)
     ]
     for number, bit in bits[:: max(1, len(bits) // rounds)]:
-        place = folder / "copy" / author.folder.name
-        shutil.copytree(author.folder, place)
-        path = place / author.segments[number].name
+        copy = folder / "copy" / author.folder.name
+        shutil.copytree(author.folder, copy)
+        path = copy / author.segments[number].name
         content = bytearray(path.read_bytes())
         content[bit // 8] ^= 1 << bit % 8
         path.write_bytes(content)
-        told: set[int] = set()
+        reported: set[int] = set()
         try:
-            report = repair_folder(place)
-        except SpoolForeign:  # the number of the format: another program's file, which is left alone
+            report = repair_folder(copy)
+        except SpoolForeign:  # the bit changed the format's number: the file is refused as one of a newer program
             refused += 1
         else:
-            told = _told(report) if report is not None else told
-            records = asyncio.run(recover(place))
-            named = [each for each in _behind(author, author.segments[number], bit // 8) if each.position in told]
-            outcome.compare(events_of(author.records), events_of(records), told=events_of(named))
-        shutil.rmtree(place.parent)
+            reported = _positions(report) if report is not None else reported
+            records = asyncio.run(recover(copy))
+            affected = _from_byte_on(author, author.segments[number], bit // 8)
+            missing = events_of(each for each in affected if each.position in reported)
+            outcome.compare(events_of(author.records), events_of(records), reported=missing)
+        shutil.rmtree(copy.parent)
         step()
-    outcome.note = f"of {len(bits):,} bits; {refused} made a file of a newer format, which is refused and left alone"
+    outcome.note = (
+        f"of {len(bits):,} bits; {refused} changed the format's number, and the file is refused without a change"
+    )
     return outcome
 
 
@@ -121,8 +124,8 @@ def _journal(spool: Path, rng: random.Random) -> Author:
     return author
 
 
-def _behind(author: Author, path: Path, byte: int) -> list[Record]:
-    """The record that holds this byte, and those that follow it in its episode: more than that may not be given up."""
+def _from_byte_on(author: Author, path: Path, byte: int) -> list[Record]:
+    """Return the record that contains this byte and the later ones of its episode; only these may be missing."""
     for index, (file, offset, size) in enumerate(author.places):
         if file == path and offset <= byte < offset + size:
             hit = author.records[index]
@@ -130,37 +133,37 @@ def _behind(author: Author, path: Path, byte: int) -> list[Record]:
     return []
 
 
-def _told(report: RepairReport) -> set[int]:
+def _positions(report: RepairReport) -> set[int]:
     spans = [*report.unreadable, *(span for each in report.given_up for span in each.positions)]
     return {position for first, last in spans for position in range(first, last + 1)}
 
 
 def power_cuts(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """A disk that keeps any sectors of what it was not told to keep; synced records must be there."""
-    outcome = Outcome(note="simulated disk: what no sync covered reached it or not, sector by sector")
+    """Cut the power of a simulated disk that keeps any subset of unsynced sectors; synced records must exist."""
+    outcome = Outcome(note="simulated disk: each unsynced sector is kept or lost at random")
     while outcome.rounds < rounds:
         place = Path(tempfile.mkdtemp(dir=folder))
         with machine_on(place, random.Random(rng.random())) as machine:
             asyncio.run(live_through(machine, random.Random(rng.random())))
             for cut, synced, stored, count in machine.cuts[: rounds - outcome.rounds]:
-                truth = machine.put_so_far[:count]
+                put_records = machine.put_so_far[:count]
                 try:
-                    kept = [each for each in asyncio.run(recover(cut)) if each.payload != LOST]
-                except SpoolDamaged:  # no power cut may look like damage
-                    outcome.changed += 1
-                    kept = []
-                gone = kept[0].position - 1 if kept else stored
-                sure = events_of(truth[min(gone, stored) : synced])
-                before = events_of(truth[: min(gone, stored)])
-                outcome.compare([*before, *sure], [*before, *events_of(kept)], put=events_of(truth))
+                    recovered = [each for each in asyncio.run(recover(cut)) if each.payload != LOST]
+                except SpoolDamaged:  # a power cut must not be mistaken for damage
+                    outcome.corrupted += 1
+                    recovered = []
+                deleted = recovered[0].position - 1 if recovered else stored
+                expected = events_of(put_records[min(deleted, stored) : synced])
+                before = events_of(put_records[: min(deleted, stored)])
+                outcome.compare([*before, *expected], [*before, *events_of(recovered)], put=events_of(put_records))
                 step()
         shutil.rmtree(place)
     return outcome
 
 
 def failed_syncs(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """The disk refuses a sync: nothing unsynced is given away, and all written is there after the process."""
-    outcome = Outcome(note="nothing that was not synced left the queue")
+    """Let a sync fail: no unsynced event leaves the queue, and all written events exist after the process."""
+    outcome = Outcome(note="no unsynced event left the queue")
     for _ in range(rounds):
         asyncio.run(_failed_sync(outcome, Path(tempfile.mkdtemp(dir=folder)), rng))
         step()
@@ -169,22 +172,22 @@ def failed_syncs(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
 
 async def _failed_sync(outcome: Outcome, place: Path, rng: random.Random) -> None:
     queue = make(place / "spool", settings=SLOW)
-    sure = [put(queue, "EpisodeStarted", b"{}")]
-    sure += [put(queue, "NodeStarted", b"synced") for _ in range(rng.randrange(5))]
+    expected = [put(queue, "EpisodeStarted", b"{}")]
+    expected += [put(queue, "NodeStarted", b"synced") for _ in range(rng.randrange(5))]
     await queue.synced_to()
-    synced = len(sure)
-    sure += [put(queue, "NodeStarted", b"not synced") for _ in range(rng.randrange(1, 5))]
+    synced = len(expected)
+    expected += [put(queue, "NodeStarted", b"not synced") for _ in range(rng.randrange(1, 5))]
     break_syncing(queue)
     with contextlib.suppress(SpoolUnavailable):
         await queue.synced_to()
-    given = await queue.get_batch(events_max=100, bytes_max=2**20, age_s_max=0.0)
-    outcome.changed += len(given) > synced
+    batch = await queue.get_batch(events_max=100, bytes_max=2**20, age_s_max=0.0)
+    outcome.corrupted += len(batch) > synced
     queue.release()
-    outcome.compare(sure, events_of(await recover(queue.folder)))
+    outcome.compare(expected, events_of(await recover(queue.folder)))
 
 
 def put(queue: RecorderQueue, kind: str, payload: bytes) -> Event:
-    """Puts one event of the one episode; what must be found of it."""
+    """Put one event of the only episode, and return it as the event that must exist later."""
     heading = started() if kind == "EpisodeStarted" else node()
     assert heading.episode is not None
     sequence = queue.put_nowait(heading, payload, reserved=True)
@@ -192,7 +195,7 @@ def put(queue: RecorderQueue, kind: str, payload: bytes) -> Event:
 
 
 def full_disk(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """The disk fills up under the queue and is emptied; what was refused was never put."""
+    """Fill the disk under the queue and empty it again; refused events must not exist later."""
     outcome = Outcome()
     for _ in range(rounds):
         place = Path(tempfile.mkdtemp(dir=folder))
@@ -205,26 +208,26 @@ def full_disk(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outc
 
 async def _filled(outcome: Outcome, spool: Path, rng: random.Random) -> None:
     queue = RecorderQueue.create(spool, settings=ON_A_SMALL_DISK, clock=SYSTEM_CLOCK, recorder=RECORDER)
-    sure = [put(queue, "EpisodeStarted", b"{}")]
-    found: list[Event] = []
+    expected = [put(queue, "EpisodeStarted", b"{}")]
+    drained: list[Event] = []
     for _ in range(3):
         with contextlib.suppress(SpoolFull):
             while True:
-                sure.append(put(queue, "NodeStarted", rng.randbytes(rng.randrange(1, 900)).hex().encode()))
+                expected.append(put(queue, "NodeStarted", rng.randbytes(rng.randrange(1, 900)).hex().encode()))
         await queue.synced_to()
         batch = await queue.get_batch(events_max=10_000, bytes_max=2**22, age_s_max=0.0)
-        found += events_of(batch)
+        drained += events_of(batch)
         await queue.acknowledge(batch[-1].position)
         await asyncio.wait_for(queue.room(), 30)
     queue.close()
-    found += events_of(await drain(queue))
+    drained += events_of(await drain(queue))
     queue.release()
-    outcome.compare(sure, found)
+    outcome.compare(expected, drained)
 
 
 @contextmanager
 def small_disk(place: Path, size: str) -> Iterator[bool]:
-    """A tmpfs of so many bytes at this place; False if there is no right to mount one."""
+    """Mount a tmpfs of this size; yield False without the permission to mount."""
     place.mkdir(exist_ok=True)
     mount = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(place)]
     mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
@@ -250,24 +253,24 @@ def _small_disk(place: Path) -> Iterator[str]:
 
     os.posix_fallocate = refusing
     try:
-        yield "simulated: there is no right to mount a small disk here"
+        yield "simulated: no permission to mount a small disk"
     finally:
         os.posix_fallocate = allocate
 
 
 def clock_jumps(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """Clocks that stand still, jump hours back and far ahead: order is by sequence, never by time."""
-    outcome = Outcome(note="wall clock and monotonic clock, each by up to a century and back")
+    """Let clocks stop and jump back and ahead; the order of events is their sequence, never their time."""
+    outcome = Outcome(note="wall clock and monotonic clock jump by up to a century, ahead and back")
     for _ in range(rounds):
         clock = Clock(wall_ns=lambda: rng.randrange(2**62), monotonic_ns=lambda: rng.choice((0, rng.randrange(2**62))))
         queue = make(Path(tempfile.mkdtemp(dir=folder)) / "spool", settings=ROOMY, clock=clock)
-        sure = [put(queue, "EpisodeStarted", b"{}")]
-        sure += [put(queue, "NodeStarted", b"t" * rng.randrange(300)) for _ in range(rng.randrange(40))]
+        expected = [put(queue, "EpisodeStarted", b"{}")]
+        expected += [put(queue, "NodeStarted", b"t" * rng.randrange(300)) for _ in range(rng.randrange(40))]
         queue.release()
         recovered = open_dead(queue.folder)
         assert recovered is not None
         recovered.release()
-        outcome.compare(sure, events_of(asyncio.run(recover(queue.folder))))
+        outcome.compare(expected, events_of(asyncio.run(recover(queue.folder))))
         shutil.rmtree(queue.folder.parent)
         step()
     return outcome

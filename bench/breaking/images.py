@@ -1,4 +1,4 @@
-"""File systems of one's own, in a file each, for faults that need a disk."""
+"""Create and mount file systems in image files, for faults that need a disk."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from pathlib import Path
 
 __all__ = ["DiskImage", "NOT_MADE"]
 
-NOT_MADE = "not made: there is no right to mount a loop image here"
+NOT_MADE = "skipped: no permission to mount a loop image"
 _MAKE = {"ext4": ["mkfs.ext4", "-q", "-F"], "xfs": ["mkfs.xfs", "-q", "-f"], "btrfs": ["mkfs.btrfs", "-q", "-f"]}
 
 
 class DiskImage:
-    """A file system of this kind in a file; `root` is where it is mounted. Raises `OSError`, `CalledProcessError`."""
+    """A file system in an image file, mounted at `root`.
+
+    Raises:
+        OSError, CalledProcessError: a program is missing, or failed.
+    """
 
     def __init__(self, folder: Path, *, kind: str = "ext4", size: str = "64M") -> None:
         self._image = folder / "disk.img"
@@ -26,12 +30,12 @@ class DiskImage:
 
     @staticmethod
     def can_make(kind: str) -> bool:
-        """Whether the program that makes such a file system is installed."""
+        """Return True if the program that creates this kind of file system is installed."""
         return shutil.which(_MAKE[kind][0]) is not None
 
     @contextmanager
     def mounted(self) -> Iterator[None]:
-        """Mounting replays the journal."""
+        """Mount the image; this replays the journal of the file system."""
         subprocess.run(["mount", "-o", "loop", self._image, self.root], check=True, capture_output=True)
         try:
             yield

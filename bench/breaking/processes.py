@@ -1,4 +1,4 @@
-"""Processes that end: recorders and appenders killed at random moments, forks, exits with a full queue, two at once."""
+"""Faults of processes: killed recorders and appenders, forks, exits with a full queue, several drains of one folder."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
+from bench.breaking.child_process import SPAWN, ChildProcess, kill_me_after
 from bench.breaking.files import ROOMY, events_of, put
 from bench.breaking.outcome import Outcome, Step
-from bench.breaking.speaking import SPAWN, Speaker, kill_me_after
 from pycrorm_async.errors import SpoolClosed, SpoolFull
 from pycrorm_async.events.envelope import LOST
 from pycrorm_async.events.ids import episode_text
@@ -37,69 +37,69 @@ _AT_ONCE = 4
 _LONGEST_CPU_S = 0.05
 
 
-def _said_until_killed(target: Callable[..., None], arguments: tuple[object, ...], life_s: float) -> list[list[str]]:
-    """Every whole line the process had written when it was killed, so long after its first."""
-    process = Speaker(target, *arguments)
+def _lines_until_killed(target: Callable[..., None], arguments: tuple[object, ...], life_s: float) -> list[list[str]]:
+    """Run the target, kill it `life_s` after its first line, and return its complete lines."""
+    process = ChildProcess(target, *arguments)
     process.wait_for("\n")
     time.sleep(life_s)
     return process.kill()
 
 
-# --- recorders --------------------------------------------------------------------------------------------------
+# --- recorders ------------------------------------------------------------------------------------------------------
 
 
-def _record(spool: str, seed: int, threads: int, doing: str, cpu_s: float) -> None:
+def _record(spool: str, seed: int, threads: int, mode: str, cpu_s: float) -> None:
     kill_me_after(cpu_s)
-    sys.argv = ["recording", spool, str(seed), str(threads), doing]
+    sys.argv = ["recording", spool, str(seed), str(threads), mode]
     recorder_process.main()
 
 
 class _Life(NamedTuple):
-    """A recorder that is to be killed: where it records, with how many threads, and what it says."""
+    """A recorder that kills itself after some CPU time: its spool, its number of threads, and its process."""
 
     spool: Path
     threads: int
-    recorder: Speaker
+    recorder: ChildProcess
 
 
 def killed_recorders(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """`kill -9` after up to 0.05 s of processor time; all that putting returned for must be there."""
-    outcome = Outcome(note="one to three threads; half of them with a consumer that stores meanwhile")
+    """Kill recorders after up to 0.05 s of CPU time; every event whose put returned must exist."""
+    outcome = Outcome(note="one to three threads; in half of the processes a consumer stores events at the same time")
     lives: deque[_Life] = deque()
-    for left in range(rounds, 0, -1):
-        while len(lives) < min(_AT_ONCE, left):
-            lives.append(_born(Path(tempfile.mkdtemp(dir=folder)), rng))
+    for rounds_left in range(rounds, 0, -1):
+        while len(lives) < min(_AT_ONCE, rounds_left):
+            lives.append(_start(Path(tempfile.mkdtemp(dir=folder)), rng))
         life = lives.popleft()
-        _compare_what_is_left(outcome, life)
+        _compare_recovered(outcome, life)
         shutil.rmtree(life.spool.parent)
         step()
     return outcome
 
 
-def _born(place: Path, rng: random.Random) -> _Life:
+def _start(place: Path, rng: random.Random) -> _Life:
     spool, threads = place / "spool", rng.choice((1, 1, 2, 3))
-    seed, doing, cpu_s = rng.randrange(2**31), rng.choice(("recording", "storing")), rng.random() * _LONGEST_CPU_S
-    return _Life(spool, threads, Speaker(_record, str(spool), seed, threads, doing, cpu_s))
+    seed, mode, cpu_s = rng.randrange(2**31), rng.choice(("recording", "storing")), rng.random() * _LONGEST_CPU_S
+    return _Life(spool, threads, ChildProcess(_record, str(spool), seed, threads, mode, cpu_s))
 
 
-def _compare_what_is_left(outcome: Outcome, life: _Life) -> None:
-    said = life.recorder.killed()
-    answered = {(line[1], int(line[2])) for line in said if line[0] == "put"}
-    there = {int(line[1]): (line[2], int(line[3]), line[4]) for line in said if line[0] == "stored"}
+def _compare_recovered(outcome: Outcome, life: _Life) -> None:
+    lines = life.recorder.wait_until_killed()
+    acknowledged = {(line[1], int(line[2])) for line in lines if line[0] == "put"}
+    by_position = {int(line[1]): (line[2], int(line[3]), line[4]) for line in lines if line[0] == "stored"}
     for recorder in Spool(life.spool).recorders():
         for each in asyncio.run(recover(recorder.path)):
             if each.episode is not None and each.payload != LOST:
                 event = (episode_text(each.episode), each.sequence, each.payload.rstrip(b"x").decode())
-                outcome.changed += there.get(each.position, event) != event
-                there[each.position] = event
-    found = [there[position] for position in sorted(there)]
-    outcome.changed += sum(text != f"{name}/{sequence}/" for name, sequence, text in found)
-    # Each thread may have been killed between the writing and the saying.
-    outcome.changed += max(0, len(found) - len(answered) - life.threads)
-    outcome.compare([(*each, f"{each[0]}/{each[1]}/") for each in answered], found, put=found)
+                outcome.corrupted += by_position.get(each.position, event) != event
+                by_position[each.position] = event
+    events = [by_position[position] for position in sorted(by_position)]
+    outcome.corrupted += sum(text != f"{name}/{sequence}/" for name, sequence, text in events)
+    # Each thread may have been killed after it wrote an event and before it printed it.
+    outcome.corrupted += max(0, len(events) - len(acknowledged) - life.threads)
+    outcome.compare([(*each, f"{each[0]}/{each[1]}/") for each in acknowledged], events, put=events)
 
 
-# --- appenders --------------------------------------------------------------------------------------------------
+# --- appenders ------------------------------------------------------------------------------------------------------
 
 _STORED = (
     "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY episode.number, sequence"
@@ -111,22 +111,22 @@ def _append(url: str, first: int) -> None:
 
 
 def killed_appenders(new_database: Callable[[Path], str]) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """The same for a process that appends batches to a database, again from the last one it reported."""
+    """Kill a process that appends batches to a database; the next one starts at the last batch that is stored."""
 
     def killed(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
         outcome, url = Outcome(note=f"batches of {2 * PER_BATCH} events of two episodes"), new_database(folder)
-        known = appended = 0
+        stored = appended = 0
         for _ in range(rounds):
-            said = _said_until_killed(_append, (url, max(known - 1, 0)), rng.random() * _LONGEST_LIFE_S)
-            appended = max([known, *(int(line[1]) + 1 for line in said if line[0] == "appended")])
+            lines = _lines_until_killed(_append, (url, max(stored - 1, 0)), rng.random() * _LONGEST_LIFE_S)
+            appended = max([stored, *(int(line[1]) + 1 for line in lines if line[0] == "appended")])
             heads = _settled(url) or [0, 0]
             outcome.lost += sum(max(0, appended * PER_BATCH - head) for head in heads)
-            outcome.misordered += sum(head % PER_BATCH != 0 for head in heads)  # half a batch
-            known = heads[0] // PER_BATCH
+            outcome.misordered += sum(head % PER_BATCH != 0 for head in heads)  # a batch is stored in part
+            stored = heads[0] // PER_BATCH
             step()
         events = [
             (episode_text(each.episode), each.sequence, each.payload.decode())
-            for number in range(known)
+            for number in range(stored)
             for each in batch(number)
             if each.episode is not None
         ]
@@ -138,50 +138,50 @@ def killed_appenders(new_database: Callable[[Path], str]) -> Callable[[int, rand
 
 
 def _settled(url: str) -> list[int]:
-    """How far the episodes are, once nobody is committing any more: a server finishes what a dead client asked for."""
-    before: list[int] = [-1]
+    """Return the heads once they no longer change, because a server may still execute a dead client's COMMIT."""
+    previous: list[int] = [-1]
     while True:
-        heads = [row[0] for row in ask(url, "SELECT head FROM episode ORDER BY number")] if _is_made(url) else []
-        if heads == before:
+        heads = [row[0] for row in ask(url, "SELECT head FROM episode ORDER BY number")] if _has_log(url) else []
+        if heads == previous:
             return heads
-        before = heads
+        previous = heads
         time.sleep(0.005 if url.startswith("postgresql") else 0)
 
 
-def _is_made(url: str) -> bool:
+def _has_log(url: str) -> bool:
     if url.startswith("postgresql"):
         return bool(ask(url, "SELECT to_regclass('pycrorm.episode') IS NOT NULL")[0][0])
     return bool(ask(url, "SELECT count(*) FROM sqlite_master WHERE name = 'episode'")[0][0])
 
 
-# --- forks and exits --------------------------------------------------------------------------------------------
+# --- forks and exits ------------------------------------------------------------------------------------------------
 
 
 def forks(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """A child is forked while the parent records, tries to record too and exits or is killed."""
-    outcome = Outcome(note="the child's puts are refused; it takes nothing from its parent")
+    """Fork a child while the parent records; the child tries to record and is killed or terminated."""
+    outcome = Outcome(note="the child's puts are refused, and the parent's events stay")
     for _ in range(rounds):
         queue = make(Path(tempfile.mkdtemp(dir=folder)) / "spool", settings=ROOMY)
-        sure = [put(queue, "EpisodeStarted", b"{}")]
-        sure += [put(queue, "NodeStarted", b"before") for _ in range(rng.randrange(9))]
+        expected = [put(queue, "EpisodeStarted", b"{}")]
+        expected += [put(queue, "NodeStarted", b"before") for _ in range(rng.randrange(9))]
         child = os.fork()
         if child == 0:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the bench's own way out, which takes all folders along
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # the benchmark's handler would delete all folders
             with contextlib.suppress(SpoolClosed):
                 queue.put_nowait(node(), b"of the child", reserved=True)
             queue.release()
             os.kill(os.getpid(), rng.choice((signal.SIGKILL, signal.SIGTERM)))
-        sure += [put(queue, "NodeStarted", b"after") for _ in range(rng.randrange(9))]
+        expected += [put(queue, "NodeStarted", b"after") for _ in range(rng.randrange(9))]
         os.waitpid(child, 0)
-        sure += [put(queue, "NodeStarted", b"alone again")]
+        expected += [put(queue, "NodeStarted", b"alone again")]
         queue.release()
-        outcome.compare(sure, events_of(asyncio.run(recover(queue.folder))))
+        outcome.compare(expected, events_of(asyncio.run(recover(queue.folder))))
         shutil.rmtree(queue.folder.parent)
         step()
     return outcome
 
 
-def _fill_and_exit(spool: str, how: str) -> None:
+def _fill_and_exit(spool: str, exit_by: str) -> None:
     queue = make(Path(spool), settings=SMALL)
     with contextlib.suppress(SpoolFull):
         kind = "EpisodeStarted"
@@ -190,37 +190,37 @@ def _fill_and_exit(spool: str, how: str) -> None:
             recorder_process.say("put", sequence, payload)
             kind = "NodeStarted"
     recorder_process.say("full", 0, "-")
-    if how == "exit":
+    if exit_by == "exit":
         raise SystemExit(3)
-    if how == "raise":
-        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, PTH123  the traceback is not ours to show
-        raise ValueError("the plan ends so")
+    if exit_by == "raise":
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115, PTH123  hide the expected traceback
+        raise ValueError("the plan failed")
     os._exit(0)
 
 
 def exits_with_a_full_queue(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """A process fills its spool, drains nothing and leaves: by exit, by an exception, by `os._exit`."""
-    outcome = Outcome(note="sys.exit, an exception nobody catches, os._exit")
+    """Let a process fill its spool and exit without a drain: by `sys.exit`, by an exception, by `os._exit`."""
+    outcome = Outcome(note="sys.exit, an uncaught exception, os._exit")
     for _ in range(rounds):
         spool = Path(tempfile.mkdtemp(dir=folder)) / "spool"
-        said = Speaker(_fill_and_exit, str(spool), rng.choice(("exit", "raise", "_exit"))).end()
-        (left,) = Spool(spool).recorders()
-        found = events_of(asyncio.run(recover(left.path)))
+        lines = ChildProcess(_fill_and_exit, str(spool), rng.choice(("exit", "raise", "_exit"))).wait()
+        (recorder,) = Spool(spool).recorders()
+        recovered = events_of(asyncio.run(recover(recorder.path)))
         name = episode_text(episode(1))
-        outcome.compare([(name, int(line[1]), line[2]) for line in said if line[0] == "put"], found)
+        outcome.compare([(name, int(line[1]), line[2]) for line in lines if line[0] == "put"], recovered)
         shutil.rmtree(spool.parent)
         step()
     return outcome
 
 
-# --- two at once ------------------------------------------------------------------------------------------------
+# --- several drains -------------------------------------------------------------------------------------------------
 
 
-def _drain_if_mine(folder: str, barrier: object) -> None:
+def _drain_if_unlocked(folder: str, barrier: object) -> None:
     barrier.wait()  # type: ignore[attr-defined]
     recovered = open_dead(Path(folder))
     if recovered is None:
-        recorder_process.say("not", "mine")
+        recorder_process.say("locked")
         return
     records = asyncio.run(recovered.get_batch(events_max=10_000, bytes_max=2**24, age_s_max=0.0))
     for name, sequence, payload in events_of(records):
@@ -230,17 +230,17 @@ def _drain_if_mine(folder: str, barrier: object) -> None:
 
 
 def second_openers(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """Four processes drain the folder of one dead recorder at the same moment: one of them does, once."""
-    outcome = Outcome(note="four processes, released together")
+    """Let four processes drain the folder of one dead recorder at the same moment; exactly one of them may."""
+    outcome = Outcome(note="four processes, started by one barrier")
     for _ in range(rounds):
         queue = make(Path(tempfile.mkdtemp(dir=folder)) / "spool", settings=ROOMY)
-        sure = [put(queue, "EpisodeStarted", b"{}")]
-        sure += [put(queue, "NodeStarted", b"x" * rng.randrange(200)) for _ in range(30)]
+        expected = [put(queue, "EpisodeStarted", b"{}")]
+        expected += [put(queue, "NodeStarted", b"x" * rng.randrange(200)) for _ in range(30)]
         queue.release()
         barrier = SPAWN.Barrier(4)
-        drainers = [Speaker(_drain_if_mine, str(queue.folder), barrier) for _ in range(4)]
-        said = [line for each in drainers for line in each.end() if line[0] == "drained"]
-        outcome.compare(sure, [(line[1], int(line[2]), line[3] if len(line) > 3 else "") for line in said])
+        drainers = [ChildProcess(_drain_if_unlocked, str(queue.folder), barrier) for _ in range(4)]
+        drained = [line for each in drainers for line in each.wait() if line[0] == "drained"]
+        outcome.compare(expected, [(line[1], int(line[2]), line[3] if len(line) > 3 else "") for line in drained])
         shutil.rmtree(queue.folder.parent)
         step()
     return outcome

@@ -1,6 +1,7 @@
-"""A database that goes back: a failover that loses, one that does not, a backup that is put back.
+"""Set a database back to an earlier state: by a failover with or without losses, or by restoring a backup.
 
-What a flush acknowledged before must be there afterwards, under the same numbers and row ids, and verify must be clean.
+Everything that a flush acknowledged before must exist afterwards, with the same numbers and row ids, and `verify` must
+report nothing.
 Each round is compared and verified directly after the flush that follows the fault, before anything else is recorded:
 events recorded after a flush may be in the log before they are in the tables, and verify reports those as behind.
 """
@@ -44,12 +45,12 @@ _VERIFY_EVERY: Final = 20
 
 @dataclass
 class NoteAction(ActionAbstract):
-    """Does nothing, and is remembered."""
+    """An action that does nothing and is recorded."""
 
     text: str
 
     async def perform(self) -> None:
-        """Noted."""
+        """Do nothing."""
 
 
 async def _record(memory: Memory, rng: random.Random) -> None:
@@ -63,8 +64,8 @@ async def _note(rng: random.Random) -> None:
         await NoteAction(f"{rng.random()}").perform()
 
 
-class _Truth:
-    """What the database held when a flush had returned."""
+class _StateBefore:
+    """The events and rows that the database contained after a flush."""
 
     def __init__(self, url: str) -> None:
         self._url = url
@@ -72,19 +73,19 @@ class _Truth:
         self._rows = [set(ask(url, question)) for question in _ROWS]
 
     def compare(self, outcome: Outcome) -> None:
-        """Count one round: the same events are there, and the same rows under the same ids."""
+        """Count one round: the same events must exist, and the same rows under the same ids."""
         keys = {event[:2] for event in self.events}
-        found: list[Event] = ask(self._url, _EVENTS)
-        outcome.compare(self.events, found, put=[event for event in found if event[:2] not in keys])
-        gone = sum(
+        events: list[Event] = ask(self._url, _EVENTS)
+        outcome.compare(self.events, events, put=[event for event in events if event[:2] not in keys])
+        missing = sum(
             len(before - set(ask(self._url, question))) for before, question in zip(self._rows, _ROWS, strict=True)
         )
-        outcome.note_changed(gone)
+        outcome.add_corrupted(missing)
 
 
-async def _check(outcome: Outcome, truth: _Truth, url: str, *, rounds: int) -> None:
+async def _check(outcome: Outcome, state: _StateBefore, url: str, *, rounds: int) -> None:
     """Count one round, and verify the first, the last and every twentieth. The tables must show all of the log."""
-    truth.compare(outcome)
+    state.compare(outcome)
     if (outcome.rounds - 1) % _VERIFY_EVERY and outcome.rounds != rounds:
         return
     log = await EventLog.open(DatabaseAddress.parse(url), create=False)
@@ -99,38 +100,38 @@ async def _check(outcome: Outcome, truth: _Truth, url: str, *, rounds: int) -> N
         "stopped": len(verified.stopped),
         "not compared": len(verified.unmade) + (verified.outdated is not None),
     }
-    outcome.note_changed(sum(faults.values()))
+    outcome.add_corrupted(sum(faults.values()))
     if any(faults.values()):
         counts = ", ".join(f"{name} {count}" for name, count in faults.items() if count)
         print(f"round {outcome.rounds}: verify reports {counts}", file=sys.stderr)
 
 
 @asynccontextmanager
-async def _gone_back(
-    memory: Memory, rng: random.Random, going_back: Callable[[], Any], url: str
-) -> AsyncIterator[_Truth]:
-    """Make the database go back under a memory, then continue in one of three ways; yield the truth from before.
+async def _set_back(
+    memory: Memory, rng: random.Random, set_back: Callable[[], Any], url: str
+) -> AsyncIterator[_StateBefore]:
+    """Set the database back under a memory, then continue in one of three ways; yield the state from before.
 
-    In the body everything recorded is flushed. In one of the ways an episode is still open there and ends after it.
+    When the body runs, everything recorded is flushed. In one of the ways an episode is still open and ends after it.
     """
     way = rng.randrange(3)
     async with memory.episode(description="through it all") if way == 0 else nullcontext():
         await (_note(rng) if way == 0 else _record(memory, rng))
         await memory.flush()
-        truth = _Truth(url)
-        await asyncio.to_thread(going_back)
+        state = _StateBefore(url)
+        await asyncio.to_thread(set_back)
         if way == 0:
             await _note(rng)
         elif way == 1:
             await _record(memory, rng)
         await memory.flush()
-        yield truth
+        yield state
 
 
 def failovers(*, synchronous: bool) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """A primary dies after its standby had stopped receiving, or had confirmed every COMMIT; the standby takes over."""
+    """Kill a primary and promote its standby, which confirmed every COMMIT, or had stopped receiving before."""
 
-    async def through(outcome: Outcome, rounds: int, rng: random.Random, step: Step, place: Path, spool: Path) -> None:
+    async def run_all(outcome: Outcome, rounds: int, rng: random.Random, step: Step, place: Path, spool: Path) -> None:
         with replicas_in(place, synchronous=synchronous) as replicas:
             ask(replicas.url(), "CREATE DATABASE memory")
             url = replicas.url("memory")
@@ -140,73 +141,73 @@ def failovers(*, synchronous: bool) -> Callable[[int, random.Random, Path, Step]
                     await memory.flush()
                     if not synchronous:
                         await asyncio.to_thread(replicas.lag)
-                    async with _gone_back(memory, rng, replicas.fail_over, url) as truth:
-                        await _check(outcome, truth, url, rounds=rounds)
+                    async with _set_back(memory, rng, replicas.fail_over, url) as state:
+                        await _check(outcome, state, url, rounds=rounds)
                     await asyncio.to_thread(replicas.follow)
                     step()
 
     def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-        standby = "confirms every COMMIT" if synchronous else "receives nothing any more"
+        standby = "confirms every COMMIT" if synchronous else "no longer receives changes"
         outcome = Outcome(
             note=f"PostgreSQL: SIGQUIT of the primary while its standby {standby}; the standby is promoted"
         )
         with tempfile.TemporaryDirectory(prefix="pair") as place:
-            asyncio.run(through(outcome, rounds, rng, step, Path(place), folder / "spool"))
+            asyncio.run(run_all(outcome, rounds, rng, step, Path(place), folder / "spool"))
         return outcome
 
     return run
 
 
 def restored_servers(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """A database on a server is replaced by a copy of it from before, under a memory that is open."""
+    """Replace a database on a server by an earlier copy while a memory is open."""
 
     outcome = Outcome(note="PostgreSQL: DROP DATABASE, then CREATE DATABASE from a copy")
 
-    async def through(server: Server, url: str) -> None:
+    async def run_all(server: Server, url: str) -> None:
         async with Memory.open(url, spool=folder / "spool", settings=_SETTINGS) as memory:
             for _ in range(rounds):
                 await _record(memory, rng)
                 await memory.flush()
                 backup = await asyncio.to_thread(Backup, url, server)
-                async with _gone_back(memory, rng, backup.restore, url) as truth:
-                    await _check(outcome, truth, url, rounds=rounds)
+                async with _set_back(memory, rng, backup.restore, url) as state:
+                    await _check(outcome, state, url, rounds=rounds)
                 await asyncio.to_thread(backup.drop)
                 step()
 
     with (
         tempfile.TemporaryDirectory(prefix="pg") as place,
-        server_in(Path(place), syncs=False) as server,  # to drop a database waits for a checkpoint of all of them
+        server_in(Path(place), syncs=False) as server,  # DROP DATABASE waits for a checkpoint of all databases
     ):
-        asyncio.run(through(server, server.new_database()))
+        asyncio.run(run_all(server, server.new_database()))
     return outcome
 
 
 def restored_files(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """A SQLite file is replaced by a copy from before, between two lives of a memory or while one has it open."""
-    outcome = Outcome(note="SQLite: the file is replaced between two processes, or in place under a memory")
+    """Replace a SQLite file by an earlier copy, while a memory has it open or between two memories."""
+    outcome = Outcome(note="SQLite: the file is replaced while no memory is open, or in place under an open one")
     url = f"sqlite:///{folder}/memory.db"
 
-    async def through() -> None:
+    async def run_all() -> None:
         for _ in range(rounds):
             async with Memory.open(url, settings=_SETTINGS) as memory:
                 await _record(memory, rng)
                 await memory.flush()
                 if rng.random() < 0.5:
-                    async with _gone_back(memory, rng, Backup(url, None).restore, url) as truth:
-                        await _check(outcome, truth, url, rounds=rounds)
+                    async with _set_back(memory, rng, Backup(url, None).restore, url) as state:
+                        await _check(outcome, state, url, rounds=rounds)
                 else:
                     _copy(folder / "memory.db", folder / "copy.db")
                     await _record(memory, rng)
                     await memory.flush()
-                    truth = _Truth(url)
-            if _replaced(folder):
+                    state = _StateBefore(url)
+            if _replace_by_copy(folder):
                 async with Memory.open(url, settings=_SETTINGS) as memory:
                     await _record(memory, rng)
                     await memory.flush()
-                    await _check(outcome, truth, url, rounds=rounds)
+                    await _check(outcome, state, url, rounds=rounds)
             step()
 
-    asyncio.run(through())
+    asyncio.run(run_all())
     return outcome
 
 
@@ -215,8 +216,8 @@ def _copy(source: Path, target: Path) -> None:
         read.backup(written)
 
 
-def _replaced(folder: Path) -> bool:
-    """Whether there was a copy, which is the memory now."""
+def _replace_by_copy(folder: Path) -> bool:
+    """Replace the memory by its copy; return False if there is no copy."""
     if not (folder / "copy.db").exists():
         return False
     for each in ("memory.db-wal", "memory.db-shm"):

@@ -1,9 +1,9 @@
-"""The whole way from the queue to the log, with every fault at once, drawn from one seed.
+"""Simulate the path from the queue to the log with all faults combined, drawn from one seed.
 
-Real files, the real queue, writer and SQLite log; simulated are the moments: the sync thread takes its turns when the
-seed says so, the power fails between any two steps on a disk that forgets, the database is away, loses its reply, or
-the drain is cancelled. After each life another recorder begins and the dead folder is drained with the same faults.
-In the end everything that was synced before a cut is in the log once, and nothing that was never put.
+Files, queue, writer and SQLite log are real. The seed decides when the sync thread runs, when the power fails on a
+disk that loses unsynced data, when the database is unavailable or loses its reply, and when the drain is cancelled.
+After the death of each recorder the next one starts, and the dead folder is drained under the same faults. At the end
+everything that was synced before a power cut must be in the log once, and nothing that was never put.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ from tests.writer.fakes import CountingFold, Passing
 
 __all__ = ["simulated"]
 
-_AT_ONCE = Backoff(first_s=1e-6, longest_s=1e-6)
+_NO_BACKOFF = Backoff(first_s=1e-6, longest_s=1e-6)
 _STORED = "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY number, sequence"
 
 
-class _Faulty(Passing):
-    """A log that is away, or commits and loses the reply, as chance says."""
+class _FaultyLog(Passing):
+    """A log that at random is unavailable, or commits and loses the reply."""
 
     def __init__(self, log: EventLog, rng: random.Random) -> None:
         super().__init__(CountingFold(log))
         self._rng = rng
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        what = self._rng.random()
-        if what < 0.2:
-            raise DatabaseUnavailable("away before anything was done")
-        answer = await super().append(records)
-        if what < 0.4:
-            raise DatabaseUnavailable("the reply was lost")
-        return answer
+        chance = self._rng.random()
+        if chance < 0.2:
+            raise DatabaseUnavailable("unavailable before the append")
+        refused = await super().append(records)
+        if chance < 0.4:
+            raise DatabaseUnavailable("the reply to the COMMIT was lost")
+        return refused
 
 
 class _Life:
-    """One recorder from its start to its death, and the truth about it."""
+    """One recorder from its start to its death."""
 
     def __init__(self, machine: Machine, rng: random.Random, number: int) -> None:
         self.machine = machine
@@ -64,11 +64,11 @@ class _Life:
         self._episodes = 0
         self._open: list[EpisodeId] = []
         self._count = 0
-        self.given = 0
+        self.taken = 0
         machine.meanwhile = self._node
 
     def act(self) -> None:
-        """Puts a few events."""
+        """Put a few events."""
         for _ in range(self._rng.randrange(1, 6)):
             if not self._open or (len(self._open) < 9 and self._rng.random() < 0.2):
                 self._episodes += 1
@@ -91,27 +91,29 @@ class _Life:
 
 
 class _PowerFails(BaseException):
-    """The machine is dead from here on."""
+    """The power of the simulated machine has failed."""
 
 
-def _fails_at(machine: Machine, moment: int) -> None:
-    """The power fails at this one of the moments at which the machine would note what a cut leaves."""
-    cut, left = machine.cut, moment
+def _fail_power_at(machine: Machine, moment: int) -> None:
+    """Let the power fail at the `moment`-th call of `machine.cut`."""
+    original_cut, calls_left = machine.cut, moment
 
-    def fails() -> None:
-        nonlocal left
-        left -= 1
-        if left == 0:
-            cut()
+    def cut_or_fail() -> None:
+        nonlocal calls_left
+        calls_left -= 1
+        if calls_left == 0:
+            original_cut()
             raise _PowerFails
 
-    machine.cut = fails  # type: ignore[method-assign]
+    machine.cut = cut_or_fail  # type: ignore[method-assign]
 
 
-async def _lived(machine: Machine, life: _Life, log: EventLog, rng: random.Random) -> tuple[Path, list[Event]]:
-    """Records, syncs and drains until the power fails; the folder as it is then found, and what had been promised."""
-    destination = _Faulty(log, rng)
-    _fails_at(machine, rng.randrange(1, 150))
+async def _record_until_cut(
+    machine: Machine, life: _Life, log: EventLog, rng: random.Random
+) -> tuple[Path, list[Event]]:
+    """Record, sync and drain until the power fails; return the folder after the cut, and the synced events."""
+    destination = _FaultyLog(log, rng)
+    _fail_power_at(machine, rng.randrange(1, 150))
     with contextlib.suppress(_PowerFails):
         while True:
             await _step(machine, life, destination, rng)
@@ -119,15 +121,15 @@ async def _lived(machine: Machine, life: _Life, log: EventLog, rng: random.Rando
     return folder, events_of(machine.put_so_far[:synced])
 
 
-async def _step(machine: Machine, life: _Life, destination: _Faulty, rng: random.Random) -> None:
+async def _step(machine: Machine, life: _Life, destination: _FaultyLog, rng: random.Random) -> None:
     queue = machine.queue
     life.act()
     machine.cut()
     if rng.random() < 0.7:
         machine.turn()
-    if queue.synced > life.given and rng.random() < 0.6:
+    if queue.synced > life.taken and rng.random() < 0.6:
         batch = await queue.get_batch(events_max=rng.choice((1, 3, 50)), bytes_max=2**20, age_s_max=0.0)
-        life.given = batch[-1].position
+        life.taken = batch[-1].position
         stored = False
         while not stored:
             machine.cut()
@@ -135,17 +137,17 @@ async def _step(machine: Machine, life: _Life, destination: _Faulty, rng: random
                 await destination.append(batch)
                 stored = True
         machine.cut()
-        await queue.acknowledge(life.given)
+        await queue.acknowledge(life.taken)
         machine.turn()
 
 
-async def _drained(folder: Path, log: EventLog, rng: random.Random) -> None:
-    """What the next process does with the folder, cancelled and begun again at random."""
+async def _drain(folder: Path, log: EventLog, rng: random.Random) -> None:
+    """Drain the dead folder as the next process would; cancel the drain and restart it at random."""
     for attempt in range(30):
         recovered = open_dead(folder, check=rng.random() < 0.5)
         assert recovered is not None
         settings = Settings(batch_events_max=rng.choice((1, 5, 100)))
-        drain = Drain(recovered, _Faulty(log, rng).append, settings=settings, backoff=_AT_ONCE)
+        drain = Drain(recovered, _FaultyLog(log, rng).append, settings=settings, backoff=_NO_BACKOFF)
         running = asyncio.create_task(drain.run())
         if attempt < 29 and rng.random() < 0.5:
             for _ in range(rng.randrange(40)):
@@ -158,8 +160,8 @@ async def _drained(folder: Path, log: EventLog, rng: random.Random) -> None:
 
 
 def simulated(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """So many memories, each with a few recorders that live, die and are recovered."""
-    outcome = Outcome(note="queue, disk, power, writer, lost replies, cancellation: one seed a memory")
+    """Run one memory a round, each with a few recorders that record, die and are recovered."""
+    outcome = Outcome(note="queue, disk, power, writer, lost replies, cancellation: one seed for each memory")
     for _ in range(rounds):
         place = Path(tempfile.mkdtemp(dir=folder))
         asyncio.run(_memory(outcome, place, random.Random(rng.random())))
@@ -171,19 +173,19 @@ def simulated(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outc
 async def _memory(outcome: Outcome, place: Path, rng: random.Random) -> None:
     url = f"sqlite:///{place}/memory.db"
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    sure: list[Event] = []
+    expected: list[Event] = []
     put: list[Event] = []
     for number in range(1, rng.randrange(2, 4)):
         with machine_on(place / str(number), rng) as machine:
             life = _Life(machine, rng, number)
-            folder, promised = await _lived(machine, life, log, rng)
-            sure += promised
+            folder, synced = await _record_until_cut(machine, life, log, rng)
+            expected += synced
             put += events_of(machine.put_so_far)
-            await _drained(folder, log, rng)
+            await _drain(folder, log, rng)
     await log.close()
-    found = [
+    stored = [
         (name, sequence, payload.encode().hex())
         for name, sequence, payload in ask(url, _STORED)
         if payload.encode() != LOST
     ]
-    outcome.compare(sure, found, put=put)
+    outcome.compare(expected, stored, put=put)

@@ -1,4 +1,4 @@
-"""Fold workers of a daemon that are killed, or stopped for good, at random moments while a plan records."""
+"""Kill or stop fold workers of a daemon at random moments while a plan records."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from pathlib import Path
 
 import msgspec
 
+from bench.breaking.child_process import ChildProcess
 from bench.breaking.outcome import Outcome, Step
-from bench.breaking.robots import Walked, compare_steps, walk
-from bench.breaking.speaking import Speaker
+from bench.breaking.robots import RecordedSteps, compare_steps, walk
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.fold_workers import DaemonNote
 from pycrorm_async.operations.recovery import recover
@@ -37,58 +37,62 @@ _SETTINGS = replace(
     fold_worker_report_s=0.05,
     fold_worker_stopped_s=0.2,
 )
-_HANGS_S = 120.0
+_REPLACED_S_MAX = 120.0
 _LONGEST_LIFE_S = 0.2
 
 
 def _serve(url: str, spool: str) -> None:
-    """A daemon with one worker, so that the one that is stopped is the one that is asked next."""
+    """Run a daemon with one fold worker, so that the daemon must use the worker that is stopped."""
     leave = asyncio.Event()
     asyncio.run(serve(url, spool=Path(spool), leave=leave, say=say, settings=_SETTINGS, fold_workers=1))
 
 
-def faulty_workers(server: Server | None, end: signal.Signals) -> Callable[[int, random.Random, Path, Step], Outcome]:
-    """A worker gets this signal; the daemon replaces it and folds on. In the end log and tables are verified."""
+def faulty_workers(
+    server: Server | None, end_signal: signal.Signals
+) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """Send a signal to the fold worker, and wait for its replacement; at the end verify log and tables."""
 
-    def made(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-        outcome, walked = Outcome(note="each was replaced; the tables are compared and verified"), Walked()
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        outcome, steps = Outcome(note="each worker was replaced; the tables are compared and verified"), RecordedSteps()
         place = Path(tempfile.mkdtemp(dir=folder))
         url = f"sqlite:///{place}/memory.db" if server is None else server.new_database()
         spool = place / "spool"
-        daemon = Speaker(_serve, url, str(spool))
+        daemon = ChildProcess(_serve, url, str(spool))
         daemon.wait_for("draining")
-        plan = Speaker(walk, url, str(spool), "daemon", "plan", rng.randrange(2**31))
+        plan = ChildProcess(walk, url, str(spool), "daemon", "plan", rng.randrange(2**31))
         try:
             for _ in range(rounds):
-                worker = _worker(Spool(spool), but=None)
+                worker = _worker(Spool(spool), other_than=None)
                 time.sleep(rng.random() * _LONGEST_LIFE_S)
-                with suppress(ProcessLookupError):  # it has just been replaced
-                    os.kill(worker, end)
-                _worker(Spool(spool), but=worker)
+                with suppress(ProcessLookupError):  # the daemon has just replaced it
+                    os.kill(worker, end_signal)
+                _worker(Spool(spool), other_than=worker)
                 step()
         finally:
-            walked.add(plan.kill())
+            steps.add(plan.kill())
             daemon.kill()
         asyncio.run(recover(url, spool=spool))
-        compare_steps(outcome, walked, url)
-        outcome.changed += asyncio.run(_differences(url))
+        compare_steps(outcome, steps, url)
+        outcome.corrupted += asyncio.run(_differences(url))
         outcome.rounds = rounds
         return outcome
 
-    return made
+    return run
 
 
-def _worker(spool: Spool, *, but: int | None) -> int:
-    """The process of the worker as soon as it runs and is another one than this."""
-    until_s = time.monotonic() + _HANGS_S
-    while time.monotonic() < until_s:
+def _worker(spool: Spool, *, other_than: int | None) -> int:
+    """Wait for a running fold worker with another pid than `other_than`; return its pid."""
+    deadline_s = time.monotonic() + _REPLACED_S_MAX
+    while time.monotonic() < deadline_s:
         note = spool.writer_note()
         if note is not None:
             for each in msgspec.json.decode(note, type=DaemonNote).fold_workers:
-                if each.state == "running" and each.pid is not None and each.pid != but:
+                if each.state == "running" and each.pid is not None and each.pid != other_than:
                     return each.pid
         time.sleep(0.01)
-    raise TimeoutError(f"no worker took the place of {but}: {note!r}")
+    raise TimeoutError(
+        f"no fold worker replaced pid {other_than} within {_REPLACED_S_MAX:g} s; the daemon's note is {note!r}"
+    )
 
 
 async def _differences(url: str) -> int:

@@ -1,4 +1,4 @@
-"""Every script in `bench/` runs with --quick and prints one JSON line; what the figures are is not a test's to say."""
+"""Every script in `bench/` runs with --quick and prints one JSON line; the figures themselves are not tested."""
 
 import json
 import subprocess
@@ -11,19 +11,19 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
-BUT = {"busy", "faults", "hook", "__main__", "rebuild_beside"}
+BUT = {"busy", "faults", "hook", "__main__", "concurrent_processes"}
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
-"""Those that have no test of their own, and are run by themselves."""
+"""Scripts without a test of their own."""
 HEAVY = {"growth", "questions", "rebuild", "visible"}
-"""Those that start servers and daemons; a quick version takes more than ten seconds, and runs in turns."""
+"""Scripts that start servers and daemons; their quick version takes more than ten seconds."""
 
 
-def measured(script: str, *options: str) -> dict[str, Any]:
-    """The line that the script prints; the last one, of several."""
+def measure(script: str, *options: str) -> dict[str, Any]:
+    """Run a script and return the last line that it prints."""
     command = [sys.executable, "-m", f"bench.{script}", "--quick", *options]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    *_, line = done.stdout.splitlines()
+    completed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert completed.returncode == 0, completed.stderr
+    *_, line = completed.stdout.splitlines()
     result = json.loads(line)
     assert result["bench"] == script
     return dict(result)
@@ -31,7 +31,7 @@ def measured(script: str, *options: str) -> dict[str, Any]:
 
 @pytest.mark.soak
 def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> None:
-    result = measured("hook")
+    result = measure("hook")
     states = [f"{writer}, {state}" for writer in ("thread", "daemon") for state in ("up", "slow", "down")]
     assert [name for name in result if isinstance(result[name], dict)] == ["none", *states]
     for name in ("none", *states):
@@ -41,7 +41,7 @@ def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> N
 
 @pytest.mark.parametrize("options", [(), pytest.param(("--postgresql",), marks=pytest.mark.soak)])
 def test_the_backlog_beside_a_busy_plan_is_measured(options: tuple[str, ...]) -> None:
-    result = measured("busy", *options)
+    result = measure("busy", *options)
     assert result["events"] > 0
     assert max(result["backlog_at_the_end"], *result["backlog"]) <= result["backlog_max"] <= result["events"] + 10
 
@@ -50,4 +50,4 @@ def test_the_backlog_beside_a_busy_plan_is_measured(options: tuple[str, ...]) ->
     "script", [pytest.param(each, marks=pytest.mark.soak) if each in HEAVY else each for each in OTHERS]
 )
 def test_every_other_script_measures_something(script: str) -> None:
-    assert len(measured(script)) >= 2
+    assert len(measure(script)) >= 2

@@ -1,4 +1,4 @@
-"""What ours is compared with has the shape of the system of the thesis, and both are given the same facts."""
+"""The baseline has the shape of the system of the thesis, and both sides store the same facts."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import pytest
 from sqlalchemy import Engine
 
-from bench.baseline.storing import Statements, engine_of, store
+from bench.baseline.store import Statements, engine_of, store
 from bench.baseline.tables import BaselineBase
-from bench.material.rollouts import THESIS_NODES, Node, Place, Thing, Tree, tree, tree_of
-from bench.material.spooled import spool_tree
+from bench.material.rollouts import THESIS_NODES, Node, Place, Tree, WorldObject, tree, tree_of
+from bench.material.spool_recording import spool_tree
 from pycrorm_async.operations.recovery import recover
 from tests.databases import ask
 
@@ -37,29 +37,29 @@ def engine(file: str) -> Iterator[Engine]:
 
 
 def rows_of(url: str) -> dict[str, int]:
-    """How many rows each table has that has any."""
+    """Return the number of rows of each table that is not empty."""
     counts = {each: ask(url, f'SELECT count(*) FROM "{each}"')[0][0] for each in BaselineBase.metadata.tables}
     return {name: count for name, count in counts.items() if count}
 
 
 @pytest.mark.parametrize(("motions", "nodes", "rows"), [(1, 9, 84), (3, 11, 95), (5, 13, 106)])
-def test_a_rollout_has_as_many_nodes_and_rows_as_there(
+def test_a_rollout_has_as_many_nodes_and_rows_as_in_the_thesis(
     file: str, engine: Engine, motions: int, nodes: int, rows: int
 ) -> None:
-    made = tree_of([motions])
-    store(made, engine)
-    assert made.nodes == 1 + nodes
+    rollouts = tree_of([motions])
+    store(rollouts, engine)
+    assert rollouts.nodes == 1 + nodes
     assert sum(rows_of(file).values()) == ROOT_ROWS + rows
 
 
 def test_one_navigation_is_eleven_inserts_over_eight_tables(file: str, engine: Engine) -> None:
-    made = tree_of([1])
-    navigation = made.rollouts[0]
+    rollouts = tree_of([1])
+    navigation = rollouts.rollouts[0]
     navigation.children.clear()
     statements = Statements(engine)
     store(Tree([navigation], 2), engine)
-    found = rows_of(file)
-    assert found == {
+    rows = rows_of(file)
+    assert rows == {
         "ProcessMetaData": 1,
         "TaskTreeNode": 2,
         "Designator": 1,
@@ -74,15 +74,15 @@ def test_one_navigation_is_eleven_inserts_over_eight_tables(file: str, engine: E
 
 
 def test_rows_with_a_key_of_their_own_take_a_statement_each_on_sqlite(file: str, engine: Engine) -> None:
-    made = tree(1_000, seed=1)
+    rollouts = tree(1_000, seed=1)
     statements = Statements(engine)
-    store(made, engine)
-    found = rows_of(file)
+    store(rollouts, engine)
+    rows = rows_of(file)
     roots = ("TaskTreeNode", "Designator", "RobotState", "Object", "Pose", "Position", "Quaternion", "ProcessMetaData")
-    own = {name: found.pop(name) for name in roots}
-    assert statements.sent == sum(own.values()) + len(found)
-    assert statements.sent / made.nodes == pytest.approx(7.0, abs=0.1)
-    assert (sum(own.values()) + sum(found.values())) / made.nodes == pytest.approx(9.05, abs=0.05)
+    own = {name: rows.pop(name) for name in roots}
+    assert statements.sent == sum(own.values()) + len(rows)
+    assert statements.sent / rollouts.nodes == pytest.approx(7.0, abs=0.1)
+    assert (sum(own.values()) + sum(rows.values())) / rollouts.nodes == pytest.approx(9.05, abs=0.05)
 
 
 @pytest.mark.soak
@@ -102,14 +102,14 @@ Fact = tuple[Any, ...]
 
 
 class Stored(NamedTuple):
-    """Where the values of a designator are: in a pose, in an object, in columns."""
+    """Places of the values of a designator: in a pose, in an object, in columns."""
 
     pose: str | None
     object: str | None
     scalars: tuple[str, ...]
 
 
-THERE = {
+IN_BASELINE = {
     "NavigateAction": Stored("pose_id", None, ()),
     "FaceAtAction": Stored("pose_id", None, ()),
     "LookAtAction": Stored("pose_id", None, ()),
@@ -119,39 +119,51 @@ THERE = {
     "MoveTCPMotion": Stored("pose_id", None, ("arm", "allow_gripper_collision")),
     "MoveGripperMotion": Stored(None, None, ("motion", "gripper", "allow_gripper_collision")),
 }
-HERE = {
-    "NavigateAction": ("navigate_action", THERE["NavigateAction"]._replace(pose="target_location_id")),
-    "FaceAtAction": ("face_at_action", THERE["FaceAtAction"]),
-    "LookAtAction": ("look_at_action", THERE["LookAtAction"]._replace(pose="target_id")),
-    "PickUpAction": ("pick_up_action", THERE["PickUpAction"]._replace(object="object_designator_id")),
-    "MoveMotion": ("move_motion", THERE["MoveMotion"]._replace(pose="target_id")),
-    "LookingMotion": ("looking_motion", THERE["LookingMotion"]._replace(pose="target_id")),
-    "MoveTCPMotion": ("move_tcp_motion", THERE["MoveTCPMotion"]._replace(pose="target_id")),
-    "MoveGripperMotion": ("move_gripper_motion", THERE["MoveGripperMotion"]),
+IN_OURS = {
+    "NavigateAction": ("navigate_action", IN_BASELINE["NavigateAction"]._replace(pose="target_location_id")),
+    "FaceAtAction": ("face_at_action", IN_BASELINE["FaceAtAction"]),
+    "LookAtAction": ("look_at_action", IN_BASELINE["LookAtAction"]._replace(pose="target_id")),
+    "PickUpAction": ("pick_up_action", IN_BASELINE["PickUpAction"]._replace(object="object_designator_id")),
+    "MoveMotion": ("move_motion", IN_BASELINE["MoveMotion"]._replace(pose="target_id")),
+    "LookingMotion": ("looking_motion", IN_BASELINE["LookingMotion"]._replace(pose="target_id")),
+    "MoveTCPMotion": ("move_tcp_motion", IN_BASELINE["MoveTCPMotion"]._replace(pose="target_id")),
+    "MoveGripperMotion": ("move_gripper_motion", IN_BASELINE["MoveGripperMotion"]),
 }
 
 
-def expected(made: Tree) -> list[Fact]:
-    """From the values themselves."""
+def expected(rollouts: Tree) -> list[Fact]:
+    """Return the facts of the values themselves."""
     facts = []
 
     def note(node: Node, parent_ns: int) -> None:
         values = list(node.values.values())
         place = next((each for each in values if isinstance(each, Place)), None)
-        thing = next((each for each in values if isinstance(each, Thing)), None)
-        scalars = tuple(each for each in values if not isinstance(each, Place | Thing))
+        world_object = next((each for each in values if isinstance(each, WorldObject)), None)
+        scalars = tuple(each for each in values if not isinstance(each, Place | WorldObject))
         robot = (*_flat(node.robot.place), node.robot.torso_m) if node.robot else (None,) * 9
         status = "FAILED" if node.failure else "SUCCEEDED"
         times = (node.start_ns // 1000, node.end_ns // 1000)
-        seen = (thing.name, thing.type, *_flat(thing.place)) if thing else (None,) * 10
+        object_values = (
+            (world_object.name, world_object.type, *_flat(world_object.place)) if world_object else (None,) * 10
+        )
         facts.append(
-            (node.dtype, *times, status, node.failure, parent_ns // 1000, *robot, *_flat(place), *seen, *scalars)
+            (
+                node.dtype,
+                *times,
+                status,
+                node.failure,
+                parent_ns // 1000,
+                *robot,
+                *_flat(place),
+                *object_values,
+                *scalars,
+            )
         )
         for child in node.children:
             note(child, node.start_ns)
 
-    for rollout in made.rollouts:
-        note(rollout, made.began_ns)
+    for rollout in rollouts.rollouts:
+        note(rollout, rollouts.began_ns)
     return sorted(facts, key=lambda fact: fact[1])
 
 
@@ -161,9 +173,9 @@ def _flat(place: Place | None) -> Fact:
     return (*place.position, *place.orientation, place.time_ns // 1000)
 
 
-def stored_there(url: str) -> list[Fact]:
+def stored_by_baseline(url: str) -> list[Fact]:
     facts: list[Fact] = []
-    for dtype, (pose, thing, scalars) in THERE.items():
+    for dtype, (pose, object_column, scalars) in IN_BASELINE.items():
         columns = ", ".join(f"leaf.{each}" for each in scalars)
         statement = f"""
             SELECT node.start_time, node.end_time, node.status, node.reason, parent.start_time,
@@ -182,7 +194,7 @@ def stored_there(url: str) -> list[Fact]:
             LEFT JOIN Pose AS pose ON pose.id = {f"leaf.{pose}" if pose else "NULL"}
             LEFT JOIN Position AS p ON p.id = pose.position_id
             LEFT JOIN Quaternion AS q ON q.id = pose.orientation_id
-            LEFT JOIN Object AS object ON object.id = {f"leaf.{thing}" if thing else "NULL"}
+            LEFT JOIN Object AS object ON object.id = {f"leaf.{object_column}" if object_column else "NULL"}
             LEFT JOIN Pose AS object_pose ON object_pose.id = object.pose_id
             LEFT JOIN Position AS op ON op.id = object_pose.position_id
             LEFT JOIN Quaternion AS oq ON oq.id = object_pose.orientation_id"""
@@ -201,9 +213,9 @@ def _us(text: str | None) -> int | None:
     return seconds * 1_000_000 + micros
 
 
-def stored_here(url: str) -> list[Fact]:
+def stored_by_us(url: str) -> list[Fact]:
     facts: list[Fact] = []
-    for dtype, (table, (pose, thing, scalars)) in HERE.items():
+    for dtype, (table, (pose, object_column, scalars)) in IN_OURS.items():
         columns = ", ".join(f"leaf.{each}" for each in scalars)
         flat = ", ".join(
             f"{name}.{each}" for name in ("robot", "pose") for each in ("x", "y", "z", "qx", "qy", "qz", "qw", "time")
@@ -216,22 +228,22 @@ def stored_here(url: str) -> list[Fact]:
             JOIN {table} AS leaf ON leaf.id = node.id
             LEFT JOIN pose AS robot ON robot.id = node.robot_pose_id
             LEFT JOIN pose ON pose.id = {f"leaf.{pose}" if pose else "NULL"}
-            LEFT JOIN object ON object.id = {f"leaf.{thing}" if thing else "NULL"}
+            LEFT JOIN object ON object.id = {f"leaf.{object_column}" if object_column else "NULL"}
             LEFT JOIN pose AS op ON op.id = object.pose_id WHERE node.dtype = '{dtype}'"""
         facts += [(dtype, *row) for row in ask(url, statement)]
     return sorted(facts, key=lambda fact: fact[1])
 
 
 def test_the_baseline_holds_the_facts_of_the_tree(file: str, engine: Engine) -> None:
-    made = tree_of([1, 5, 3, 1])
-    store(made, engine)
-    assert stored_there(file) == expected(made)
+    rollouts = tree_of([1, 5, 3, 1])
+    store(rollouts, engine)
+    assert stored_by_baseline(file) == expected(rollouts)
 
 
 def test_ours_holds_the_facts_of_the_tree(tmp_path: Path) -> None:
-    made = tree_of([1, 5, 3, 1])
+    rollouts = tree_of([1, 5, 3, 1])
     url = f"sqlite:///{tmp_path}/ours.db"
-    spool_tree(made, tmp_path / "spool")
+    spool_tree(rollouts, tmp_path / "spool")
     report = asyncio.run(recover(url, spool=tmp_path / "spool"))
     assert (report.failed, report.lost, report.drained.stopped) == ({}, (), {})
-    assert stored_here(url) == expected(made)
+    assert stored_by_us(url) == expected(rollouts)

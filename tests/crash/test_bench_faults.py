@@ -118,7 +118,7 @@ def test_the_quick_version_makes_every_fault_and_costs_nothing(names: list[str])
     bad = [each for each in outcomes if any(each[name] for name in COST)]
     assert (code, bad) == (0, []), said
     assert [each["fault"] for each in outcomes] == names
-    made = [each for each in outcomes if not each["note"].startswith("not made: there is no right to mount")]
+    made = [each for each in outcomes if not each["note"].startswith("skipped: no permission to mount")]
     assert all(each["rounds"] >= 2 and each["events"] >= 20 for each in made)
     assert all(each["told"] > 0 for each in outcomes if each["fault"] == "flipped bit")
 
@@ -171,7 +171,7 @@ _BREAKS = [
     (forgets_the_last, "lost"),
     (gives_the_last_twice, "duplicated"),
     (swaps_two, "misordered"),
-    (changes_one, "changed"),
+    (changes_one, "corrupted"),
 ]
 _SEEN = [(fault, *each) for fault in (files.torn_writes, files.failed_syncs, files.clock_jumps) for each in _BREAKS]
 
@@ -238,7 +238,7 @@ def test_a_round_is_verified_while_none_of_its_events_is_on_its_way(
 
     monkeypatch.setattr(restores, "verify", verify_later)
     outcome = restores.restored_servers(1, random.Random(IN_AN_EPISODE), tmp_path, lambda: None)
-    assert (outcome.rounds, outcome.changed, outcome.rounds_failed) == (1, 0, [])
+    assert (outcome.rounds, outcome.corrupted, outcome.rounds_failed) == (1, 0, [])
 
 
 @pytest.mark.usefixtures("only_flushes_fold")
@@ -254,5 +254,5 @@ def test_a_flush_that_folds_nothing_after_a_restore_is_seen(tmp_path: Path, monk
 
     monkeypatch.setattr(Backup, "restore", restore_and_break)
     outcome = restores.restored_servers(1, random.Random(IN_AN_EPISODE), tmp_path, lambda: None)
-    assert outcome.changed > 0
+    assert outcome.corrupted > 0
     assert outcome.rounds_failed == [1]

@@ -1,4 +1,7 @@
-"""Style as a test: sizes of files and folders, the first words of docstrings, and words that the glossary replaces."""
+"""Style as a test: sizes of files and folders, the first words of docstrings, and words that the glossary replaces.
+
+Sizes hold for the package; the rules for prose hold for the package and for `bench/`.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,15 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parent.parent.parent / "pycrorm_async"
+ROOT = Path(__file__).parent.parent.parent
+PACKAGE, BENCH = ROOT / "pycrorm_async", ROOT / "bench"
 MODULES = sorted(PACKAGE.rglob("*.py"))
+BENCH_MODULES = sorted(BENCH.rglob("*.py"))
 LINES_MAX = 400
 MODULES_MAX = 12
 OPENINGS = ("What", "Who", "Where", "How", "Which", "Whether")
+BENCH_OPENINGS = (*OPENINGS, "Each", "Every", "That", "So", "By", "Of", "With", "Without", "Until", "When", "All")
+"""The docstrings of `bench/` also do not open with a fragment that has no subject and no verb."""
 REPLACED = re.compile(
     r"\b(tells?|told|telling|hears?|heard|mends?|anew|lets? go|gives? up|gave up|puts? aside|goes on|went on"
     r"|looks? round|whoever|nobody|somebody|things?)\b",
@@ -34,6 +41,14 @@ def texts_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
                         yield part.lineno, part.value
 
 
+def docstrings_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Docstrings of modules, classes, functions and constants, with their lines."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(text))) if text.strip():
+                yield node.lineno, text
+
+
 def without_code(text: str) -> str:
     """The text without what is quoted as code, examples, and the names of arguments."""
     text = re.sub(r"(?m)^\s*(>>>|\.\.\.).*$|^ +\w+(, \w+)*:", "", text)
@@ -42,6 +57,17 @@ def without_code(text: str) -> str:
 
 def names_of(paths: list[Path]) -> list[str]:
     return [str(each.relative_to(PACKAGE)) for each in paths]
+
+
+def replaced_in(paths: list[Path]) -> list[str]:
+    """The places at which prose has a word that the glossary replaces."""
+    found = {
+        f"{path.relative_to(ROOT)}:{line}: {match.group()}"
+        for path in paths
+        for line, text in texts_of(ast.parse(path.read_text()))
+        for match in REPLACED.finditer(without_code(text))
+    }
+    return sorted(found)
 
 
 def test_no_file_is_longer_than_four_hundred_lines() -> None:
@@ -65,11 +91,27 @@ def test_every_module_has_a_docstring_that_opens_with_a_sentence() -> None:
 
 @pytest.mark.parametrize("folder", sorted({each.relative_to(PACKAGE).parts[0] for each in MODULES}))
 def test_prose_uses_the_words_of_the_glossary(folder: str) -> None:
-    replaced = [
-        f"{path.relative_to(PACKAGE)}:{line}: {match.group()}"
-        for path in MODULES
-        if path.relative_to(PACKAGE).parts[0] == folder
-        for line, text in texts_of(ast.parse(path.read_text()))
-        for match in REPLACED.finditer(without_code(text))
+    assert replaced_in([path for path in MODULES if path.relative_to(PACKAGE).parts[0] == folder]) == []
+
+
+def test_every_docstring_of_the_bench_opens_with_a_sentence() -> None:
+    openings = [
+        f"{path.relative_to(ROOT)}:{line}: {text.split()[0]}"
+        for path in BENCH_MODULES
+        for line, text in docstrings_of(ast.parse(path.read_text()))
+        if text.split()[0] in BENCH_OPENINGS
     ]
-    assert sorted(set(replaced)) == []
+    assert openings == []
+
+
+def test_every_script_of_the_bench_has_a_docstring() -> None:
+    assert [path.name for path in BENCH_MODULES if ast.get_docstring(ast.parse(path.read_text())) is None] == []
+
+
+def test_the_prose_of_the_bench_uses_the_words_of_the_glossary() -> None:
+    assert replaced_in(BENCH_MODULES) == []
+
+
+def test_the_page_of_the_bench_uses_the_words_of_the_glossary() -> None:
+    prose = re.sub(r"`[^`]*`", "", (BENCH / "README.md").read_text())
+    assert REPLACED.findall(prose) == []

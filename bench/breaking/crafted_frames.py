@@ -1,4 +1,4 @@
-"""Folders whose frames and headers were changed with all checksums made right: damage concerns its own folder alone."""
+"""Change frames and headers of folders and correct all checksums; damage must not affect any other folder."""
 
 from __future__ import annotations
 
@@ -22,48 +22,51 @@ from tests.queue.forged_segments import change_a_frame, change_the_header
 
 __all__ = ["crafted_folders"]
 
-_FOUND = "SELECT e.id, v.sequence, v.payload FROM event v JOIN episode e ON e.number = v.episode ORDER BY 1, 2"
+_STORED_EVENTS = "SELECT e.id, v.sequence, v.payload FROM event v JOIN episode e ON e.number = v.episode ORDER BY 1, 2"
 
 
 _FOLDERS = 10
-"""Changed in one round: most of its time goes into opening a database."""
+"""Folders to change in one round; several share a round, because opening the database takes most of its time."""
 
 
 def crafted_folders(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """Ten of eleven folders are changed; the other is stored whole, and of each changed one all before the change."""
+    """Change ten of eleven folders; the other is stored completely, and each changed one up to its first change."""
     outcome = Outcome()
-    changed = refused = 0
+    changes_total = refused = 0
     for _ in range(rounds):
         place = Path(tempfile.mkdtemp(dir=folder))
         spool, url = place / "spool", f"sqlite:///{place / 'memory.db'}"
         authors = [_author(spool, number, rng) for number in range(1, _FOLDERS + 2)]
-        whole = authors.pop(rng.randrange(len(authors)))
-        sure = events_of(whole.records)
+        intact_author = authors.pop(rng.randrange(len(authors)))
+        expected = events_of(intact_author.records)
         for crafted in authors:
-            path, changes, safe = rng.choice(crafted.segments), rng.choice((1, 1, 2, 5)), 0
+            path, changes_of_folder, intact_records = rng.choice(crafted.segments), rng.choice((1, 1, 2, 5)), 0
             if rng.random() < 0.2:
                 change_the_header(path, rng)
             else:
-                safe = max(1, min(change_a_frame(path, rng, fitting=rng.random() < 0.8) for _ in range(changes))) - 1
-            sure += events_of(crafted.records[:safe])
-            changed += changes
-        refused += _stored(url, spool)
+                intact_records = (
+                    max(1, min(change_a_frame(path, rng, fitting=rng.random() < 0.8) for _ in range(changes_of_folder)))
+                    - 1
+                )
+            expected += events_of(crafted.records[:intact_records])
+            changes_total += changes_of_folder
+        refused += _recover_spool(url, spool)
         inspect_spool(spool)
         for each in Spool(spool).recorders():
-            with suppress(PycrormError):  # a segment of another recorder: reported, and left alone
+            with suppress(PycrormError):  # a segment of another recorder is reported and not repaired
                 repair_folder(each.path)
-        _stored(url, spool)
-        found = [(name, sequence, payload.encode().hex()) for name, sequence, payload in ask(url, _FOUND)]
-        acknowledged = set(sure)
-        outcome.compare(sure, [each for each in found if each in acknowledged])
+        _recover_spool(url, spool)
+        stored = [(name, sequence, payload.encode().hex()) for name, sequence, payload in ask(url, _STORED_EVENTS)]
+        expected_events = set(expected)
+        outcome.compare(expected, [each for each in stored if each in expected_events])
         shutil.rmtree(place)
         step()
-    outcome.note = f"{changed:,} changes; {refused:,} folders refused as damaged; the one beside them stored whole"
+    outcome.note = f"{changes_total:,} changes; {refused:,} folders refused as damaged; all intact folders stored"
     return outcome
 
 
-def _stored(url: str, spool: Path) -> int:
-    """How many folders were refused; anything but a report of it ends the bench."""
+def _recover_spool(url: str, spool: Path) -> int:
+    """Recover the spool; return the number of folders that were refused. Any other error ends the benchmark."""
     return len(asyncio.run(recover(url, spool=spool)).failed)
 
 

@@ -1,4 +1,4 @@
-"""How the system of the thesis stored a task tree: objects for all of it, then one commit."""
+"""Store a task tree as the system of the thesis did: objects for all rows, then one commit."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bench.baseline.tables import (
     RobotStateRow,
     TaskTreeNodeRow,
 )
-from bench.material.rollouts import Node, Place, Robot, Thing, Tree
+from bench.material.rollouts import Node, Place, Robot, Tree, WorldObject
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
 
 __all__ = ["engine_of", "Statements", "store"]
@@ -33,7 +33,7 @@ _ENUMS: dict[str, type[Enum]] = {"arm": Arms, "gripper": Arms, "grasp": Grasp, "
 
 
 class Statements:
-    """Counts what an engine is told to insert: statements sent, and rows in them."""
+    """Count the INSERT statements that an engine sends."""
 
     def __init__(self, engine: Engine) -> None:
         self.sent = 0
@@ -44,29 +44,29 @@ class Statements:
 
 
 def engine_of(url: str) -> Engine:
-    """A synchronous engine, as the original had, with its tables made."""
-    place = make_url(url)
-    if place.get_backend_name() == "postgresql":
-        place = place.set(drivername="postgresql+psycopg")
-    engine = create_engine(place)
+    """Create a synchronous engine, as in the original, and its tables."""
+    address = make_url(url)
+    if address.get_backend_name() == "postgresql":
+        address = address.set(drivername="postgresql+psycopg")
+    engine = create_engine(address)
     BaselineBase.metadata.create_all(engine)
     return engine
 
 
-def store(made: Tree, engine: Engine) -> None:
-    """The whole tree in one session and one commit."""
+def store(tree: Tree, engine: Engine) -> None:
+    """Store the whole tree in one session and one commit."""
     with Session(engine) as session:
         metadata = MetaDataRow("bench", "rollouts", None)
         session.add(metadata)
-        inserting = _Inserting(session, metadata)
-        root = inserting.add(TaskTreeNodeRow(_time(made.began_ns), None, NodeStatus.RUNNING, None))
-        for rollout in made.rollouts:
-            inserting.node(rollout, root)
+        inserts = _Inserts(session, metadata)
+        root = inserts.add(TaskTreeNodeRow(_time(tree.began_ns), None, NodeStatus.RUNNING, None))
+        for rollout in tree.rollouts:
+            inserts.node(rollout, root)
         session.commit()
 
 
-class _Inserting:
-    """Adds each value's rows to the session, those it depends on first."""
+class _Inserts:
+    """Add the rows of each value to the session after the rows that it depends on."""
 
     def __init__(self, session: Session, metadata: MetaDataRow) -> None:
         self._session = session
@@ -93,7 +93,7 @@ class _Inserting:
             match value:
                 case Place():
                     linked["pose"] = self._pose(value)
-                case Thing():
+                case WorldObject():
                     linked["object"] = self._object(value)
                 case str():
                     scalars[name] = _ENUMS[name][value]
@@ -115,9 +115,9 @@ class _Inserting:
         pose: PoseRow = self.add(row)
         return pose
 
-    def _object(self, thing: Thing) -> ObjectRow:
-        row = ObjectRow(ObjectType[thing.type], thing.name)
-        row.pose = self._pose(thing.place)
+    def _object(self, world_object: WorldObject) -> ObjectRow:
+        row = ObjectRow(ObjectType[world_object.type], world_object.name)
+        row.pose = self._pose(world_object.place)
         stored: ObjectRow = self.add(row)
         return stored
 
@@ -129,5 +129,5 @@ class _Inserting:
 
 
 def _time(time_ns: int) -> datetime:
-    """Without a time zone, as there."""
+    """Return a datetime without a time zone, as in the original."""
     return datetime.fromtimestamp(time_ns // 1000 / 1e6, UTC).replace(tzinfo=None)

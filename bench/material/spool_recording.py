@@ -1,4 +1,4 @@
-"""The same task tree as our hooks would have recorded it: events in a spool, by the real queue."""
+"""Record task trees as events in a spool, by the real queue, as the hooks would record them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from bench.material.rollouts import MILK, SHARES, Node, Place, Robot, Thing, Tree, tree_of
+from bench.material.rollouts import MILK, SHARES, Node, Place, Robot, Tree, WorldObject, tree_of
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.events.envelope import Heading
@@ -55,35 +55,35 @@ _CLASSES: tuple[type[Designator], ...] = (
 DECLARED: dict[str, DeclaredType] = {each.dtype: declared_type(each) for each in _CLASSES}
 
 
-def spool_tree(made: Tree, spool: Path) -> int:
-    """Writes the tree into a new recorder's folder, as one closed episode, and leaves it; the number of its events."""
+def spool_tree(tree: Tree, spool: Path) -> int:
+    """Write the tree as one closed episode into the folder of a dead recorder; return the number of events."""
     recording = Recording(spool)
     recording.declare()
-    recording.begin(made.began_ns)
-    for rollout in made.rollouts:
+    recording.begin(tree.began_ns)
+    for rollout in tree.rollouts:
         recording.put_tree(rollout, recording.root)
     recording.end()
     return recording.leave() - len(DECLARED)
 
 
 def spool_rollouts(count: int, spool: Path, *, seed: int, an_episode: int = 100) -> int:
-    """So many rollouts in episodes of a hundred, by one recorder that is gone then; the number of its events.
+    """Write `count` rollouts in episodes of `an_episode` into the folder of a dead recorder; return the event count.
 
-    Each turns out as one of the thesis by chance. Needs memory for one episode only.
+    The outcome of each rollout is drawn with the shares of the thesis. Only one episode is in memory at a time.
     """
-    recording, chance = Recording(spool), random.Random(seed)
+    recording, rng = Recording(spool), random.Random(seed)
     recording.declare()
     for first in range(0, count, an_episode):
-        made = tree_of(chance.choices((5, 3, 1), SHARES, k=min(an_episode, count - first)), seed + first)
-        recording.begin(made.began_ns)
-        for rollout in made.rollouts:
+        tree = tree_of(rng.choices((5, 3, 1), SHARES, k=min(an_episode, count - first)), seed + first)
+        recording.begin(tree.began_ns)
+        for rollout in tree.rollouts:
             recording.put_tree(rollout, recording.root)
         recording.end()
     return recording.leave() - len(DECLARED)
 
 
 class Recording:
-    """One recorder that writes one episode after the other; what it puts happens when the values say it did."""
+    """A recorder that writes episodes one after the other, with the times of the values instead of the clock."""
 
     def __init__(self, spool: Path, *, settings: Settings | None = None, live: bool = False) -> None:
         self._now_ns = 1
@@ -97,13 +97,13 @@ class Recording:
         self.root = 0
 
     def declare(self) -> None:
-        """Once, before the first episode."""
+        """Declare the types; call it once, before the first episode."""
         for each in DECLARED.values():
             heading = Heading(None, DesignatorTypeDeclared.__name__, DesignatorTypeDeclared.version)
             self._emitter.put_payload(heading, each.payload)
 
     def begin(self, began_ns: int) -> None:
-        """A new episode, with its root and the milk."""
+        """Begin an episode with its root and the milk."""
         self._now_ns = began_ns
         self._episode = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
         self._put(EpisodeStarted("rollouts", "bench", "here", __version__, "3"))
@@ -116,7 +116,7 @@ class Recording:
         self._put(EpisodeEnded("SUCCEEDED"))
 
     def put_tree(self, node: Node, parent: int, *, after: Callable[[], None] | None = None) -> None:
-        """This node and all below it; `after` is called when a node has ended."""
+        """Put this node and its descendants; `after` is called after the end of each node."""
         declared = DECLARED[node.dtype]
         self._now_ns = node.start_ns
         sequence = self._put(
@@ -137,7 +137,7 @@ class Recording:
             after()
 
     def leave(self) -> int:
-        """All of it is synced, and the folder is that of a recorder that is gone; how many records it holds."""
+        """Sync everything and close the recorder, so that its folder is dead; return the number of its records."""
         asyncio.run(self.queue.synced_to(self.queue.written))
         count = self.queue.written
         self.queue.close()
@@ -151,7 +151,7 @@ class Recording:
         match value:
             case Place():
                 return _pose(value)
-            case Thing():
+            case WorldObject():
                 return self._milk
             case _:
                 return value
