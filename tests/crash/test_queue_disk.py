@@ -90,8 +90,15 @@ def small_disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
         return
     allocate = os.posix_fallocate
 
+    def used_bytes() -> int:
+        while True:  # the other thread may rename a file while it is counted
+            with contextlib.suppress(FileNotFoundError):
+                sizes, again = ({path: path.stat().st_size for path in disk.rglob("*")} for _ in range(2))
+                if sizes == again:
+                    return sum(sizes.values())
+
     def allocate_on_a_small_disk(descriptor: int, offset: int, size: int) -> None:
-        if sum(path.stat().st_size for path in disk.rglob("*")) + size > 2**18:
+        if used_bytes() + size > 2**18:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         allocate(descriptor, offset, size)
 
