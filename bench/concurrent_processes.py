@@ -12,6 +12,7 @@ import os
 import threading
 import time
 from contextlib import ExitStack
+from operator import le
 from pathlib import Path
 
 from sqlalchemy import func, select
@@ -77,9 +78,9 @@ class _Durations:
         self.by_phase = {phase: {"times": 0, "longest_ms": 0.0} for phase in ("calm", "rebuilding")}
 
     def add(self, phase: str, began_s: float) -> None:
-        wait = self.by_phase[phase]
-        wait["times"] += 1
-        wait["longest_ms"] = max(wait["longest_ms"], round((time.perf_counter() - began_s) * 1e3, 1))
+        operations = self.by_phase[phase]
+        operations["times"] += 1
+        operations["longest_ms"] = max(operations["longest_ms"], round((time.perf_counter() - began_s) * 1e3, 1))
 
 
 def _record_until_stopped(url: str, spool: Path) -> None:
@@ -121,9 +122,7 @@ async def _query(url: str, commands: _Commands) -> None:
             async with reading.session() as session:
                 totals = [(await session.scalars(select(func.count()).select_from(each))).one() for each in _COUNTED]
                 counts = (*totals, len((await session.scalars(first)).all()))
-            assert all(before <= after for before, after in zip(previous, counts, strict=True)), (
-                f"{counts} after {previous}"
-            )
+            assert all(map(le, previous, counts)), f"{counts} after {previous}"
             queried.add(phase, began_s)
             if not any(previous):
                 print("asks", flush=True)

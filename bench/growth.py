@@ -94,7 +94,7 @@ def nodes_per_s(
         spools.append(folder.with_suffix(f".{number}"))
         for recorder in range(recorders):
             complete_folders.append((folder.with_suffix(f".{number}.{recorder}.made"), spools[-1]))
-            events += _spooled(complete_folders[-1][0], nodes // recorders, an_episode)
+            events += _spool(complete_folders[-1][0], nodes // recorders, an_episode)
     running = [start_daemon(url, spool) for spool in spools]
     try:
         began = time.perf_counter()
@@ -108,7 +108,7 @@ def nodes_per_s(
             stop(each)
 
 
-def _spooled(folder: Path, nodes: int, an_episode: int) -> int:
+def _spool(folder: Path, nodes: int, an_episode: int) -> int:
     """Spool about `nodes` nodes in episodes of about `an_episode` nodes; return the number of events."""
     rollouts = max(1, round(nodes / _NODES_A_ROLLOUT))
     return spool_rollouts(rollouts, folder, seed=_SEED, an_episode=max(1, round(an_episode / _NODES_A_ROLLOUT)))
@@ -125,7 +125,7 @@ def add_episodes(databases: Databases, sizes: Sizes) -> dict[str, dict[str, floa
             rates: list[float] = []
             for more in (max(1, episodes - stored_episodes), *[sizes.episodes[0]] * 3):
                 complete = spool.with_suffix(f".{number}.{len(rates)}.{more}")
-                events = _spooled(complete, more * 100, 100)
+                events = _spool(complete, more * 100, 100)
                 folded = progress(url).folded
                 began = time.perf_counter()
                 for recorder_folder in complete.iterdir():
@@ -186,8 +186,8 @@ def curve(values: tuple[int, ...], turns: int, rate: Callable[[int], float]) -> 
             measured_rates.append(rate(value))
             console().print(f"    {value:,}: {measured_rates[-1]:,.0f} nodes/s")
     medians = {value: statistics.median(measured_rates) for value, measured_rates in rates.items()}
-    good = [value for value, median in medians.items() if median >= _KNEE_SHARE * max(medians.values())]
-    return {**{str(value): spread(measured_rates) for value, measured_rates in rates.items()}, "knee": max(good)}
+    near_best = [value for value, median in medians.items() if median >= _KNEE_SHARE * max(medians.values())]
+    return {**{str(value): spread(measured_rates) for value, measured_rates in rates.items()}, "knee": max(near_best)}
 
 
 def measure(databases: Databases, sizes: Sizes, turns: int, *, postgresql: bool) -> dict[str, Any]:

@@ -64,16 +64,16 @@ class FullDisksOn:
         with disk.mounted():
             for _ in range(rounds):
                 if self._kind == "btrfs":
-                    _refused(outcome, disk.root, folder, rng)
+                    _refuse_on_btrfs(outcome, disk.root, folder, rng)
                 else:
-                    _filled(outcome, disk.root, rng)
+                    _fill_under_a_recorder(outcome, disk.root, rng)
                 step()
         if self._kind == "btrfs":
             outcome.note = "a spool on btrfs is refused; the events are of a second recorder on another disk"
         return outcome
 
 
-def _filled(outcome: Outcome, root: Path, rng: random.Random) -> None:
+def _fill_under_a_recorder(outcome: Outcome, root: Path, rng: random.Random) -> None:
     spool = root / "spool"
     recorder = ChildProcess(_record_on_a_full_disk, str(spool), rng.randrange(2**31))
     try:
@@ -87,7 +87,7 @@ def _filled(outcome: Outcome, root: Path, rng: random.Random) -> None:
     put_before = [(episode_text(_EPISODE), int(words[1]), words[2]) for words in lines if words[0] == "put"]
     (root / "filler").unlink()
     recovered = [
-        each for folder in Spool(spool).recorders() for each in events_of(asyncio.run(_recovered(folder.path)))
+        each for folder in Spool(spool).recorders() for each in events_of(asyncio.run(_recover_only(folder.path)))
     ]
     attempted = [(episode_text(_EPISODE), len(put_before) + 1, each[2]) for each in recovered[len(put_before) :][:1]]
     outcome.compare(put_before, recovered, put=attempted)
@@ -106,7 +106,7 @@ def _fill(root: Path) -> None:
                 size //= 2
 
 
-def _refused(outcome: Outcome, root: Path, folder: Path, rng: random.Random) -> None:
+def _refuse_on_btrfs(outcome: Outcome, root: Path, folder: Path, rng: random.Random) -> None:
     try:
         _queue(root / "spool").release()
     except SpoolUnavailable as refusal:
@@ -119,7 +119,7 @@ def _refused(outcome: Outcome, root: Path, folder: Path, rng: random.Random) -> 
     expected = [put(queue, "EpisodeStarted", b"{}")]
     expected += [put(queue, "NodeStarted", rng.randbytes(40).hex().encode()) for _ in range(rng.randrange(10, 60))]
     queue.release()
-    outcome.compare(expected, events_of(asyncio.run(_recovered(queue.folder))))
+    outcome.compare(expected, events_of(asyncio.run(_recover_only(queue.folder))))
     shutil.rmtree(folder / "spool")
     (root / "filler").unlink()
 
@@ -268,7 +268,7 @@ def _queue(spool: Path, settings: Settings = _SETTINGS) -> RecorderQueue:
     return RecorderQueue.create(spool, settings=settings, clock=SYSTEM_CLOCK, recorder=recorder)
 
 
-async def _recovered(folder: Path) -> list[Record]:
+async def _recover_only(folder: Path) -> list[Record]:
     """Recover the only recorder of the spool, and return its records."""
     [(records, _)] = await _folders(folder.parent)
     return records

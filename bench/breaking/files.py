@@ -200,13 +200,13 @@ def full_disk(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outc
     for _ in range(rounds):
         place = Path(tempfile.mkdtemp(dir=folder))
         with _small_disk(place) as kind:
-            asyncio.run(_filled(outcome, place / "spool", rng))
+            asyncio.run(_fill_and_empty(outcome, place / "spool", rng))
         outcome.note = kind
         step()
     return outcome
 
 
-async def _filled(outcome: Outcome, spool: Path, rng: random.Random) -> None:
+async def _fill_and_empty(outcome: Outcome, spool: Path, rng: random.Random) -> None:
     queue = RecorderQueue.create(spool, settings=ON_A_SMALL_DISK, clock=SYSTEM_CLOCK, recorder=RECORDER)
     expected = [put(queue, "EpisodeStarted", b"{}")]
     drained: list[Event] = []

@@ -119,7 +119,7 @@ def killed_appenders(new_database: Callable[[Path], str]) -> Callable[[int, rand
         for _ in range(rounds):
             lines = _lines_until_killed(_append, (url, max(stored - 1, 0)), rng.random() * _LONGEST_LIFE_S)
             appended = max([stored, *(int(line[1]) + 1 for line in lines if line[0] == "appended")])
-            heads = _settled(url) or [0, 0]
+            heads = _wait_for_heads(url) or [0, 0]
             outcome.lost += sum(max(0, appended * PER_BATCH - head) for head in heads)
             outcome.misordered += sum(head % PER_BATCH != 0 for head in heads)  # a batch is stored in part
             stored = heads[0] // PER_BATCH
@@ -137,7 +137,7 @@ def killed_appenders(new_database: Callable[[Path], str]) -> Callable[[int, rand
     return killed
 
 
-def _settled(url: str) -> list[int]:
+def _wait_for_heads(url: str) -> list[int]:
     """Return the heads once they no longer change, because a server may still execute a dead client's COMMIT."""
     previous: list[int] = [-1]
     while True:
