@@ -8,6 +8,7 @@ pose. Foreign keys are not enforced, because that would cost a third of the writ
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, Table, Text
@@ -260,7 +261,16 @@ def make_table(name: str, columns: dict[str, Storage], generation: int, stored: 
     """Return the table with its indexes, in one generation.
 
     `stored` maps a column of the layout to its name in this database; the table's column keys are those of the layout.
+    The latest tables are kept, because the views of all tables are made again whenever one is added.
     """
+    return _make_table(name, tuple(columns.items()), generation, stored)
+
+
+@lru_cache(maxsize=512)
+def _make_table(
+    name: str, items: tuple[tuple[str, Storage], ...], generation: int, stored: Callable[[str], str]
+) -> Table:
+    columns = dict(items)
     table = Table(
         physical_name(name, generation),
         MetaData(),

@@ -70,8 +70,7 @@ class SQLite:
         return LogIdentity._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
 
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
-        for statement in statements:
-            await connection.exec_driver_sql(statement)
+        await (await _driver(connection)).execute_in_turn((statement, ()) for statement in statements)
 
     async def insert_log(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None:
         await connection.exec_driver_sql(tables.INSERT_LOG, (birth.log_id, format_now, birth.created_wall_ns))
@@ -223,12 +222,11 @@ class SQLite:
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
-        for name, text in before.items():
-            if after.get(name) != text:
-                await connection.exec_driver_sql(f"DROP VIEW {_quote(name)}")
-        for name, text in after.items():
-            if before.get(name) != text:
-                await connection.exec_driver_sql(f"CREATE VIEW {_quote(name)} AS {text}")
+        drops = [f"DROP VIEW {_quote(name)}" for name, text in before.items() if after.get(name) != text]
+        changed = ((name, text) for name, text in after.items() if before.get(name) != text)
+        await self.execute_all(
+            connection, [*drops, *(f"CREATE VIEW {_quote(name)} AS {text}" for name, text in changed)]
+        )
 
     async def sweep(self, connection: AsyncConnection) -> None:
         """Do nothing: replaced views are dropped at once; readers have a snapshot."""
@@ -249,8 +247,8 @@ class SQLite:
             yield claimed
 
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
-        for name, text in views.items():
-            await connection.exec_driver_sql(f"CREATE TEMP VIEW {_quote(name)} AS {text}")
+        creations = [f"CREATE TEMP VIEW {_quote(name)} AS {text}" for name, text in views.items()]
+        await self.execute_all(connection, creations)
 
     async def insertion(self, rows: RowsByTable) -> Insertion:
         insertions = []
