@@ -12,8 +12,9 @@ import threading
 import traceback
 import warnings
 from multiprocessing import forkserver
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 from unittest import mock
 
 COMMAND = [sys.executable, "-W", "error", "-m", "pycrorm_async"]
@@ -26,8 +27,19 @@ def environment() -> dict[str, str]:
 
 
 _VERBS = "copy demo episodes events rebuild run show spool status verify writer".split()
-_LOADED = [f"pycrorm_async.cli.{name}" for name in ("main", *_VERBS)]
+_LOADED = [*(f"pycrorm_async.cli.{name}" for name in ("main", *_VERBS)), "tests.preloaded"]
 _starting = threading.Lock()
+FORKED: Final = multiprocessing.get_context("forkserver")
+"""Makes processes by forking one that has loaded the program. A process of tests has one such server, see `fork`."""
+
+
+def fork(process: ForkServerProcess) -> None:
+    """Start a process of `FORKED`, always from a server that has loaded the same modules."""
+    with _starting:
+        FORKED.set_forkserver_preload(_LOADED)
+        with mock.patch.dict(os.environ, environment(), clear=True):
+            forkserver.ensure_running()
+        process.start()
 
 
 def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subprocess.CompletedProcess[str]:
@@ -38,14 +50,9 @@ def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subpro
     """
     with tempfile.TemporaryDirectory() as folder:
         told = [Path(folder) / name for name in ("out", "err")]
-        context = multiprocessing.get_context("forkserver")
         words = [str(each) for each in arguments]
-        process = context.Process(target=_run, args=(words, str(cwd), *map(str, told)))
-        with _starting:
-            context.set_forkserver_preload(_LOADED)
-            with mock.patch.dict(os.environ, environment(), clear=True):
-                forkserver.ensure_running()
-            process.start()
+        process = FORKED.Process(target=_run, args=(words, str(cwd), *map(str, told)))
+        fork(process)
         process.join(timeout_s)
         if process.exitcode is None:
             process.kill()

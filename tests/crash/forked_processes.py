@@ -5,24 +5,16 @@ What they write to their output is in a pipe, which holds it when they die; thei
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import sys
 import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
+from tests.commands import FORKED, fork
+
 __all__ = ["Forked"]
 
-_FORKED = multiprocessing.get_context("forkserver")
-_FORKED.set_forkserver_preload(
-    [
-        "tests.crash.recorder_process",
-        "tests.crash.chore_robot",
-        "tests.crash.step_robot",
-        "tests.crash.rebuild_processes",
-    ]
-)
 _HANGS_S = 300.0
 
 
@@ -30,10 +22,10 @@ class Forked:
     """One process that calls `target`, and all it said."""
 
     def __init__(self, target: Callable[..., None], *arguments: object) -> None:
-        mine, its_output = _FORKED.Pipe(duplex=False)
-        its_input, self._input = _FORKED.Pipe(duplex=False)
-        self.process = _FORKED.Process(target=_speaking, args=(its_input, its_output, target, *arguments))
-        self.process.start()
+        mine, its_output = FORKED.Pipe(duplex=False)
+        its_input, self._input = FORKED.Pipe(duplex=False)
+        self.process = FORKED.Process(target=_speaking, args=(its_input, its_output, target, *arguments))
+        fork(self.process)
         its_input.close()
         its_output.close()
         self._output = mine
