@@ -5,8 +5,10 @@ through `Recorder` and `WorldRecorder`. Ends of nodes do so too, except when a p
 garbage collector closes its coroutines and thereby ends its nodes, in any thread and in the middle of whatever that
 thread is doing. The sampler's thread reads `id`, `world` and `continue_at`.
 
-`_open_nodes` holds every node that started and whose end is not written. `end_node` removes a node only after it has
-put the node's end into the queue, so a node whose end could not be written ends LOST with the episode.
+`_open_nodes` holds every node that started and whose end is not written. The call that removes a node writes its end,
+so no node has two; if writing raises, it restores the node, which then ends LOST with the episode. `_ending` holds a
+node while a thread writes its end. `end` and `continue_as` wait, for a limited time, until it is empty, because the end
+of a node must precede the end of the episode. `end_node` never waits, because the garbage collector may call it.
 
 A sequence has 26 bits, so an episode can run out of sequences. When one reaches `continue_at`, `continue_as` ends it,
 and the same `Episode` object continues under a new id, so that contexts and nodes that refer to it stay valid. Every
@@ -18,15 +20,16 @@ the duration of a node is the sum of its parts.
 
 Only a start, an observation or a change of the world triggers a follow-up, after it has been recorded itself. An end
 never does, because the garbage collector may cause it. Until the next start, events use the reserve of sequences behind
-`continue_at`, and the sampler takes only the first and the last sample of each motion. `continue_as` removes a node
-from `_open_nodes` before it writes the node's end, and skips a node that has been removed meanwhile, because the
-garbage collector may have ended it in this thread. `NodeRecord.episode_id` is the id under which the node's sequence
-counts; a node whose `episode_id` is not the episode's current id is never referred to in the follow-up.
+`continue_at`, and the sampler takes only the first and the last sample of each motion. If an end cannot be written, the
+next event tries again; `_interrupted` then holds the nodes that have an end and, if they still run then, are started
+again in the follow-up. `NodeRecord.episode_id` is the id under which the node's sequence counts; a node whose
+`episode_id` is not the episode's current id is never referred to in the follow-up.
 """
 
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final, Literal, NamedTuple
 
@@ -78,6 +81,8 @@ CONTINUED: Final = "EpisodeContinued"
 
 _RESERVE_EVENTS_MAX = 2**20
 """Bounds the sequences reserved behind `continue_at`: more open nodes than fit into a process' memory."""
+_LAST_ENDS_S = 1.0
+"""Bounds how long the end of an episode waits for ends of nodes in other threads; each takes microseconds."""
 
 
 class NodeRecord(NamedTuple):
@@ -123,10 +128,13 @@ class Episode:
         self._emitter = emitter
         self._opening = opening
         self._open_nodes: dict[int, TaskTreeNode] = {}
+        self._interrupted: dict[int, TaskTreeNode] = {}
+        self._ending: set[TaskTreeNode] = set()
         events_max = emitter.settings.episode_events_max
         self._continue_at: Final = events_max - min(events_max // 8, _RESERVE_EVENTS_MAX)
         self.continue_at = self._continue_at
         self._root = self._start(None, None)
+        self._root_ended = False
 
     def _start(self, continues: EpisodeId | None, root: int | None) -> int:
         """Write the start of the episode and of its root node; return the root's sequence."""
@@ -213,15 +221,16 @@ class Episode:
     def end_node(self, node: TaskTreeNode) -> None:
         """Write how a node ended."""
         record: NodeRecord = node.record
-        if self._open_nodes.get(record.sequence) is not node:
-            return
-        failure = failure_value(node.failure, self) if node.failure is not None else None
-        result = encode_or_missing(node.result, self) if node.result is not None else None
-        status: NodeStatus = node.status.value
-        assert node.designator is not None
-        self._put_end(NodeEnded(record.sequence, status, failure, result), node.designator.dtype)
-        # Not before the put: if it raises, the node must stay open, so that `end` writes it as LOST.
-        self._open_nodes.pop(record.sequence, None)
+        self._ending.add(node)  # before the removal, so that no thread that misses the node ends the episode
+        try:
+            if self._open_nodes.get(record.sequence) is node:
+                failure = failure_value(node.failure, self) if node.failure is not None else None
+                result = encode_or_missing(node.result, self) if node.result is not None else None
+                status: NodeStatus = node.status.value
+                assert node.designator is not None
+                self._close_node(NodeEnded(record.sequence, status, failure, result), node.designator.dtype)
+        finally:
+            self._ending.discard(node)
 
     def record_location(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
@@ -261,11 +270,12 @@ class Episode:
         if self.world is not None:
             self.leave_world(self.world.world, emptied=False)
         for sequence in sorted(self._open_nodes, reverse=True):
-            self._put_end(NodeEnded(sequence, "LOST"), "Episode")
-        self._open_nodes.clear()
+            self._close_node(NodeEnded(sequence, "LOST"), "Episode")
+        self._wait_for_ends()
         status, root_status = end_statuses(failure)
         value = failure_value(failure, self) if failure is not None else None
-        self._put_end(NodeEnded(self._root, root_status, value), "Episode")
+        if not self._root_ended:
+            self._put_end(NodeEnded(self._root, root_status, value), "Episode")
         ended = EpisodeEnded(status, value)
         try:
             self._emitter.put(self.id, ended)
@@ -274,19 +284,24 @@ class Episode:
 
     def continue_as(self, follow_up: EpisodeId, declared: Callable[[TaskTreeNode], DeclaredType]) -> dict[int, int]:
         """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
-        former, open_nodes, root, world = self.id, sorted(self._open_nodes.items()), self._root, self.world
-        if world is not None:
-            world.stop()
+        former, root, world = self.id, self._root, self.world
+        self._interrupted.update(self._open_nodes)
+        open_nodes = sorted(self._interrupted.items())
         reason = FailureValue(CONTINUED, f"the episode continues in episode {episode_text(follow_up)}")
         for sequence, node in reversed(open_nodes):
-            if self._open_nodes.pop(sequence, None) is node:  # the garbage collector may have just ended it
-                interrupted = NodeEnded(sequence, "INTERRUPTED", reason)
-                self._put_end(interrupted if node.ended_ns is None else NodeEnded(sequence, "LOST"), "Episode")
-        self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
+            interrupted = NodeEnded(sequence, "INTERRUPTED", reason)
+            self._close_node(interrupted if node.ended_ns is None else NodeEnded(sequence, "LOST"), "Episode")
+        self._wait_for_ends()
+        if not self._root_ended:  # it ended in an attempt before this one
+            self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
+            self._root_ended = True
         self._emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up)))
         self.id = follow_up
         last = self._root = self._start(former, root)
+        self._root_ended = False
+        self._interrupted.clear()
         if world is not None:
+            world.stop()
             self.world = WorldRecorder(self._emitter, follow_up, world.world, world.continue_)
             last = max(last, self.world.last)
         renumbered: dict[int, int] = {}
@@ -344,6 +359,23 @@ class Episode:
         except Exception as error:  # noqa: BLE001  the node is recorded without the robot's state
             self._emitter.note_fault("robot state", error)
             return None
+
+    def _close_node(self, event: NodeEnded, owner: str) -> None:
+        """Remove the node and write its end; no effect if it was removed, as the garbage collector may do meanwhile."""
+        node = self._open_nodes.pop(event.node, None)
+        if node is None:
+            return
+        try:
+            self._put_end(event, owner)
+        except BaseException:
+            self._open_nodes[event.node] = node  # so that it ends LOST with the episode
+            raise
+
+    def _wait_for_ends(self) -> None:
+        """Wait until other threads have written the ends of nodes that they are ending, for a limited time."""
+        deadline = time.monotonic() + _LAST_ENDS_S
+        while self._ending and time.monotonic() < deadline:
+            time.sleep(0.001)
 
     def _put_end(self, event: NodeEnded, owner: str) -> None:
         if event.failure is not None or event.result is not None:

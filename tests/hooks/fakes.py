@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -37,9 +37,18 @@ class ListSink:
         self.broken_starts = 0
         self.space = asyncio.Event()
         self.lock = threading.RLock()
+        self.fails_at: int | None = None
+        """The sequence whose put raises, once."""
+        self.before_end: Callable[[], None] = lambda: None
+        """Called before each end of a node is put."""
 
     def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+        if heading.type == "NodeEnded":
+            self.before_end()
         with self.lock:
+            if heading.episode is not None and self.sequences.get(heading.episode, 0) + 1 == self.fails_at:
+                self.fails_at = None
+                raise RuntimeError("the disk is on fire")
             return self._put(heading, payload, reserved)
 
     def _put(self, heading: Heading, payload: bytes, reserved: bool) -> int:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import math
+import threading
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
@@ -317,3 +319,71 @@ def test_how_many_events_an_episode_may_have_is_checked() -> None:
     for wrong in (0, 99, SEQUENCE_MAX + 1, 150.5):
         with pytest.raises(CallerError, match="from 100 to 67,108,863"):
             Settings(episode_events_max=wrong)  # type: ignore[arg-type]
+
+
+def outcomes(rig: Rig) -> Counter[str]:
+    """How often each note ended with an outcome of its own, by text; every part is in legal order."""
+    ended: Counter[str] = Counter()
+    for events in parts_of(rig.sink):
+        assert [each for each in findings(events) if each.kind != "remark"] == []
+        assert isinstance(events[-1][1], EpisodeEnded)
+        nodes = dict(only(events, NodeStarted))
+        for _, end in only(events, NodeEnded):
+            assert isinstance(end, NodeEnded)
+            if end.failure is None or end.failure.type != "EpisodeContinued":
+                ended[f"{getattr(nodes[end.node], 'parameters', {}).get('text', 'other')} {end.status}"] += 1
+    return ended
+
+
+@pytest.mark.parametrize("put", range(1, 6))
+async def test_a_follow_up_whose_event_cannot_be_written_is_tried_again_and_every_node_ends_once(put: int) -> None:
+    """The put of the follow-up that fails: the ends of note, shift and move, then of the root and the episode."""
+    with rigged(SMALL) as rig, rig.episode(), BulletWorld():
+        milk = Object("milk", ObjectType.MILK)
+
+        @dataclass
+        class MovingActionPerformable(ActionAbstract):
+            async def perform(self) -> None:
+                rig.sink.fails_at = MAX - MAX // 8 + put
+                await ShiftActionPerformable(60).perform()
+                milk.set_pose(Pose([1, 2, 3]))
+
+        await MovingActionPerformable().perform()
+    assert rig.emitter.faults.total == 1
+    assert rig.recorder.continued_count == 1
+    ended = {f"day {number} SUCCEEDED": 1 for number in range(60)} | {"other SUCCEEDED": 3}
+    if put > 1:  # its end says that the episode continues, and it had ended before the second attempt
+        del ended["day 41 SUCCEEDED"]
+    assert outcomes(rig) == Counter(ended)
+    moves = [event for events in parts_of(rig.sink) for _, event in only(events, ObjectMoved)]
+    assert [getattr(each, "pose", None).position for each in moves] == [(1, 2, 3)]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("continued", [True, False])
+async def test_the_end_of_an_episode_waits_for_a_node_that_another_thread_is_ending(*, continued: bool) -> None:
+    with rigged(SMALL) as rig, rig.episode():
+
+        async def late() -> None:
+            await NoteActionPerformable("late").perform()
+
+        ending, go = threading.Event(), threading.Event()
+
+        def pause() -> None:
+            if threading.current_thread() is thread:
+                ending.set()
+                go.wait(5)
+
+        rig.sink.before_end = pause
+        context = contextvars.copy_context()
+        thread = threading.Thread(target=lambda: context.run(asyncio.run, late()))
+        thread.start()
+        await asyncio.to_thread(ending.wait, 5)
+        timer = threading.Timer(0.1, go.set)
+        timer.start()
+        if continued:
+            await ShiftActionPerformable(60).perform()
+    thread.join()
+    timer.join()
+    assert rig.emitter.faults.total == 0
+    shifts = {f"day {number} SUCCEEDED": 1 for number in range(60)} | {"other SUCCEEDED": 2}
+    assert outcomes(rig) == Counter({"late SUCCEEDED": 1} | (shifts if continued else {"other SUCCEEDED": 1}))
