@@ -18,6 +18,8 @@ from tests.databases import ask, await_events
 pytestmark = pytest.mark.slow
 
 SMALL = ("learn", "--rollouts", "400", "--evaluate", "150", "--held-out", "150")
+BY_ONE = (*SMALL, "--workers", "1")
+"""The same rollouts. A worker takes two seconds to start, much longer than its rollouts."""
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,7 @@ def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> No
     assert "400 rollouts of this experiment are recorded already" in line
     assert "--resume" in line
     assert refused.returncode == 2
-    done = pycrorm(*SMALL, "--resume", "--figure", "two.svg", "--study", "2", cwd=folder)
+    done = pycrorm(*BY_ONE, "--resume", "--figure", "two.svg", "--study", "2", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "The same policies in other scenes" in done.stdout
     assert done.stdout.count("from the log") > 2
@@ -67,7 +69,7 @@ def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> No
 
 
 def test_a_study_asks_what_else_the_policy_is_worth(document: Any, folder: Path) -> None:
-    studied = answer(*SMALL, "--resume", "--study", "4", cwd=folder)["study"]
+    studied = answer(*BY_ONE, "--resume", "--study", "4", cwd=folder)["study"]
     assert len(studied["elsewhere"]) > 8
     assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {4}
     assert document["study"] is None
@@ -84,13 +86,13 @@ def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path
     *note, told = said.strip().splitlines()
     assert told == "pycrorm: interrupted; all events recorded so far are kept"
     assert note in ([], ["recorded events are being stored; Ctrl-C again exits at once without losing any"])
-    document = answer(*SMALL, *longer, "--resume", cwd=tmp_path)
+    document = answer(*BY_ONE, *longer, "--resume", cwd=tmp_path)
     assert [each["rollouts"] for each in document["phases"]] == [1_500, 150, 150]
     assert 0 < document["phases"][0]["done_now"] < 1_500
 
 
 def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: Path) -> None:
-    command = [*COMMAND, *SMALL, "--rollouts", "100000", "--json"]
+    command = [*COMMAND, *BY_ONE, "--rollouts", "100000", "--json"]
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -106,7 +108,7 @@ def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: P
     assert note == "recorded events are being stored; Ctrl-C again exits at once without losing any\n"
     assert (process.returncode, printed) == (130, "")
     assert told == "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
-    phase = answer(*SMALL, "--resume", cwd=tmp_path)["phases"][0]
+    phase = answer(*BY_ONE, "--resume", cwd=tmp_path)["phases"][0]
     assert (phase["rollouts"], phase["done_now"] < 400) == (400, True)
 
 
@@ -127,7 +129,7 @@ def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: P
 )
 def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...], code: int, words: str) -> None:
     (tmp_path / "folder.png").mkdir()
-    done = pycrorm(*SMALL, *arguments, cwd=tmp_path)
+    done = pycrorm(*BY_ONE, *arguments, cwd=tmp_path)
     assert words in one_line_of(done)
     assert done.returncode == code
 
