@@ -2,6 +2,8 @@
 
 import asyncio
 import contextlib
+import errno
+import os
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +13,9 @@ import pytest
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
 from pycrorm_async.queue import RecorderQueue
-from tests.queue.factories import DECLARED, SMALL, drain, make, node, started
+from pycrorm_async.queue.files.segment import Segment
+from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
+from tests.queue.factories import DECLARED, SMALL, Author, drain, make, node, started
 
 # Every node takes 976 bytes. The first segment holds the start and 3 of them, each other one 3: 24 in 8 segments.
 # Kept free are 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, and these hold 3.
@@ -161,3 +165,27 @@ def test_recorder_level_records_count_too(queue: RecorderQueue) -> None:
             put += 1 + queue.put_nowait(DECLARED, PAYLOAD)
     assert put == ORDINARY
     assert queue.full
+
+
+def test_a_disk_that_filled_up_while_a_segment_was_prepared_stays_full(
+    spool: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    appender = Author(spool, settings=replace(SMALL, spool_bytes_max=2**20)).appender
+    resume = GcSafeLock.resume_gc
+
+    def disk_is_full(*_: object, **__: object) -> Segment:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def fill_and_resume(lock: GcSafeLock) -> None:  # the sync thread has not noted yet that a segment is prepared
+        resume(lock)
+        monkeypatch.undo()
+        with monkeypatch.context() as patch:
+            patch.setattr(Segment, "allocate", disk_is_full)
+            for _ in range(2):
+                with pytest.raises(SpoolFull):
+                    while True:
+                        appender.put(started() if not appender.open else node(), PAYLOAD, True)
+
+    monkeypatch.setattr(GcSafeLock, "resume_gc", fill_and_resume)
+    appender.prepare()
+    assert not appender.admits_again(reserved=True)

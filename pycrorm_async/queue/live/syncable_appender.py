@@ -94,7 +94,8 @@ class SyncableAppender(Appender):
         return None
 
     def _note_preparation(self, refused: str | None) -> None:
-        self._disk_refused = refused
+        if refused is not None or self._prepared is not None:  # else a put has used it, and may have met a full disk
+            self._disk_refused = refused
         self._set_limits()
         self._forget_refused()
 
