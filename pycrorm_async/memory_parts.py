@@ -14,9 +14,9 @@ from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.plan.experience import experience
 from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.world.observers import watcher
-from pycrorm_async.writer.delegated_writer import DelegatedWriter
 from pycrorm_async.writer.writer_thread import WriterThread
 
 __all__ = ["Parts"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -139,7 +139,8 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
         for projection in projections:
             lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
-        _warn(limits_near)
+        for warning in limits_near:
+            note(f"warning: {warning}")
     if fault is not None:
         problem(fault)
         return 3
@@ -168,11 +169,6 @@ def _report_halted(projections: Sequence[ProjectionState]) -> bool:
         for number, reason in projection.parked.items():
             problem(f"episode {number} is stopped in the projection {projection.name}: {reason}")
     return any(each.parked or each.fault for each in projections)
-
-
-def _warn(warnings: Iterable[str]) -> None:
-    for warning in warnings:
-        note(f"warning: {warning}")
 
 
 def _workers(note: bytes | None) -> Sequence[FoldWorkerState]:
@@ -217,8 +213,8 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
         None if status is None else status.stored,
         None if status is None else status.folded,
         report.bytes_spooled,
-        status.note.away if locked and status is not None else None,
-        status.note.given_up if locked and status is not None else None,
+        status.note.unavailable if locked and status is not None else None,
+        status.note.failure if locked and status is not None else None,
         {} if status is None else status.note.stopped,
         report.refused,
     )

@@ -18,6 +18,7 @@ from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.retention.stored_segments import stored_in
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -144,7 +145,10 @@ async def open_destination(
     try:
         spool.bind(log.log_id)
         projector = Projector(log, views=views, projections=projections, installed=installed_projections(projections))
-        healed = HealedLog(log, spool.path, settings, clock=clock) if settings is not None else None
+        healed: HealedLog | None = None
+        if settings is not None and settings.keep_stored_s and settings.keep_stored_bytes:
+            folder = stored_in(spool.path, log.log_id)
+            healed = None if folder is None else HealedLog(log, spool.path, folder, settings, clock=clock)
         destination = LogAndTables(log, projector, healed)
         await destination.open_tables()
         yield destination

@@ -1,6 +1,6 @@
 """Append to a log, and append again the events that it lost in a failover or a restored backup.
 
-    healed = HealedLog(log, spool, settings, clock=clock)
+    healed = HealedLog(log, spool, stored_in(spool, log.log_id), settings, clock=clock)
     refusals = await healed.append(records)
     await healed.confirm()
 
@@ -39,7 +39,6 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.retention.acknowledged_heads import AcknowledgedHeads
 from pycrorm_async.queue.retention.stored_records import stored_recorders, stored_records
-from pycrorm_async.queue.retention.stored_segments import stored_in
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Basis, EpisodeRow
@@ -56,7 +55,7 @@ _T = TypeVar("_T")
 
 
 class HealedLog:
-    """One log, with the heads that a spool remembers of it. Belongs to the loop of the log.
+    """One log, with the heads that a spool remembers of it in a folder. Belongs to the loop of the log.
 
     Attributes:
         rounds: the number of healings.
@@ -64,15 +63,12 @@ class HealedLog:
         missing: the number of episodes that could not be completed.
     """
 
-    def __init__(self, log: EventLog, spool: Path, settings: Settings, *, clock: Clock) -> None:
+    def __init__(self, log: EventLog, spool: Path, folder: Path, settings: Settings, *, clock: Clock) -> None:
         self._store = log
         self._spool = spool
         self._settings = settings
         self._clock = clock
-        folder = stored_in(spool, log.log_id) if settings.keep_stored_s and settings.keep_stored_bytes else None
-        self._heads: AcknowledgedHeads | None = None
-        if folder is not None:
-            self._heads = AcknowledgedHeads(folder, keep_s=settings.keep_stored_s, wall_ns=clock.wall_ns)
+        self._heads = AcknowledgedHeads(folder, keep_s=settings.keep_stored_s, wall_ns=clock.wall_ns)
         self._healing = asyncio.Lock()
         self.rounds = 0
         self.offered = 0
@@ -81,14 +77,12 @@ class HealedLog:
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         """Append as `EventLog.append` does, healing a log that went back. Raises `LogWentBack` if that failed."""
         heads = self._heads
-        if heads is None:
-            return await self._store.append(records)
         for _ in range(_ROUNDS):
             heads.refresh()
             try:
-                stored = await self._store.store(records, self._basis(heads))
+                stored = await self._store.store(records, self._basis())
             except LogWentBack as error:
-                await self._heal(heads, error)
+                await self._heal(error)
                 continue
             acknowledged = heads.all  # without this batch, whose heads are noted below
             short = [
@@ -98,44 +92,45 @@ class HealedLog:
             ]
             if not short:
                 break
-            await self._heal(heads, short[0])
+            await self._heal(short[0])
         else:
-            stored = await self._store.store(records, self._basis(heads))
+            stored = await self._store.store(records, self._basis())
         heads.note({each: (row.number, row.head) for each, row in stored.rows.items()})
         return stored.refusals
 
     async def confirm(self) -> None:
         """Append again the events that the log lost. Raises `DatabaseUnavailable`; may then be called again."""
         heads = self._heads
-        if heads is None:
-            return
         heads.refresh()
         if heads.last is None:
             return
         episode, head = heads.last
         row = (await self._store.heads([episode])).get(episode)
         if row is None or row.head < head:
-            await self._heal(heads, LogWentBack(episode_text(episode), head, 0 if row is None else row.head))
+            await self._heal(LogWentBack(episode_text(episode), head, 0 if row is None else row.head))
 
-    def _basis(self, heads: AcknowledgedHeads) -> Basis:
+    def _basis(self) -> Basis:
+        heads = self._heads
+
         def number_of(episode: EpisodeId) -> int | None:
             acknowledged = heads.all.get(episode)
             return (acknowledged.number or None) if acknowledged is not None else None
 
         return Basis(heads.last, number_of, heads.number_max)
 
-    async def _heal(self, heads: AcknowledgedHeads, cause: LogWentBack) -> None:
+    async def _heal(self, cause: LogWentBack) -> None:
+        heads = self._heads
         async with self._healing:
             heads.refresh()
-            lost = await self._lost(heads)
+            lost = await self._lost()
             if not lost:  # another task or process has healed it
                 return
             self.rounds += 1
             _log.warning("%s: searching %s for the lost events of %d episodes", cause, self._spool, len(lost))
             await self._store.skip_numbers(heads.number_max)
-            offered = await self._offer(heads, lost)
+            offered = await self._offer(lost)
             self.offered += offered
-            left = await self._lost(heads)
+            left = await self._lost()
             self.missing += len(left)
             if left:
                 heads.note({each: (heads.all[each].number, head) for each, head in left.items()}, lowered=True)
@@ -147,18 +142,18 @@ class HealedLog:
             except DatabaseError as error:
                 _log.warning("%s: the healing cannot be recorded in the log: %s", self._store.address, error)
 
-    async def _lost(self, heads: AcknowledgedHeads) -> dict[EpisodeId, int]:
+    async def _lost(self) -> dict[EpisodeId, int]:
         """Return the episodes of which the log has less than was acknowledged, with their heads in the log."""
-        acknowledged = dict(heads.all)
+        acknowledged = dict(self._heads.all)
         rows: dict[EpisodeId, EpisodeRow] = {}
         for part in _parts(list(acknowledged), _EPISODES_MAX):
             rows |= await self._store.heads(part)
         present = {each: rows[each].head if each in rows else 0 for each in acknowledged}
         return {each: head for each, head in present.items() if head < acknowledged[each].head}
 
-    async def _offer(self, heads: AcknowledgedHeads, lost: Mapping[EpisodeId, int]) -> int:
+    async def _offer(self, lost: Mapping[EpisodeId, int]) -> int:
         """Append the lost events that the segments contain; return their number."""
-        basis = self._basis(heads)._replace(witness=None)
+        basis = self._basis()._replace(witness=None)
         offered = 0
         recorders = await asyncio.to_thread(stored_recorders, self._spool, self._store.log_id)
         for recorder in recorders:

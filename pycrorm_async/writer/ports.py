@@ -5,9 +5,8 @@ A writer beside a plan needs `Source` and `Destination`; a daemon needs `Claimed
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from pathlib import Path
-from typing import NamedTuple, Protocol
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import NamedTuple, Protocol, TypeAlias
 
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
@@ -20,9 +19,6 @@ __all__ = [
     "SourceScanner",
     "ScanResult",
     "Tables",
-    "OfferedQueue",
-    "DrainProgress",
-    "DrainRemarks",
 ]
 
 
@@ -158,73 +154,5 @@ class ScanResult(NamedTuple):
     failed: Mapping[str, Exception]
 
 
-class SourceScanner(Protocol):
-    """Claim every recorder's folder that can be drained, except those of these names. Reads files: blocks."""
-
-    def __call__(self, but: Collection[str]) -> ScanResult: ...
-
-
-class DrainRemarks(Protocol):
-    """The reasons in the drain status of a queue."""
-
-    @property
-    def given_up(self) -> str | None:
-        """Why the drainer acknowledges no more records; None while it drains."""
-        ...
-
-    @property
-    def away(self) -> str | None:
-        """Why the database is unavailable at the moment; None while it is available."""
-        ...
-
-    @property
-    def stopped(self) -> Mapping[str, str]:
-        """By episode id, why the episode is refused or parked."""
-        ...
-
-
-class DrainProgress(Protocol):
-    """Positions that the drainer of a queue has reached."""
-
-    @property
-    def stored(self) -> int:
-        """Records up to this position are in the log."""
-        ...
-
-    @property
-    def folded(self) -> int:
-        """Records up to this position are visible in the tables, or never will be."""
-        ...
-
-    @property
-    def note(self) -> DrainRemarks:
-        """The drainer's reasons."""
-        ...
-
-
-class OfferedQueue(Protocol):
-    """A recorder's queue that another process drains."""
-
-    @property
-    def folder(self) -> Path:
-        """The recorder's folder, below the spool."""
-        ...
-
-    @property
-    def written(self) -> int:
-        """Position of the last record put."""
-        ...
-
-    @property
-    def is_drained(self) -> bool:
-        """True if a process drains the queue now."""
-        ...
-
-    @property
-    def external_drain_status(self) -> DrainProgress | None:
-        """The drain status from the other process; None for a queue that this process drains."""
-        ...
-
-    async def synced_to(self) -> None:
-        """Wait until all records are synced. Raises `SpoolUnavailable`."""
-        ...
+SourceScanner: TypeAlias = Callable[[Collection[str]], ScanResult]
+"""Claims every recorder's folder that can be drained, except those of these names. Reads files: blocks."""

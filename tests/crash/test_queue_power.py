@@ -167,7 +167,7 @@ def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
             yield machine
         finally:
             machine.queue._appender.close()
-            machine.queue._consumer.reader.close()
+            machine.queue._source.reader.close()
 
 
 async def live_through(machine: Machine, rng: random.Random) -> None:
@@ -181,7 +181,7 @@ async def live_through(machine: Machine, rng: random.Random) -> None:
         machine.cut()
         machine.turn()
         machine.cut()
-        if machine.queue.synced > machine.queue._consumer.reader.cursor.position and rng.random() < 0.7:
+        if machine.queue.synced > machine.queue._source.reader.cursor.position and rng.random() < 0.7:
             batch = await machine.queue.get_batch(events_max=rng.choice([1, 4, 1000]), bytes_max=2**20, age_s_max=0.0)
             await machine.queue.acknowledge(batch[-1].position)
             machine.turn()

@@ -7,7 +7,7 @@ import pytest
 
 from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus, Progress, RecorderStatus
 
-SAID = DrainStatus(7, 5, DrainNote(given_up="refused", away="locked", stopped={"an episode": "why"}))
+SAID = DrainStatus(7, 5, DrainNote(failure="refused", unavailable="locked", stopped={"an episode": "why"}))
 
 
 def both(folder: Path) -> tuple[Progress, Progress]:
@@ -34,7 +34,7 @@ def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_pa
     drainer.write_drain_status(SAID)
     before = (tmp_path / "progress").read_bytes()
     recorder.write_recorder_status(RecorderStatus(2**40 + 77, closed=True))
-    drainer.write_drain_status(DrainStatus(2**40, 2**33, DrainNote(given_up="another reason")))
+    drainer.write_drain_status(DrainStatus(2**40, 2**33, DrainNote(failure="another reason")))
     after = (tmp_path / "progress").read_bytes()
     changed = [place for place in range(len(after)) if before[place] != after[place]]
     for place in changed:
@@ -46,7 +46,7 @@ def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_pa
         assert reader.drained() in (
             DrainStatus(),
             SAID,
-            DrainStatus(2**40, 2**33, DrainNote(given_up="another reason")),
+            DrainStatus(2**40, 2**33, DrainNote(failure="another reason")),
         )
         reader.close()
     (tmp_path / "progress").write_bytes(before)
@@ -81,11 +81,20 @@ def test_a_short_file_and_one_of_another_format_are_as_good_as_none(tmp_path: Pa
 def test_a_note_that_is_too_long_is_cut_and_the_numbers_are_said(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     stopped = {f"episode {number}": "é" * 10_000 for number in range(1000)}
-    drainer.write_drain_status(DrainStatus(9, 8, DrainNote(given_up="ü" * 10_000, stopped=stopped)))
+    drainer.write_drain_status(DrainStatus(9, 8, DrainNote(failure="ü" * 10_000, stopped=stopped)))
     said = recorder.drained()
     assert (said.stored, said.folded) == (9, 8)
-    assert said.note.given_up == "ü" * 300
+    assert said.note.failure == "ü" * 300
     assert said.note.stopped
     assert set(said.note.stopped.values()) == {"é" * 300}
-    drainer.write_drain_status(DrainStatus(9, 8, DrainNote(given_up="\U0001f916" * 10_000, away="\U0001f916" * 10_000)))
-    assert recorder.drained().note.given_up == "\U0001f916" * 300
+    drainer.write_drain_status(
+        DrainStatus(9, 8, DrainNote(failure="\U0001f916" * 10_000, unavailable="\U0001f916" * 10_000))
+    )
+    assert recorder.drained().note.failure == "\U0001f916" * 300
+
+
+def test_the_note_keeps_its_keys_for_programs_of_other_versions(tmp_path: Path) -> None:
+    recorder = Progress.make(tmp_path)
+    recorder.write_drain_status(SAID)
+    content = (tmp_path / "progress").read_bytes()
+    assert b'{"given_up":"refused","away":"locked","stopped":{"an episode":"why"}}' in content

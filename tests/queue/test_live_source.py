@@ -298,11 +298,11 @@ async def test_what_shows_and_what_stopped_is_heard_at_once(offered: RecorderQue
     said = offered.external_drain_status
     assert said is not None
     assert (said.stored, said.folded) == (0, 1)
-    assert (said.note.away, said.note.stopped) == ("locked", {"an episode": "parked"})
+    assert (said.note.unavailable, said.note.stopped) == ("locked", {"an episode": "parked"})
     source.mark_unavailable(None)
     said = offered.external_drain_status
     assert said is not None
-    assert said.note.away is None
+    assert said.note.unavailable is None
     source.release()
 
 

@@ -57,13 +57,13 @@ class DrainNote(msgspec.Struct, frozen=True, omit_defaults=True):
     """The drainer's reasons.
 
     Attributes:
-        given_up: why the drainer will acknowledge no more records; None while it drains.
-        away: why the database is unavailable at the moment; None while it is available.
+        failure: why the drainer will acknowledge no more records; None while it drains.
+        unavailable: why the database is unavailable at the moment; None while it is available.
         stopped: by episode id, why the episode is refused or parked; only the first episodes, if there are many.
     """
 
-    given_up: str | None = None
-    away: str | None = None
+    failure: str | None = msgspec.field(default=None, name="given_up")
+    unavailable: str | None = msgspec.field(default=None, name="away")
     stopped: Mapping[str, str] = {}
 
 
@@ -183,12 +183,12 @@ def _encode_note(note: DrainNote) -> bytes:
     """Encode the note as JSON, with reasons shortened and episodes dropped until it fits."""
     stopped = {episode: reason[:_REASON_CHARACTERS_MAX] for episode, reason in note.stopped.items()}
     while True:
-        short = DrainNote(_shorten(note.given_up), _shorten(note.away), stopped)
+        short = DrainNote(_shorten(note.failure), _shorten(note.unavailable), stopped)
         encoded = msgspec.json.encode(short)
         if len(encoded) <= _NOTE_BYTES_MAX:
             return encoded
         if not stopped:  # 300 characters may still take too many bytes
-            return msgspec.json.encode(DrainNote("the reason is too long for this file" if note.given_up else None))
+            return msgspec.json.encode(DrainNote("the reason is too long for this file" if note.failure else None))
         stopped = dict(list(stopped.items())[: len(stopped) // 2])
 
 

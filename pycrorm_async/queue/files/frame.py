@@ -79,21 +79,10 @@ Fields: TypeAlias = tuple[int, int, int, int, int, int, bytes, bytes, bytes, int
 
 def encode(frame: Frame, salt: int) -> bytes:
     """Encode one frame; computes its `checksum` and `size`."""
-    body = encode_body(frame.type, frame.payload)
-    header = encode_header(
-        frame.kind,
-        len(frame.type),
-        frame.version,
-        len(frame.payload),
-        frame.position,
-        frame.sequence,
-        frame.wall_ns,
-        frame.monotonic_ns,
-        frame.episode,
-        salt,
-        crc32(body),
-    )
-    return header + body
+    kind, version, position, sequence, wall_ns, monotonic_ns, episode, name, payload, _, _ = frame
+    body = encode_body(name, payload)
+    sizes_and_times = len(name), version, len(payload), position, sequence, wall_ns, monotonic_ns
+    return encode_header(kind, *sizes_and_times, episode, salt, crc32(body)) + body
 
 
 def encode_body(type_name: bytes, payload: bytes) -> bytes:

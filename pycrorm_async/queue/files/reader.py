@@ -15,9 +15,9 @@ from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Buffer, decode_each
-from pycrorm_async.queue.files.segment import decode_header, header_bytes, salt_of
+from pycrorm_async.queue.files.segment import decode_header, header_bytes, map_segment, salt_of, segment_path
 
-__all__ = ["Cursor", "Batch", "Reader", "check_type"]
+__all__ = ["Cursor", "Place", "Batch", "Reader", "check_type"]
 
 
 class Cursor(NamedTuple):
@@ -26,6 +26,14 @@ class Cursor(NamedTuple):
     number: int
     offset: int
     position: int
+
+
+class Place(NamedTuple):
+    """A recorder's folder, the recorder's id, and the cursor from which its segments are read."""
+
+    folder: Path
+    recorder: bytes
+    start: Cursor
 
 
 class Batch(NamedTuple):
@@ -49,12 +57,12 @@ def check_type(path: Path, offset: int, name: bytes) -> str:
 
 
 class Reader:
-    """Read one recorder's segments. `load` returns the path and the bytes of a segment by number."""
+    """Read one recorder's segments."""
 
-    def __init__(self, *, recorder: bytes, start: Cursor, load: Callable[[int], tuple[Path, Buffer]]) -> None:
-        self.cursor = start
-        self._recorder = recorder
-        self._load = load
+    def __init__(self, place: Place) -> None:
+        self.cursor = place.start
+        self._folder = place.folder
+        self._recorder = place.recorder
         self._number = 0
         self._path = Path()
         self._buffer: Buffer = b""
@@ -115,7 +123,8 @@ class Reader:
 
     def _open_segment(self, number: int) -> None:
         self.close()
-        self._path, self._buffer = self._load(number)
+        self._path = segment_path(self._folder, number)
+        self._buffer = map_segment(self._path)
         self._number = number
 
     def _next_segment(self, number: int, offset: int, position: int) -> int:

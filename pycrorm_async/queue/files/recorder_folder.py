@@ -27,6 +27,7 @@ __all__ = [
     "begin_folder",
     "folder_error",
     "finish_folder",
+    "is_folder_name",
     "parse_folder_name",
     "make_folder",
     "remove_folder",
@@ -50,6 +51,15 @@ def parse_folder_name(name: str) -> FolderName:
     if not rest.endswith(REFUSED):
         raise ValueError(name)
     return FolderName(parse_episode_id(recorder), parse_episode_id(rest.removesuffix(REFUSED)))
+
+
+def is_folder_name(name: str) -> bool:
+    """Return whether `parse_folder_name` accepts this name."""
+    try:
+        parse_folder_name(name)
+    except ValueError:
+        return False
+    return True
 
 
 @contextmanager

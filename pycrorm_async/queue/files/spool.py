@@ -11,7 +11,7 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue.files.file_access import create_spool
 from pycrorm_async.queue.files.locks import FileLock, folder_lock, is_locked, read_note
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, STORED
-from pycrorm_async.queue.files.recorder_folder import parse_folder_name, wrap_os_errors, write_durably
+from pycrorm_async.queue.files.recorder_folder import is_folder_name, parse_folder_name, wrap_os_errors, write_durably
 from pycrorm_async.queue.retention.acknowledged_heads import forget_numbers
 from pycrorm_async.settings import FileAccess
 
@@ -157,9 +157,7 @@ class Spool:
 
 
 def _is_recorder(path: Path) -> bool:
-    try:
-        parse_folder_name(path.name)
-    except ValueError:
+    if not is_folder_name(path.name):
         return False
     try:
         (path / ALIVE).lstat()

@@ -34,13 +34,12 @@ from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.queue.files.drain_status import DrainStatus, DrainStatusReader
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
 from pycrorm_async.queue.files.names import ALIVE
-from pycrorm_async.queue.files.reader import Cursor
+from pycrorm_async.queue.files.reader import Cursor, Place
 from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
 from pycrorm_async.queue.files.segment import LastRecord, Segment, header_bytes
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.appender import NOTHING_OPEN
 from pycrorm_async.queue.live.capacity import Capacity
-from pycrorm_async.queue.live.consumer import Place
 from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.live.relocatable_appender import RelocatableAppender
 from pycrorm_async.queue.live.relocation import Home, move
@@ -147,6 +146,20 @@ class QueueFiles:
         """The drain status from another process, if plausible; None if this process drains the queue."""
         return None if self._drain_status is None else self._drain_status.read(synced=self._synced)
 
+    def ends_at(self, position: int) -> bool:
+        """Return whether no record will follow this position."""
+        return self._failure is not None or (self._closed and position == self.written)
+
+    async def check_files(self) -> None:
+        """Wait until the sync thread has compared its files with the folder, and has moved the queue if they differ."""
+        if self._released:
+            return
+        checks, self._check_requested = self._checks, True
+        self._sync_thread.hurry()
+        await self._notifier.until(
+            lambda: self._failure is not None or (self._checks > checks and self._displaced is None)
+        )
+
     @property
     def _over(self) -> bool:
         return self._closed or self._failure is not None
@@ -187,8 +200,8 @@ class QueueFiles:
         published = self._publish(drain_status)
         status = drain_status.read(synced=self._synced)
         self._stored = max(self._stored, status.stored)
-        if status.note.given_up != self._appender.stuck:
-            self._appender.stuck = status.note.given_up
+        if status.note.failure != self._appender.stuck:
+            self._appender.stuck = status.note.failure
             self._room_notifier.notify_all()
         return published
 

@@ -27,10 +27,10 @@ from pycrorm_async.queue.files.names import DRAIN
 from pycrorm_async.queue.files.recorder_folder import make_folder, remove_folder, remove_made_ahead, wrap_os_errors
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.capacity import Capacity
-from pycrorm_async.queue.live.consumer import Consumer
 from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.live.queue_files import PROGRESS_INTERVAL_S, QueueFiles
 from pycrorm_async.queue.live.relocatable_appender import Relocated
+from pycrorm_async.queue.sources.own_source import OwnSource
 from pycrorm_async.settings import Settings
 
 __all__ = ["RecorderQueue"]
@@ -55,7 +55,7 @@ class RecorderQueue(QueueFiles):
     ) -> None:
         """For `create`, which creates and locks the folder. Raises `SpoolUnavailable`."""
         super().__init__(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
-        self._consumer = Consumer(self, self._notifier)
+        self._source = OwnSource(self, self._notifier)
         call_in_forked_child(self._abandon)
         self._sync_thread.start()
 
@@ -151,7 +151,7 @@ class RecorderQueue(QueueFiles):
     def is_drained(self) -> bool:
         """True if this or another process drains the queue now."""
         with wrap_os_errors(self.folder):
-            return self._consumer.drains or is_locked(self.folder / DRAIN)
+            return self._source.drains or is_locked(self.folder / DRAIN)
 
     @property
     def declarations_unrepeated(self) -> int:
@@ -194,16 +194,6 @@ class RecorderQueue(QueueFiles):
             unreported, self._unreported_loss = self._unreported_loss, None
             raise unreported
 
-    async def check_files(self) -> None:
-        """Wait until the sync thread has compared its files with the folder, and has moved the queue if they differ."""
-        if self._released:
-            return
-        checks, self._check_requested = self._checks, True
-        self._sync_thread.hurry()
-        await self._notifier.until(
-            lambda: self._failure is not None or (self._checks > checks and self._displaced is None)
-        )
-
     # --- the consumer ------------------------------------------------------------------------------------------
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
@@ -214,11 +204,11 @@ class RecorderQueue(QueueFiles):
         returns the same records. After a failed sync returns the records synced before, then raises
         `SpoolUnavailable`; raises it also while another process drains this queue.
         """
-        return await self._consumer.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+        return await self._source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
 
     async def acknowledge(self, position: int) -> None:
         """Note that records up to this position are durable in the database, which frees their segments."""
-        assert position <= self._consumer.reader.cursor.position, "only supplied records can be acknowledged"
+        assert position <= self._source.reader.cursor.position, "only supplied records can be acknowledged"
         if self._log_id is None:
             with contextlib.suppress(FilesError):
                 self._log_id = Spool(self._spool).log_id()
@@ -231,7 +221,7 @@ class RecorderQueue(QueueFiles):
 
         From one thread at a time; blocks. Raises `FilesError` or `SpoolDamaged`; then the records must stay here.
         """
-        self._consumer.dead_letter(records)
+        self._source.dead_letter(records)
         return True
 
     def fail(self, reason: str) -> None:
@@ -241,10 +231,6 @@ class RecorderQueue(QueueFiles):
         """
         self._appender.stuck = self._appender.stuck or reason
         self._room_notifier.notify_all()
-
-    def ends_at(self, position: int) -> bool:
-        """Return whether no record will follow this position."""
-        return self._failure is not None or (self._closed and position == self.written)
 
     # --- the end -----------------------------------------------------------------------------------------------
 
@@ -284,7 +270,7 @@ class RecorderQueue(QueueFiles):
         finally:
             if self._drain_status is not None:
                 self._drain_status.close()
-            self._consumer.release()
+            self._source.release()
             for lock in (self._home.alive, *self._former_locks):
                 lock.release()
 
@@ -302,5 +288,5 @@ class RecorderQueue(QueueFiles):
         self._failure = SpoolClosed(f"queue {self.name} belongs to the process that forked this one")
         failure = self._failure
         self._appender.abandon(lambda: failure)
-        self._consumer.reader.close()
+        self._source.reader.close()
         self._notifier, self._room_notifier = Notifier(), Notifier()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 from zlib import crc32
 
-from pycrorm_async.errors import InternalError, PycrormError, SpoolUnavailable
+from pycrorm_async.errors import InternalError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.files.frame import (
     CHECKSUM_START,
@@ -63,11 +63,6 @@ class RelocatableAppender(SyncableAppender):
         """Note that the folder was renamed to this path."""
         self._gc_lock.run(partial(self._settle, folder))
 
-    @property
-    def free_bytes(self) -> int:
-        """Bytes that still fit into the current segment."""
-        return self._end - self._offset
-
     def _carry(self, record: Fields) -> None:
         kind, _, position, sequence, wall_ns, monotonic_ns, episode, name, _, _, size = record
         if position != self.position + 1:
@@ -89,7 +84,7 @@ class RelocatableAppender(SyncableAppender):
         self, successor: RelocatableAppender, segment: Segment, offset: int, switch: Callable[[], None]
     ) -> bool:
         late_bytes = self._offset - offset
-        if segment is not self._current or late_bytes > min(_LATE_BYTES, successor.free_bytes):
+        if segment is not self._current or late_bytes > min(_LATE_BYTES, successor._end - successor._offset):
             return False
         for record in decode_each(self._buffer, offset, self._salt):
             if record[0] != COMMIT:
@@ -103,7 +98,7 @@ class RelocatableAppender(SyncableAppender):
         successor.declarations = self.declarations
         if self._refusal is not None:
             successor.refuse(self._refusal)
-        self._refusal = _relocated
+        self._refusal = lambda: Relocated("the queue has moved to another folder")
         switch()
         return True
 
@@ -113,7 +108,3 @@ class RelocatableAppender(SyncableAppender):
             if segment is not None:
                 segment.path = folder / segment.path.name
         self.begun = [each._replace(path=folder / each.path.name) for each in self.begun]
-
-
-def _relocated() -> PycrormError:
-    return Relocated("the queue has moved to another folder")

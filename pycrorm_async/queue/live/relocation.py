@@ -33,11 +33,10 @@ from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.drain_status import DrainStatusReader
 from pycrorm_async.queue.files.frame import COMMIT, Buffer, decode_each
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
-from pycrorm_async.queue.files.reader import Cursor
+from pycrorm_async.queue.files.reader import Cursor, Place
 from pycrorm_async.queue.files.recorder_folder import begin_folder, finish_folder, remove_folder
 from pycrorm_async.queue.files.segment import LastRecord, Segment, decode_header, header_bytes, read_segment, salt_of
 from pycrorm_async.queue.live.appender import SegmentStart
-from pycrorm_async.queue.live.consumer import Place
 from pycrorm_async.queue.live.relocatable_appender import RelocatableAppender
 from pycrorm_async.settings import FileAccess
 

@@ -18,9 +18,9 @@ from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, Record
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.files.locks import is_locked
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, MENDED, PROGRESS, TAIL
-from pycrorm_async.queue.files.recorder_folder import folder_error, parse_folder_name, wrap_os_errors
-from pycrorm_async.queue.files.scan import Survey, ValidPrefix, survey
-from pycrorm_async.queue.files.segment import read_segment, segment_numbers, segment_path
+from pycrorm_async.queue.files.recorder_folder import folder_error, is_folder_name, parse_folder_name, wrap_os_errors
+from pycrorm_async.queue.files.scan import Survey, ValidPrefix, survey, tails
+from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 
 __all__ = [
@@ -181,23 +181,15 @@ def _text(name: str) -> str:
 def is_damaged_copy(path: Path) -> bool:
     """Return whether this is a damaged folder that `repair` replaced."""
     name, suffix, number = path.name.partition(DAMAGED_SUFFIX)
-    return _is_name(name) and bool(suffix) and (not number or number[1:].isdigit()) and path.is_dir()
+    return is_folder_name(name) and bool(suffix) and (not number or number[1:].isdigit()) and path.is_dir()
 
 
 def _is_unfinished(path: Path) -> bool:
     """Return whether this is an empty recorder's folder without `alive`, or one that has its unfinished name."""
     name = path.name.removesuffix(MENDED).removesuffix(MAKING)
-    if not _is_name(name) or not path.is_dir():
+    if not is_folder_name(name) or not path.is_dir():
         return False
     return name != path.name or not any(path.iterdir())
-
-
-def _is_name(name: str) -> bool:
-    try:
-        parse_folder_name(name)
-    except ValueError:
-        return False
-    return True
 
 
 def inspect_folder(recorder: RecorderFolder) -> FolderReport:
@@ -272,8 +264,10 @@ class _Count:
 def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
     folder = recorder.path
     count, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or state.being_drained)
-    ours = {ALIVE, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in prefix.numbers)}
-    others = sorted(_text(each.name) for each in folder.iterdir() if each.name not in ours)
+    entries = [each.name for each in folder.iterdir()]
+    numbers = {*prefix.numbers, *segment_numbers(folder)}  # also those begun or deleted since the scan
+    ours = {ALIVE, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in numbers)}
+    others = sorted(_text(each) for each in entries if each not in ours)
     return RecorderReport(
         **vars(state),
         first=prefix.start.position + 1,
@@ -283,11 +277,9 @@ def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
         types=dict(sorted(count.types.items())),
         episodes=len(count.episodes | set(prefix.open)),
         open=tuple(_open(prefix)),
-        tail_bytes=0 if recorder.alive or damage else _tail_bytes(folder, prefix),
+        tail_bytes=0 if recorder.alive or damage else sum(len(tail) for _, tail in tails(folder, prefix)),
         cut_off=tuple(each for each in others if each.endswith(TAIL)),
-        foreign=tuple(
-            each for each in others if not each.endswith((TAIL, MAKING)) and each not in _new_segments(folder)
-        ),
+        foreign=tuple(each for each in others if not each.endswith((TAIL, MAKING))),
         damage=None if damage is None else Damage(str(damage.path), damage.offset, damage.reason),
     )
 
@@ -324,18 +316,3 @@ def _open(prefix: ValidPrefix) -> list[OpenEpisode]:
         OpenEpisode(episode_text(EpisodeId(episode)), last.sequence, last.wall_ns)
         for episode, last in sorted(prefix.open.items())
     ]
-
-
-def _new_segments(folder: Path) -> set[str]:
-    """Name the segments that exist now, including those created after the scan."""
-    return {segment_path(folder, number).name for number in segment_numbers(folder)}
-
-
-def _tail_bytes(folder: Path, prefix: ValidPrefix) -> int:
-    """Return the bytes behind the last whole record, without trailing zeros."""
-    size = 0
-    for number in prefix.numbers:
-        if number >= prefix.cut.number:
-            content = read_segment(segment_path(folder, number))
-            size += len(content[prefix.cut.offset if number == prefix.cut.number else 0 :].rstrip(b"\0"))
-    return size

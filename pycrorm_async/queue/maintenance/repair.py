@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from pycrorm_async.errors import InternalError, SpoolUnavailable
+from pycrorm_async.errors import InternalError, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue.files.file_access import create_folder, open_file
 from pycrorm_async.queue.files.locks import FileLock
@@ -82,16 +83,18 @@ def repair_folder(folder: Path) -> RepairReport | None:
     Raises `SpoolUnavailable` if the recorder lives, a process drains the folder, or it cannot be written, and
     `SpoolForeign` for a newer format or another recorder's file. Then the folder is unchanged.
     """
-    with wrap_os_errors(folder):
-        locks = _lock(folder)
-        try:
-            result = survey(folder, parse_folder_name(folder.name).recorder)
-            if result.damage is None:
-                return None
-            return _replace(folder, result)
-        finally:
-            for lock in locks:
-                lock.release()
+    with wrap_os_errors(folder), ExitStack() as locks:
+        alive = FileLock.take(folder / ALIVE, create=False)
+        if alive is None:
+            reason = "its recorder is alive, or another process drains it: stop that process first"
+            raise SpoolUnavailable(folder, reason)
+        locks.callback(alive.release)
+        drain = FileLock.take(folder / DRAIN)
+        if drain is None:
+            raise SpoolUnavailable(folder, "another process drains it: stop that process first")
+        locks.callback(drain.release)
+        result = survey(folder, parse_folder_name(folder.name).recorder)
+        return None if result.damage is None else _replace(folder, result, result.damage)
 
 
 def finish_repairs(spool: Path) -> list[Path]:
@@ -107,25 +110,8 @@ def finish_repairs(spool: Path) -> list[Path]:
     return folders
 
 
-def _lock(folder: Path) -> list[FileLock]:
-    alive = FileLock.take(folder / ALIVE, create=False)
-    if alive is None:
-        raise SpoolUnavailable(folder, "its recorder is alive, or another process drains it: stop that process first")
-    try:
-        drain = FileLock.take(folder / DRAIN)
-    except BaseException:
-        alive.release()
-        raise
-    if drain is None:
-        alive.release()
-        raise SpoolUnavailable(folder, "another process drains it: stop that process first")
-    return [drain, alive]
-
-
-def _replace(folder: Path, result: Survey) -> RepairReport:
+def _replace(folder: Path, result: Survey, damage: SpoolDamaged) -> RepairReport:
     """Build a repaired folder, rename the damaged one, and give its name to the repaired one."""
-    damage = result.damage
-    assert damage is not None
     repaired = folder.with_name(f"{folder.name}{MENDED}")
     if repaired.exists():  # left by a killed repair
         shutil.rmtree(repaired)

@@ -15,7 +15,7 @@ from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame, encode_span
 from pycrorm_async.queue.files.recorder_folder import parse_folder_name, write_durably
-from pycrorm_async.queue.files.scan import Survey, ValidPrefix, check_record, whole_frames
+from pycrorm_async.queue.files.scan import Survey, check_record, whole_frames
 from pycrorm_async.queue.files.segment import (
     EPISODE_ENDED,
     LastRecord,
@@ -46,10 +46,11 @@ class Salvage:
         self._repaired = repaired
         self._recorder = parse_folder_name(damaged.name).recorder
         self._survey = result
-        self.headless = _is_headless(result.prefix)
-        self._open = dict(result.prefix.open)
-        self._number = result.prefix.cut.number
-        self.position = self._last_position = result.prefix.cut.position
+        prefix = result.prefix
+        self.headless = not prefix.bases and bool(prefix.numbers) and prefix.numbers[0] > 1
+        self._open = dict(prefix.open)
+        self._number = prefix.cut.number
+        self.position = self._last_position = prefix.cut.position
         self.saved = 0
         self.unreadable: list[Range] = []
         self._dropped: dict[EpisodeId, list[Frame]] = {}
@@ -64,7 +65,7 @@ class Salvage:
         if not prefix.bases:
             self._number -= 1  # the first one written replaces the one with the unreadable header
         safe = 0
-        for number in self._damaged_numbers():
+        for number in (each for each in self._survey.prefix.numbers if each >= self._survey.prefix.cut.number):
             frames = list(self._frames(number))
             safe = max([safe, *(frame.position for frame in frames if frame.kind == COMMIT)])
             before = dict(self._open)
@@ -81,9 +82,6 @@ class Salvage:
         """Return the sequence of an open episode's last kept record; 0 if none is kept."""
         last = self._open.get(episode)
         return last.sequence if last is not None else 0
-
-    def _damaged_numbers(self) -> list[int]:
-        return [number for number in self._survey.prefix.numbers if number >= self._survey.prefix.cut.number]
 
     def _frames(self, number: int) -> Iterator[Frame]:
         """Decode the whole frames of a segment behind the damage."""
@@ -164,10 +162,6 @@ class Salvage:
         self.position += len(records)
         self.saved += len(records)
         write_durably(segment_path(self._repaired, self._number), b"".join((header, *span)))
-
-
-def _is_headless(prefix: ValidPrefix) -> bool:
-    return not prefix.bases and bool(prefix.numbers) and prefix.numbers[0] > 1
 
 
 def ranges(numbers: Iterable[int]) -> tuple[Range, ...]:

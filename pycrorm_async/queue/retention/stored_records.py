@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from pycrorm_async.errors import FilesError, SpoolDamaged
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.queue.files.recorder_folder import parse_folder_name
+from pycrorm_async.queue.files.recorder_folder import is_folder_name, parse_folder_name
 from pycrorm_async.queue.files.scan import SegmentScanner
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import Spool
@@ -36,7 +36,7 @@ def stored_recorders(spool: Path, log_id: str) -> list[StoredRecorder]:
     present = {each.name for each in Spool(spool).recorders()}
     names = set(present)
     if kept is not None and kept.is_dir():
-        names |= {each.name for each in kept.iterdir() if _is_recorder(each)}
+        names |= {each.name for each in kept.iterdir() if is_folder_name(each.name) and each.is_dir()}
     recorders = []
     for name in sorted(names):
         # List the source folder first, so that a segment moved meanwhile is listed twice rather than missed.
@@ -78,11 +78,3 @@ def _segments(folder: Path) -> dict[int, Path]:
         return {number: segment_path(folder, number) for number in segment_numbers(folder)}
     except (FileNotFoundError, NotADirectoryError):
         return {}
-
-
-def _is_recorder(path: Path) -> bool:
-    try:
-        parse_folder_name(path.name)
-    except ValueError:
-        return False
-    return path.is_dir()

@@ -58,12 +58,8 @@ def kept_segments(spool: Path) -> list[KeptSegment]:
 
     Leaves out files deleted or moved during the listing. Raises other `OSError`.
     """
-    return sorted(segment for folder in _folders(spool / STORED) for segment in _segments(folder))
-
-
-def _folders(stored: Path) -> Iterator[Path]:
-    for log in _children(stored):
-        yield from _children(log)
+    folders = [folder for log in _children(spool / STORED) for folder in _children(log)]
+    return sorted(segment for folder in folders for segment in _segments(folder))
 
 
 def _children(folder: Path) -> list[Path]:

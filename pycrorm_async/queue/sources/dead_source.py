@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
@@ -52,33 +53,22 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool
     Also None for dead letters of a recorder whose own folder still exists, because its drainer may add more.
 
     Holds `alive` and `drain` until `release`. Scans until there are records to supply, and with `check` the whole
-    folder. Moves segments whose
-    records are all stored to `stored`, or deletes them without it. Raises `SpoolDamaged`, `SpoolForeign` and
-    `SpoolUnavailable`; then it holds no lock.
+    folder. Moves segments whose records are all stored to `stored`, or deletes them without it. Raises `SpoolDamaged`,
+    `SpoolForeign` and `SpoolUnavailable`; then it holds no lock.
     """
-    with wrap_os_errors(folder):
+    with wrap_os_errors(folder), ExitStack() as locks:
         own = folder.with_name(folder.name.partition(".")[0])
         if own != folder and ((own / ALIVE).exists() or own.with_name(f"{own.name}{MENDED}").exists()):
             return None
-        alive = FileLock.take(folder / ALIVE, create=False)
-        if alive is None:
-            return None
-        try:
-            drain = FileLock.take(folder / DRAIN)
-            if drain is None:
-                alive.release()
+        for name in (ALIVE, DRAIN):
+            lock = FileLock.take(folder / name, create=name == DRAIN)
+            if lock is None:
                 return None
-            try:
-                recorder = parse_folder_name(folder.name).recorder
-                if check:
-                    scan(folder, recorder)
-                return DeadSource(folder, recorder, (drain, alive), stored)
-            except BaseException:
-                drain.release()
-                raise
-        except BaseException:
-            alive.release()
-            raise
+            locks.callback(lock.release)
+        recorder = parse_folder_name(folder.name).recorder
+        if check:
+            scan(folder, recorder)
+        return DeadSource(folder, recorder, locks, stored)
 
 
 class DeadSource:
@@ -93,9 +83,8 @@ class DeadSource:
     is_alive = False
     invisible: Mapping[EpisodeId, int] = {}
 
-    def __init__(
-        self, folder: Path, recorder: EpisodeId, locks: tuple[FileLock, ...], stored: StoredSegments | None
-    ) -> None:
+    def __init__(self, folder: Path, recorder: EpisodeId, locks: ExitStack, stored: StoredSegments | None) -> None:
+        """For `open_dead`; takes the locks over, unless it raises."""
         self.folder = folder
         self.name = folder.name
         self.lost: tuple[Record, ...] = ()
@@ -105,11 +94,11 @@ class DeadSource:
         self._scanner = SegmentScanner(folder, recorder, on_record=self._ready.append)
         while self._scan_further() and self._confirmed == self._scanner.prefix.start.position:
             pass
-        self._locks = locks
         self._released = False
         self._stored_segments = stored
         self._dead_letters = DeadLetters(folder)
         self._supplied = self.stored = self._scanner.prefix.start.position
+        self._locks = locks.pop_all()
 
     @property
     def all_stored(self) -> bool:
@@ -195,8 +184,7 @@ class DeadSource:
         finally:
             self._released = True
             self._dead_letters.release()
-            for lock in self._locks:
-                lock.release()
+            self._locks.close()
         count = len(self.lost)
         return f"is recovered ({count} episode{'s' * (count != 1)} LOST)" if count else "is recovered"
 

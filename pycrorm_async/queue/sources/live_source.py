@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Self
 
@@ -20,10 +21,9 @@ from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus, Progress
-from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileLock, is_locked
 from pycrorm_async.queue.files.names import ALIVE, DRAIN
-from pycrorm_async.queue.files.reader import Cursor, Reader
+from pycrorm_async.queue.files.reader import Cursor, Place, Reader
 from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
 from pycrorm_async.queue.files.scan import read_header
 from pycrorm_async.queue.files.segment import header_bytes, map_segment, segment_numbers, segment_path
@@ -61,7 +61,7 @@ class LiveSource:
         before = progress.drained()
         self._status = before._replace(note=DrainNote())  # drops the note of an earlier drainer
         visible = min(before.stored, before.folded)
-        self._reader = Reader(recorder=recorder, start=self._start_of(visible), load=self._load)
+        self._reader = Reader(Place(folder, recorder, self._start_of(visible)))
         self.invisible: dict[EpisodeId, int] = {}
         self._reader.skip_to(min(before.stored, progress.recorded().synced), on_records=self._note_invisible)
         self._until: int | None = None
@@ -76,36 +76,26 @@ class LiveSource:
         Reads the segments from the first record that is not visible to the last one that is stored. Raises
         `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`; then it holds no lock.
         """
-        with wrap_os_errors(folder):
+        with wrap_os_errors(folder), ExitStack() as opened:
             progress = Progress.open(folder, writing=True)
             if progress is None:
                 return None
-            source: Self | None = None
+            opened.callback(progress.close)
+            recorded = progress.recorded()
+            if recorded.closed and progress.drained().stored >= recorded.synced:
+                return None  # the recorder is about to delete it
+            drain = FileLock.take(folder / DRAIN, create=False)
+            if drain is None:
+                return None
+            opened.callback(drain.release)
+            if not is_locked(folder / ALIVE):
+                return None
             try:
-                source = cls._take(folder, progress)
+                source = cls(folder, parse_episode_id(folder.name), drain, progress)
             except FileNotFoundError:  # the recorder deleted a stored segment meanwhile: the next attempt succeeds
-                source = None
-            finally:
-                if source is None:
-                    progress.close()
+                return None
+            opened.pop_all()
             return source
-
-    @classmethod
-    def _take(cls, folder: Path, progress: Progress) -> Self | None:
-        recorded = progress.recorded()
-        if recorded.closed and progress.drained().stored >= recorded.synced:
-            return None  # the recorder is about to delete it
-        drain = FileLock.take(folder / DRAIN, create=False)
-        if drain is None:
-            return None
-        try:
-            if is_locked(folder / ALIVE):
-                return cls(folder, parse_episode_id(folder.name), drain, progress)
-        except BaseException:
-            drain.release()
-            raise
-        drain.release()
-        return None
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:  # noqa: ARG002
         """Return the next synced records in order, at least one, within the limits (a larger record comes alone).
@@ -144,8 +134,8 @@ class LiveSource:
 
     def fail(self, reason: str) -> None:
         """Publish why no more records will be acknowledged, so that waiting producers fail. The first reason stays."""
-        if self._status.note.given_up is None:
-            self._update_note(given_up=reason)
+        if self._status.note.failure is None:
+            self._update_note(failure=reason)
 
     def finish(self) -> None:
         """End this source behind the records that are synced now."""
@@ -164,7 +154,7 @@ class LiveSource:
 
     def mark_unavailable(self, reason: str | None) -> None:
         """Publish why the database is unavailable; None when it is available again. Raises `SpoolUnavailable`."""
-        self._update_note(away=reason)
+        self._update_note(unavailable=reason)
 
     @property
     def supplied(self) -> int:
@@ -242,7 +232,3 @@ class LiveSource:
                 break
             start = Cursor(number, header_bytes(len(header.open)), header.base - 1)
         return start or Cursor(1, header_bytes(0), 0)
-
-    def _load(self, number: int) -> tuple[Path, Buffer]:
-        path = segment_path(self.folder, number)
-        return path, map_segment(path)

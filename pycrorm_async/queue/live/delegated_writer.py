@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
+from collections.abc import Callable
 
 from pycrorm_async.errors import DatabaseError, EpisodeParked, FlushTimeout
+from pycrorm_async.queue.files.drain_status import DrainStatus
+from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.ports import DrainProgress, OfferedQueue
 
 __all__ = ["DelegatedWriter"]
 
@@ -22,7 +25,7 @@ Longer than a daemon takes to find a new queue."""
 class DelegatedWriter:
     """The counterpart of `WriterThread` for a queue that a daemon drains. Belongs to the plan's loop."""
 
-    def __init__(self, queue: OfferedQueue, settings: Settings) -> None:
+    def __init__(self, queue: RecorderQueue, settings: Settings) -> None:
         self._queue = queue
         self._settings = settings
         self._drained_s = asyncio.get_running_loop().time()
@@ -33,18 +36,12 @@ class DelegatedWriter:
         Raises `EpisodeParked` for episodes of this queue that stopped, `DatabaseError` if the drainer had to stop, and
         `FlushTimeout` after `flush_timeout_s` without progress; its message says whether a process drains the queue.
         """
-        before, loop = self._status.stored, asyncio.get_running_loop()
-        last, since_s = self._progress, loop.time()
-        while self._status.folded < position:
-            self._raise_given_up()
-            if self._progress != last:
-                last, since_s = self._progress, loop.time()
-            if loop.time() - since_s > self._settings.flush_timeout_s:
-                raise FlushTimeout(
-                    f"not finished after {self._settings.flush_timeout_s:g} s ({self._hindrance(before)});"
-                    " everything recorded is safe in the spool"
-                )
-            await asyncio.sleep(_POLL_S)
+        hindrance = await self._wait(position, undrained_s_max=math.inf, on_poll=self._raise_failure)
+        if hindrance is not None:
+            raise FlushTimeout(
+                f"not finished after {self._settings.flush_timeout_s:g} s ({hindrance});"
+                " everything recorded is safe in the spool"
+            )
         self._raise_stopped()
 
     async def close(self) -> None:
@@ -54,23 +51,32 @@ class DelegatedWriter:
         `flush_timeout_s` without progress: the next drainer of the spool stores the rest. Raises `EpisodeParked`.
         """
         await self._queue.synced_to()
-        before, position = self._status.stored, self._queue.written
-        loop = asyncio.get_running_loop()
+        position = self._queue.written
+        hindrance = await self._wait(position, undrained_s_max=_UNDRAINED_S)
+        if hindrance is not None:
+            _log.warning("%s (%s)", self._describe_rest(position), hindrance)
+        self._raise_stopped()
+
+    async def _wait(
+        self, position: int, *, undrained_s_max: float, on_poll: Callable[[], None] = lambda: None
+    ) -> str | None:
+        """Wait until the records up to this position are visible; return the hindrance if the wait reached a limit."""
+        loop, before = asyncio.get_running_loop(), self._status.stored
         last, since_s = self._progress, loop.time()
         while self._status.folded < position:
+            on_poll()
             now_s = loop.time()
-            if self._is_being_stored:
+            if self._status.note.unavailable is None and self._queue.is_drained:
                 self._drained_s = now_s
             if self._progress != last:
                 last, since_s = self._progress, now_s
-            if now_s - self._drained_s > _UNDRAINED_S or now_s - since_s > self._settings.flush_timeout_s:
-                _log.warning("%s (%s)", self._describe_rest(position), self._hindrance(before))
-                break
+            if now_s - self._drained_s > undrained_s_max or now_s - since_s > self._settings.flush_timeout_s:
+                return self._hindrance(before)
             await asyncio.sleep(_POLL_S)
-        self._raise_stopped()
+        return None
 
     @property
-    def _status(self) -> DrainProgress:
+    def _status(self) -> DrainStatus:
         status = self._queue.external_drain_status
         assert status is not None, "the queue is offered to a daemon"
         return status
@@ -79,13 +85,9 @@ class DelegatedWriter:
     def _progress(self) -> tuple[int, int]:
         return self._status.stored, self._status.folded
 
-    @property
-    def _is_being_stored(self) -> bool:
-        return self._status.note.away is None and self._queue.is_drained
-
-    def _raise_given_up(self) -> None:
+    def _raise_failure(self) -> None:
         """Raise the drainer's reason if it had to stop; a drainer that still runs only reports a refused episode."""
-        reason = self._status.note.given_up
+        reason = self._status.note.failure
         if reason is not None and not self._queue.is_drained:
             raise DatabaseError(f"{reason}; everything recorded is safe in the spool")
 
@@ -97,12 +99,12 @@ class DelegatedWriter:
 
     def _hindrance(self, before: int) -> str:
         status = self._status
-        if status.note.given_up is not None:
-            return f"no more events are stored: {status.note.given_up}"
+        if status.note.failure is not None:
+            return f"no more events are stored: {status.note.failure}"
         if not self._queue.is_drained:
             return "no process drains this spool: start `pycrorm writer`"
-        if status.note.away is not None:
-            return f"the daemon reports that the database is unavailable: {status.note.away}"
+        if status.note.unavailable is not None:
+            return f"the daemon reports that the database is unavailable: {status.note.unavailable}"
         return (
             "the daemon makes no progress"
             if status.stored == before

@@ -1,9 +1,9 @@
 """Read synced records back from the folder of a live queue, in order, for the queue's one consumer.
 
-A consumer belongs to one task of one loop. The sync thread may move the queue to another folder at any time
-(`relocation.py`) and publishes the new `Place`. The consumer switches to it at its next step and continues behind its
-position. When a read fails, the consumer first asks the sync thread to check its files; if the queue then has moved,
-the consumer repeats the read in the new folder.
+The source belongs to one task of one loop. The sync thread may move the queue to another folder at any time
+(`relocation.py`) and publishes the new `Place`. The source switches to it at its next step and continues behind its
+position. When a read fails, the source first asks the sync thread to check its files; if the queue then has moved,
+the source repeats the read in the new folder.
 """
 
 from __future__ import annotations
@@ -12,63 +12,31 @@ import asyncio
 import contextlib
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
-from typing import NamedTuple, Protocol
 
-from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolUnavailable
+from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.envelope import Record
-from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.names import DRAIN
-from pycrorm_async.queue.files.reader import Batch, Cursor, Reader
+from pycrorm_async.queue.files.reader import Batch, Reader
 from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
-from pycrorm_async.queue.files.segment import map_segment, segment_path
 from pycrorm_async.queue.live.notifier import Notifier
+from pycrorm_async.queue.live.queue_files import QueueFiles
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
-__all__ = ["Consumer", "Place", "QueueView"]
+__all__ = ["OwnSource"]
 
 
-class Place(NamedTuple):
-    """The folder that a queue writes in, the recorder's id, and the cursor before the folder's first record."""
+class OwnSource:
+    """The consumer's side of a queue; it holds the lock `drain` from its first batch on."""
 
-    folder: Path
-    recorder: bytes
-    start: Cursor
-
-
-class QueueView(Protocol):
-    """The consumer's view of its queue. Other threads change all of it, between any two steps."""
-
-    @property
-    def place(self) -> Place: ...
-
-    @property
-    def synced(self) -> int: ...
-
-    @property
-    def failure(self) -> PycrormError | None: ...
-
-    def ends_at(self, position: int) -> bool:
-        """Return whether no record will follow this position."""
-        ...
-
-    async def check_files(self) -> None:
-        """Wait until the sync thread has compared its files with the folder and has moved a displaced queue."""
-        ...
-
-
-class Consumer:
-    """The consumer; it holds the lock `drain` from its first batch on."""
-
-    def __init__(self, queue: QueueView, notifier: Notifier) -> None:
+    def __init__(self, queue: QueueFiles, notifier: Notifier) -> None:
         self._queue = queue
         self._notifier = notifier
         self._place = queue.place
         self._drain: FileLock | None = None
         self._released = False
         self._dead_letters = DeadLetters(self._place.folder)
-        self.reader = _reader(self._place)
+        self.reader = Reader(self._place)
 
     @property
     def drains(self) -> bool:
@@ -105,7 +73,7 @@ class Consumer:
         place = self._queue.place
         if place is self._place:
             return
-        reader = _reader(place)
+        reader = Reader(place)
         with wrap_os_errors(place.folder):
             reader.skip_to(self.reader.cursor.position)
         self.reader.close()
@@ -145,11 +113,3 @@ class Consumer:
                 self._drain = FileLock.take(self._place.folder / DRAIN)
             if self._drain is None:
                 raise SpoolUnavailable(self._place.folder, "is being drained by another process")
-
-
-def _reader(place: Place) -> Reader:
-    def load(number: int) -> tuple[Path, Buffer]:
-        path = segment_path(place.folder, number)
-        return path, map_segment(path)
-
-    return Reader(recorder=place.recorder, start=place.start, load=load)
