@@ -68,7 +68,7 @@ def _round(outcome: Outcome, place: Path, rng: random.Random, name: str) -> None
         steps.add(plan.kill())
     finally:
         plan.stop()
-    asyncio.run(rebind(url, spool=spool, say=lambda _: None))
+    asyncio.run(rebind(url, spool=spool, on_rebinding=lambda _: None))
     report = asyncio.run(recover(url, spool=spool))
     if report.failed:
         outcome.error = str(next(iter(report.failed.values())))

@@ -107,7 +107,7 @@ def killed_plans(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
 
 
 def _serve(url: str, spool: str) -> None:
-    asyncio.run(serve(url, spool=Path(spool), leave=asyncio.Event(), say=say))
+    asyncio.run(serve(url, spool=Path(spool), stop=asyncio.Event(), report=say))
 
 
 def killed_daemons(server: Server | None) -> Callable[[int, random.Random, Path, Step], Outcome]:

@@ -44,7 +44,7 @@ _LONGEST_LIFE_S = 0.2
 def _serve(url: str, spool: str) -> None:
     """Run a daemon with one fold worker, so that the daemon must use the worker that is stopped."""
     leave = asyncio.Event()
-    asyncio.run(serve(url, spool=Path(spool), leave=leave, say=say, settings=_SETTINGS, fold_workers=1))
+    asyncio.run(serve(url, spool=Path(spool), stop=leave, report=say, settings=_SETTINGS, fold_workers=1))
 
 
 def faulty_workers(

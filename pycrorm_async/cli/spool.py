@@ -114,7 +114,7 @@ def rebind(
     --once`.
     """
     projections, settings = load_projections(projection or ()), Settings(file_access=file_access)
-    done = asyncio.run(recovery.rebind(url, spool=spool, settings=settings, say=_print_rebinding))
+    done = asyncio.run(recovery.rebind(url, spool=spool, settings=settings, on_rebinding=_print_rebinding))
     extra = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
     return store_once(url, spool, projections, settings, as_json=as_json, extra=extra)
 

@@ -32,12 +32,12 @@ from pycrorm_async.operations.recovery import RecoveryReport, recover
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.daemon import LEAVE_S, DaemonSummary
+from pycrorm_async.writer.daemon import STOP_S, DaemonSummary
 
 __all__ = ["writer", "store_once"]
 
 _WATCHDOG_MARGIN_S = 5.0
-"""Seconds after `LEAVE_S` until the watchdog ends a process whose database does not answer at all."""
+"""Seconds after `STOP_S` until the watchdog ends a process whose database does not answer at all."""
 
 
 def writer(
@@ -80,13 +80,13 @@ async def _serve_until_signal(
     settings: Settings,
     processes: Sequence[FoldProcess],
 ) -> DaemonSummary:
-    leave = asyncio.Event()
+    stop = asyncio.Event()
 
     def handle_signal() -> None:
-        if leave.is_set():
+        if stop.is_set():
             os._exit(130)  # the second signal; events not stored are safe in the spool
-        leave.set()
-        watchdog = threading.Timer(LEAVE_S + _WATCHDOG_MARGIN_S, os._exit, (0,))
+        stop.set()
+        watchdog = threading.Timer(STOP_S + _WATCHDOG_MARGIN_S, os._exit, (0,))
         watchdog.daemon = True
         watchdog.start()
 
@@ -95,8 +95,8 @@ async def _serve_until_signal(
     return await serve(
         url,
         spool=spool,
-        leave=leave,
-        say=note,
+        stop=stop,
+        report=note,
         settings=settings,
         projections=projections,
         fold_workers=WORKERS,

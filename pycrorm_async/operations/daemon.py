@@ -31,7 +31,7 @@ from pycrorm_async.operations.fold_worker import Assignment
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldWorkerState, FoldWorkerTables
 from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.locks import FileIdentity, FileLock
 from pycrorm_async.queue.files.recorder_folder import folder_error
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
@@ -50,14 +50,14 @@ async def serve(
     url: str,
     *,
     spool: Path | None,
-    leave: asyncio.Event,
-    say: Callable[[str], None],
+    stop: asyncio.Event,
+    report: Callable[[str], None],
     settings: Settings | None = None,
     projections: Sequence[Projection] = (),
     fold_workers: int = 0,
     forked: Sequence[FoldProcess] = (),
 ) -> DaemonSummary:
-    """Drain every recorder of the spool and fold, until `leave` is set. Calls `say` with one line for each report.
+    """Drain every recorder of the spool and fold, until `stop` is set. Calls `report` with one line for each report.
 
     Folds custom `projections` and the installed ones too. `fold_workers` is the number of processes that fold, of which
     the first may be `forked` already; while none is ready, this process folds.
@@ -73,30 +73,30 @@ async def serve(
     lock = place.take_writer()
     if lock is None:
         raise SpoolTaken(place.path, "another `pycrorm writer` drains it already")
-    note = _Note(lock, say)
+    note = _Note(lock, report)
     async with AsyncExitStack() as stack:
         stack.callback(lock.release)
         projections = validate_projections(projections)
         destination = await stack.enter_async_context(
             open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections, settings=settings)
         )
-        say(f"draining {place.path} into {address}")
+        report(f"draining {place.path} into {address}")
         stored = StoredSegments(place.path, settings, wall_ns=SYSTEM_CLOCK.wall_ns)
         folders = _Folders(place, destination.log_id, address, stored)
         assignment = Assignment(url, destination.log_id, projections)
         workers = await stack.enter_async_context(
-            FoldWorkers(fold_workers, assignment, settings=settings, say=say, note=note, forked=forked)
+            FoldWorkers(fold_workers, assignment, settings=settings, say=report, note=note, forked=forked)
         )
         tables: Tables = FoldWorkerTables(destination, workers) if fold_workers else destination
-        return await Daemon(destination, tables, folders, settings=settings, say=say).run(leave)
+        return await Daemon(destination, tables, folders, settings=settings, report=report).run(stop)
 
 
 class _Note:
     """Writes the states of the fold workers into the daemon's lock file, where `pycrorm status` reads them."""
 
-    def __init__(self, lock: FileLock, say: Callable[[str], None]) -> None:
+    def __init__(self, lock: FileLock, report: Callable[[str], None]) -> None:
         self._lock = lock
-        self._say = say
+        self._report = report
         self._failed = False
 
     def __call__(self, workers: Sequence[FoldWorkerState]) -> None:
@@ -104,7 +104,7 @@ class _Note:
             self._lock.write_note(msgspec.json.encode(DaemonNote(os.getpid(), workers)))
         except OSError as error:
             if not self._failed:
-                self._say(f"`pycrorm status` cannot show the fold workers: their states cannot be written: {error}")
+                self._report(f"`pycrorm status` cannot show the fold workers: their states cannot be written: {error}")
             self._failed = True
 
 
@@ -152,10 +152,9 @@ class _Folders:
         return open_dead(folder.path, stored=self._stored, check=folder.name in self._taken)
 
 
-def _identity(file: Path | None) -> tuple[int, int] | None:
-    """Return device and inode of a file; None if it is missing or cannot be examined."""
+def _identity(file: Path | None) -> FileIdentity | None:
+    """Return the identity of a file; None if it is missing or cannot be examined."""
     try:
-        status = file.stat() if file is not None else None
+        return None if file is None else FileIdentity.of(file.stat())
     except OSError:
         return None
-    return None if status is None else (status.st_dev, status.st_ino)

@@ -163,11 +163,12 @@ class Rebinding(NamedTuple):
 
 
 async def rebind(
-    url: str, *, spool: Path | None = None, settings: Settings | None = None, say: Callable[[Rebinding], None]
+    url: str, *, spool: Path | None = None, settings: Settings | None = None, on_rebinding: Callable[[Rebinding], None]
 ) -> Rebinding:
     """Bind a spool to the database that is at this URL now, creating it if it is missing; `recover` then stores it.
 
-    Calls `say` before it changes anything. Raises `SpoolTaken` where a process records into the spool or drains it.
+    Calls `on_rebinding` before it changes anything. Raises `SpoolTaken` where a process records into the spool or
+    drains it.
     """
     address, settings = shared_address(url), settings or Settings()
     place = Spool(spool or address.default_spool, settings.file_access)
@@ -176,6 +177,6 @@ async def rebind(
     await log.close()
     events = sum(each.records for each in report.recorders)
     rebinding = Rebinding(place.path, place.log_id(), log.log_id, len(report.recorders), events)
-    say(rebinding)
+    on_rebinding(rebinding)
     place.rebind(log.log_id)
     return rebinding

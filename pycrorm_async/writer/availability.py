@@ -7,20 +7,11 @@ from typing import TypeVar
 
 from pycrorm_async.errors import DatabaseUnavailable
 
-__all__ = ["Availability", "is_notable"]
+__all__ = ["Availability"]
 
 _T = TypeVar("_T")
 _NOTABLE_S = 1.0
 """A database that has not answered for less than this is not reported: a deadlock or a quick restart."""
-
-
-def is_notable(unanswered_s: float) -> bool:
-    """Return whether a database that has not answered for this long counts as unavailable.
-
-    >>> is_notable(0.3), is_notable(2.0)
-    (False, True)
-    """
-    return unanswered_s >= _NOTABLE_S
 
 
 class Availability:
@@ -49,7 +40,7 @@ class Availability:
     def _note_failure(self, called_s: float, reason: str) -> None:
         if self._unanswered_since_s is None:
             self._unanswered_since_s = called_s
-        if not self._reported and is_notable(self._now_s() - self._unanswered_since_s):
+        if not self._reported and self._now_s() - self._unanswered_since_s >= _NOTABLE_S:
             self._reported = True
             self._on_lost(reason)
 

@@ -9,11 +9,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
 from typing import NamedTuple, TypeVar
 
 from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
-from pycrorm_async.events.envelope import Record
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Drain, DrainState, run_to_completion
 from pycrorm_async.writer.patience import Patience
@@ -61,7 +60,9 @@ class LiveWriter:
         self._settings = settings
         self._randomness = randomness
         self._appended_events = asyncio.Event()
-        self._drain = Drain(source, destination.append, settings=settings, on_append=self._note_append)
+        self._drain = Drain(
+            source, destination.append, settings=settings, on_append=lambda _: self._appended_events.set()
+        )
         self._adopted: list[Drain] = []
         self._adoption_errors: list[str] = []
         self._not_adopted: list[str] = []
@@ -125,7 +126,7 @@ class LiveWriter:
     @property
     def progress(self) -> tuple[int, int]:
         """A value that changes while the database accepts records; readable from any thread."""
-        return self._drain.appended, self._destination.writes
+        return self._drain.state.appended, self._destination.writes
 
     @property
     def state(self) -> WriterState:
@@ -169,7 +170,7 @@ class LiveWriter:
         self._fold_error = None
         return result
 
-    def _note_append(self, _: Sequence[Record]) -> None:
+    def _note_append(self, _: object) -> None:
         self._appended_events.set()
 
     def _note_away(self, error: DatabaseUnavailable) -> None:
@@ -184,13 +185,10 @@ class LiveWriter:
                 async with asyncio.timeout(self._settings.idle_ms / 1000):
                     await self._appended_events.wait()
             except TimeoutError:
-                await self._fold_once()
-
-    async def _fold_once(self) -> None:
-        try:
-            await self._fold()
-        except Exception as error:  # noqa: BLE001 - in the state; the next flush raises it
-            self._fold_error = str(error)
+                try:
+                    await self._fold()
+                except Exception as error:  # noqa: BLE001 - in the state; the next flush raises it
+                    self._fold_error = str(error)
 
     async def _adopt_all(self) -> None:
         # Recovering folders reads files; in a thread, so that it does not delay our own queue.
@@ -212,7 +210,7 @@ class LiveWriter:
             self._destination.append,
             settings=self._settings,
             on_append=self._note_append,
-            say=self._not_adopted.append,
+            report=self._not_adopted.append,
         )
         self._adopted.append(drain)
         try:

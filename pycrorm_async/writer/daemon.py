@@ -13,7 +13,7 @@ No task waits for another one's database call. `Availability` observes every cal
 unavailable each task retries with pauses, and the recorders keep their events on disk. An error in one recorder's
 folder ends only its drain task; an error in a fold is reported and retried while appending continues.
 
-On `leave` the daemon claims no more folders and drains the records synced at that moment. After `LEAVE_S` it cancels
+On `stop` the daemon claims no more folders and drains the records synced at that moment. After `STOP_S` it cancels
 the remaining drain tasks. Draining may stop at any point: unacknowledged records stay in their folders for the next
 daemon, and the log stores repeated records once. A release always runs to its end, also in a cancelled task, because
 the next daemon, possibly in this process, needs the folder's lock.
@@ -38,10 +38,10 @@ from pycrorm_async.writer.ports import ClaimedSource, Log, ScanResult, SourceSca
 from pycrorm_async.writer.retry import PATIENT, Backoff
 from pycrorm_async.writer.visibility import VisibilityTracker
 
-__all__ = ["Daemon", "DaemonSummary", "LEAVE_S"]
+__all__ = ["Daemon", "DaemonSummary", "STOP_S"]
 
-LEAVE_S: Final = 10.0
-"""Bounds the time of leaving. Records not stored by then stay in their folders for the next daemon."""
+STOP_S: Final = 10.0
+"""Bounds the time of stopping. Records not stored by then stay in their folders for the next daemon."""
 _SCAN_INTERVAL_S: Final = 0.2
 """Interval between two scans for folders, and so the delay until a new recorder is drained."""
 _CONFIRM_S: Final = 5.0
@@ -58,7 +58,7 @@ class DaemonSummary(NamedTuple):
 
 
 class Daemon:
-    """The daemon. Belongs to the loop that runs it. `say` gets one line per notable event."""
+    """The daemon. Belongs to the loop that runs it. `report` gets one line per notable event."""
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class Daemon:
         scan: SourceScanner,
         *,
         settings: Settings,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         randomness: Callable[[], float] = random.random,
     ) -> None:
         self._log = log
@@ -75,7 +75,7 @@ class Daemon:
         self._availability = Availability(now_s=self._now_s, on_lost=self._note_lost, on_back=self._note_back)
         self._scan = scan
         self._settings = settings
-        self._say = say
+        self._report = report
         self._randomness = randomness
         self._serving: dict[str, VisibilityTracker] = {}
         self._rests: dict[str, tuple[int, float]] = {}  # by name: number of attempts, time of the next one
@@ -84,10 +84,10 @@ class Daemon:
         self._last_lines: dict[str, str] = {}  # by subject, the last line
         self._recorders = self._records = 0
 
-    async def run(self, leave: asyncio.Event) -> DaemonSummary:
-        """Run until `leave` is set; then drain the records synced at that moment, fold, and return.
+    async def run(self, stop: asyncio.Event) -> DaemonSummary:
+        """Run until `stop` is set; then drain the records synced at that moment, fold, and return.
 
-        Returns at most `LEAVE_S` later unless a database call blocks; no record is lost by that. Raises `SpoolForeign`
+        Returns at most `STOP_S` later unless a database call blocks; no record is lost by that. Raises `SpoolForeign`
         if the spool was bound to another database, and `DatabaseForeign` if the database was replaced by another.
         """
         foreign: SpoolForeign | DatabaseForeign | None = None
@@ -95,7 +95,7 @@ class Daemon:
             folding = tasks.create_task(self._fold_repeatedly(), name="pycrorm fold")
             confirming = tasks.create_task(self._confirm_repeatedly(), name="pycrorm confirm")
             drains: set[asyncio.Task[None]] = set()
-            while not leave.is_set() and foreign is None:
+            while not stop.is_set() and foreign is None:
                 try:
                     for source in await self._claim_sources():
                         task = tasks.create_task(self._serve(source), name=f"pycrorm drain {source.name}")
@@ -103,16 +103,16 @@ class Daemon:
                         task.add_done_callback(drains.discard)
                 except (SpoolForeign, DatabaseForeign) as error:
                     foreign = error
-                await _wait(leave, _SCAN_INTERVAL_S)
+                await _wait(stop, _SCAN_INTERVAL_S)
             for each in self._serving.values():
                 each.source.finish()
             if drains:
-                patience_s = 0.0 if isinstance(foreign, DatabaseForeign) else LEAVE_S
+                patience_s = 0.0 if isinstance(foreign, DatabaseForeign) else STOP_S
                 _, late = await asyncio.wait(drains, timeout=patience_s)
                 for task in late:
                     task.cancel()
                 if late and foreign is None:
-                    self._say(f"not finished after {LEAVE_S:g} s: the remaining events are safe in the spool")
+                    self._report(f"not finished after {STOP_S:g} s: the remaining events are safe in the spool")
             folding.cancel()
             confirming.cancel()
         if foreign is not None:
@@ -141,7 +141,7 @@ class Daemon:
         except SpoolForeign:
             raise
         except FilesError as error:
-            self._say_if_new(f"cannot scan for recorders: {error}", "scan")
+            self._report_if_new(f"cannot scan for recorders: {error}", "scan")
             return []
         self._last_lines.pop("scan", None)
         for name, fault in result.failed.items():
@@ -154,7 +154,7 @@ class Daemon:
         assert pause_s is not None, "retries never end"
         self._rests[name] = attempt, self._now_s() + pause_s
         then = "retrying with pauses" if retried else "the next writer retries"
-        self._say_if_new(f"recorder {name}: {reason}; {then}", f"{name} rests")
+        self._report_if_new(f"recorder {name}: {reason}; {then}", f"{name} rests")
 
     # --- one recorder -----------------------------------------------------------------------------------------
 
@@ -165,11 +165,11 @@ class Daemon:
             self._append,
             settings=self._settings,
             on_append=self._appended_events.set,
-            say=lambda line: self._say_if_new(line, name),
+            report=lambda line: self._report_if_new(line, name),
         )
         self._serving[name] = tracker
         if name not in self._rests:
-            self._say(f"recorder {name} " + ("appeared" if source.is_alive else "is dead: recovering its folder"))
+            self._report(f"recorder {name} " + ("appeared" if source.is_alive else "is dead: recovering its folder"))
         fault: str | None = None
         try:
             if self._away is not None:
@@ -184,7 +184,7 @@ class Daemon:
         return await self._availability.observe(self._log.append(records))
 
     async def _release(self, tracker: VisibilityTracker, fault: str | None) -> None:
-        name, state, retried = tracker.source.name, tracker.state, True
+        name, state, retried = tracker.source.name, tracker.drain.state, True
         try:
             outcome = await asyncio.to_thread(tracker.source.release)
             retried = outcome is not None or not tracker.source.holds_dead_letters
@@ -193,7 +193,7 @@ class Daemon:
                     (f"episode {episode} {why}" for episode, why in state.refused.items()), "not all events are stored"
                 )
             if fault is None:
-                self._say(f"recorder {name} {outcome}; {state.records} events stored")
+                self._report(f"recorder {name} {outcome}; {state.records} events stored")
         except PycrormError as error:
             fault = fault or str(error)
         del self._serving[name]
@@ -221,7 +221,7 @@ class Daemon:
             except Exception as error:  # noqa: BLE001 - reported and retried; appending continues
                 attempt += 1
                 if not isinstance(error, DatabaseUnavailable):
-                    self._say_if_new(f"the tables cannot be brought up to date: {_one_line(error)}", "fold")
+                    self._report_if_new(f"the tables cannot be brought up to date: {_one_line(error)}", "fold")
                 self._appended_events.set()
                 await asyncio.sleep(PATIENT.pause_s(attempt, self._randomness()) or 0.0)
             else:
@@ -236,7 +236,7 @@ class Daemon:
                 self._last_lines.pop("confirm", None)
             except Exception as error:  # noqa: BLE001 - reported and retried
                 if not isinstance(error, DatabaseUnavailable):
-                    self._say_if_new(f"stored events cannot be confirmed: {_one_line(error)}", "confirm")
+                    self._report_if_new(f"stored events cannot be confirmed: {_one_line(error)}", "confirm")
             await asyncio.sleep(_CONFIRM_S)
 
     async def _publish_visibility(self) -> None:
@@ -247,18 +247,18 @@ class Daemon:
             try:
                 tracker.note(appended, behind, stopped)
             except FilesError as error:  # the drain meets the same disk error and reports it
-                self._say(f"recorder {tracker.source.name}: {error}")
+                self._report(f"recorder {tracker.source.name}: {error}")
 
     # --- reports --------------------------------------------------------------------------------------
 
     def _note_lost(self, reason: str) -> None:
         self._away = reason
-        self._say(f"the database is unavailable: {reason}; retrying")
+        self._report(f"the database is unavailable: {reason}; retrying")
         self._publish_availability()
 
     def _note_back(self, after_s: float) -> None:
         self._away = None
-        self._say(f"the database is available again after {after_s:.1f} s")
+        self._report(f"the database is available again after {after_s:.1f} s")
         self._publish_availability()
 
     def _publish_availability(self) -> None:
@@ -266,13 +266,13 @@ class Daemon:
             try:
                 tracker.source.mark_unavailable(self._away)
             except FilesError as error:
-                self._say(f"recorder {tracker.source.name}: {error}")
+                self._report(f"recorder {tracker.source.name}: {error}")
 
-    def _say_if_new(self, line: str, about: str) -> None:
+    def _report_if_new(self, line: str, about: str) -> None:
         """Say a line unless it was the last one about this subject."""
         if self._last_lines.get(about) != line:
             self._last_lines[about] = line
-            self._say(line)
+            self._report(line)
 
     def _now_s(self) -> float:
         return asyncio.get_running_loop().time()

@@ -49,14 +49,14 @@ class DrainState(NamedTuple):
     """
 
     source: str
-    records: int
-    batches: int
-    retries: int
-    away: str | None
-    last_error: str | None
-    appended: int
-    acknowledged: int
-    refused: Mapping[str, str]
+    records: int = 0
+    batches: int = 0
+    retries: int = 0
+    away: str | None = None
+    last_error: str | None = None
+    appended: int = 0
+    acknowledged: int = 0
+    refused: Mapping[str, str] = {}
 
 
 class Drain:
@@ -73,7 +73,7 @@ class Drain:
         settings: Settings,
         backoff: Backoff = PATIENT,
         on_append: Callable[[Sequence[Record]], None] = lambda _: None,
-        say: Callable[[str], None] = _log.error,
+        report: Callable[[str], None] = _log.error,
         randomness: Callable[[], float] = random.random,
         sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
     ) -> None:
@@ -82,15 +82,11 @@ class Drain:
         self._settings = settings
         self._backoff = backoff
         self._on_append = on_append
-        self._say = say
+        self._report = report
         self._randomness = randomness
         self._sleep = sleep
-        self._records = self._batches = self._retries = 0
-        self._away: str | None = None
-        self._last_error: str | None = None
-        self._appended = self._acknowledged = 0
+        self.state = DrainState(source.name)  # replaced in one step, because any thread may read it
         self._acknowledge_max: int | None = None  # no position above it is acknowledged
-        self._refused: dict[str, str] = {}
         self.stuck: FilesError | DamageError | None = None
         """Why the source could not keep refused records; no position from them on is acknowledged."""
         self._changed = asyncio.Condition()
@@ -111,8 +107,8 @@ class Drain:
             ):
                 refusals = await self._append(batch)
                 await self._acknowledge(await self._safe_position(batch, refusals))
-                self._batches += 1
-                self._appended = batch[-1].position
+                name, batches = self._source.name, self.state.batches + 1  # a queue that moves gets another name
+                self.state = self.state._replace(source=name, batches=batches, appended=batch[-1].position)
                 self._on_append(batch)
                 await self._notify()
         except Exception as error:
@@ -131,27 +127,8 @@ class Drain:
     async def reached(self, position: int) -> bool:
         """Wait until the records up to this position are appended; False if the drain ended before."""
         async with self._changed:
-            await self._changed.wait_for(lambda: self._finished or self._appended >= position)
-        return self._appended >= position
-
-    @property
-    def appended(self) -> int:
-        """Position of the last appended record."""
-        return self._appended
-
-    @property
-    def state(self) -> DrainState:
-        return DrainState(
-            source=self._source.name,
-            records=self._records,
-            batches=self._batches,
-            retries=self._retries,
-            away=self._away,
-            last_error=self._last_error,
-            appended=self._appended,
-            acknowledged=self._acknowledged,
-            refused=dict(self._refused),  # one step of the interpreter, so consistent from any thread
-        )
+            await self._changed.wait_for(lambda: self._finished or self.state.appended >= position)
+        return self.state.appended >= position
 
     async def _append(self, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
         refusals = await retry(
@@ -161,20 +138,20 @@ class Drain:
             randomness=self._randomness,
             sleep=self._sleep,
         )
-        self._away = None
+        self.state = self.state._replace(away=None)
         return refusals
 
     def _note_away(self, error: DatabaseUnavailable) -> None:
-        self._retries += 1
-        self._away = self._last_error = str(error)
+        self.state = self.state._replace(retries=self.state.retries + 1, away=str(error), last_error=str(error))
 
     async def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
         """Keep the refused records of a batch; return the position that may be acknowledged."""
-        self._records += sum(1 for record in batch if record.episode not in refusals) if refusals else len(batch)
+        appended = sum(1 for record in batch if record.episode not in refusals) if refusals else len(batch)
         refused = {episode_text(episode): reason for episode, reason in refusals.items()}
         if refused and self._acknowledge_max is None:
             await self._keep_refused([each for each in batch if each.episode in refusals], refused)
-        self._refused = {**refused, **self._refused}
+        refused |= self.state.refused
+        self.state = self.state._replace(records=self.state.records + appended, refused=refused)
         return batch[-1].position if self._acknowledge_max is None else self._acknowledge_max
 
     async def _keep_refused(self, records: Sequence[Record], refused: Mapping[str, str]) -> None:
@@ -184,20 +161,20 @@ class Drain:
             self._acknowledge_max, self.stuck = records[0].position - 1, error
             episode, reason = next(iter(refused.items()))
             refusal = f"episode {episode} was refused: {reason}; its events cannot be kept as dead letters: {error}"
-            self._say(f"recorder {self._source.name} gets no further acknowledgements: {refusal}")
+            self._report(f"recorder {self._source.name} gets no further acknowledgements: {refusal}")
             self._source.fail(refusal)
             return
         if not kept_elsewhere:
             self._acknowledge_max = records[0].position - 1
         for episode, reason in refused.items():
-            if episode not in self._refused:
+            if episode not in self.state.refused:
                 detail = f"episode {episode} was refused: {reason}; its events are kept in the spool"
-                self._say(f"recorder {self._source.name}: {detail}")
+                self._report(f"recorder {self._source.name}: {detail}")
 
     async def _acknowledge(self, position: int) -> None:
-        if position > self._acknowledged:
+        if position > self.state.acknowledged:
             await self._source.acknowledge(position)
-            self._acknowledged = position
+            self.state = self.state._replace(acknowledged=position)
 
     async def _notify(self) -> None:
         async with self._changed:

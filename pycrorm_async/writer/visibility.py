@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.drain import Append, Drain, DrainState
+from pycrorm_async.writer.drain import Append, Drain
 from pycrorm_async.writer.ports import ClaimedSource
 
 __all__ = ["VisibilityTracker"]
@@ -31,10 +31,10 @@ class VisibilityTracker:
         *,
         settings: Settings,
         on_append: Callable[[], None],
-        say: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
         self.source = source
-        self._drain = Drain(source, append, settings=settings, on_append=self._track, say=say)
+        self.drain = Drain(source, append, settings=settings, on_append=self._track, report=report)
         self._on_append = on_append
         self._stored_before = source.stored if source.invisible else 0
         # Of each batch its last position, and each episode's last sequence up to it; first those stored before.
@@ -46,19 +46,15 @@ class VisibilityTracker:
 
     async def run(self) -> None:
         """Run until the folder is drained and all its records are visible. Raises as `Drain.run` does."""
-        await self._drain.run()
+        await self.drain.run()
         while self._invisible:
             self._updated.clear()
             await self._updated.wait()
 
     @property
-    def state(self) -> DrainState:
-        return self._drain.state
-
-    @property
     def appended(self) -> int:
         """Position of the last appended record, by this process or an earlier one."""
-        return max(self._drain.appended, self._stored_before)
+        return max(self.drain.state.appended, self._stored_before)
 
     def note(self, appended: int, behind: Mapping[str, int], stopped: Mapping[str, str]) -> None:
         """Publish to the recorder which records are visible.
@@ -68,7 +64,7 @@ class VisibilityTracker:
             behind: by id, the folded sequence of each episode with events that are not visible yet.
             stopped: by id, why an episode is refused or parked.
         """
-        visible_to, stopped = 0, {**self.state.refused, **stopped}
+        visible_to, stopped = 0, {**self.drain.state.refused, **stopped}
         while self._invisible and self._invisible[0][0] <= appended:
             position, lasts = self._invisible[0]
             if any(behind.get(episode, last) < last for episode, last in lasts.items()):

@@ -9,10 +9,10 @@ outcome of the thread. Cancelling `start`, `flush` or `close` cancels the wait, 
 
 A flush runs in the thread's loop, which may be ending at that moment. `_accepting` guards `_flushes`: a flush is added
 before the loop stops accepting, and then the loop waits for it, or it finds None there and waits for `_ended` instead.
-A writer that failed keeps its loop until it is asked to leave, so that each later flush raises its error.
+A writer that failed keeps its loop until it is asked to stop, so that each later flush raises its error.
 
-`close` asks the thread to leave and waits as long as the writer makes progress. Then it cancels the work and waits
-`_LEAVE_S` for the thread to close its database. The thread is a daemon thread: unstored events are safe in the spool,
+`close` asks the thread to stop and waits as long as the writer makes progress. Then it cancels the work and waits
+`_STOP_S` for the thread to close its database. The thread is a daemon thread: unstored events are safe in the spool,
 so they must not keep the process from ending.
 """
 
@@ -32,7 +32,7 @@ from pycrorm_async.writer.ports import Destination, Source
 
 __all__ = ["WriterThread"]
 
-_LEAVE_S = 10.0
+_STOP_S = 10.0
 """Bounds the wait of `close`, after it has timed out, for the thread to close its database."""
 
 
@@ -63,7 +63,7 @@ class WriterThread:
         self._ended: Future[None] = Future()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._work: asyncio.Task[None] | None = None
-        self._leave: asyncio.Event | None = None
+        self._stop: asyncio.Event | None = None
         self._accepting = threading.Lock()
         self._flushes: set[Future[None]] | None = set()  # None: the loop accepts no more flushes
         self._thread = threading.Thread(target=self._run, name=f"pycrorm writer {source.name}", daemon=True)
@@ -74,7 +74,7 @@ class WriterThread:
         try:
             await asyncio.shield(asyncio.wrap_future(self._opened))
         except asyncio.CancelledError:
-            self._opened.add_done_callback(lambda _: self._request_leave(cancel=True))
+            self._opened.add_done_callback(lambda _: self._request_stop(cancel=True))
             raise
         except Exception:
             self._thread.join()
@@ -119,12 +119,12 @@ class WriterThread:
         Raises the error that stopped appending, `EpisodeParked`, or `FlushTimeout` after `flush_timeout_s` without
         progress.
         """
-        self._request_leave(cancel=False)
+        self._request_stop(cancel=False)
         ended = asyncio.wrap_future(self._ended)
         if not await self._patience.wait(ended):
             timeout = self._timeout_error()
-            self._request_leave(cancel=True)
-            await asyncio.wait([ended], timeout=_LEAVE_S)
+            self._request_stop(cancel=True)
+            await asyncio.wait([ended], timeout=_STOP_S)
             if ended.done():
                 ended.exception()  # retrieved, so that it is not logged; the timeout is raised instead
             raise timeout
@@ -148,11 +148,11 @@ class WriterThread:
             " everything recorded is safe in the spool"
         )
 
-    def _request_leave(self, *, cancel: bool) -> None:
-        if self._ended.done() or self._loop is None or self._leave is None or self._work is None:
+    def _request_stop(self, *, cancel: bool) -> None:
+        if self._ended.done() or self._loop is None or self._stop is None or self._work is None:
             return
         try:
-            self._loop.call_soon_threadsafe(self._work.cancel if cancel else self._leave.set)
+            self._loop.call_soon_threadsafe(self._work.cancel if cancel else self._stop.set)
         except RuntimeError:  # the loop has just closed: the thread is ending
             return
 
@@ -176,15 +176,15 @@ class WriterThread:
     async def _main(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._work = asyncio.current_task()
-        self._leave = asyncio.Event()
+        self._stop = asyncio.Event()
         async with AsyncExitStack() as stack:
             destination = await self._open(stack)
             writer = LiveWriter(self._source, destination, adopt=self._adopt, settings=self._settings)
             self._opened.set_result(writer)
             try:
-                # A failed writer waits for the request to leave, so that every flush raises its error.
+                # A failed writer waits for the request to stop, so that every flush raises its error.
                 [outcome] = await asyncio.gather(writer.run(), return_exceptions=True)
-                await self._leave.wait()
+                await self._stop.wait()
                 await asyncio.gather(*map(asyncio.wrap_future, self._end_flushes()), return_exceptions=True)
             finally:
                 if self._end_flushes():

@@ -247,7 +247,7 @@ async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, 
                 held.extend(found.held)
                 return found
 
-            await Daemon(destination, destination, look_and_note, settings=SETTINGS, say=say).run(leave)
+            await Daemon(destination, destination, look_and_note, settings=SETTINGS, report=say).run(leave)
 
         async def round_(at: int) -> bool:
             script = script_of(at)

@@ -172,7 +172,7 @@ async def test_the_one_who_drains_may_leave_and_what_comes_after_is_drained_too(
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     job = Job(Scene(), default_policy(), 5)
     leave, ready = asyncio.Event(), asyncio.Event()
-    other = asyncio.create_task(serve(place.url, spool=None, leave=leave, say=lambda _: ready.set()))
+    other = asyncio.create_task(serve(place.url, spool=None, stop=leave, report=lambda _: ready.set()))
     await ready.wait()
     async with Workers(1, place) as workers:
         await workers.roll_out(job, [(0, 10)])

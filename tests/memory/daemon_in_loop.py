@@ -16,7 +16,7 @@ class Daemon:
     def __init__(self, url: str, spool: Path, settings: Settings = QUICK) -> None:
         self.said: list[str] = []
         self.leave = asyncio.Event()
-        serving = serve(url, spool=spool, leave=self.leave, say=self.said.append, settings=settings)
+        serving = serve(url, spool=spool, stop=self.leave, report=self.said.append, settings=settings)
         self.task = asyncio.create_task(serving)
 
     async def says(self, pattern: str) -> None:

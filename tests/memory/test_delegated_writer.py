@@ -310,7 +310,7 @@ async def test_a_second_daemon_on_the_same_spool_is_refused_in_one_line(
     async with daemon() as started:
         await started.says("draining")
         with pytest.raises(SpoolUnavailable, match="another `pycrorm writer` drains it already") as refused:
-            await serve(database_url, spool=spool, leave=asyncio.Event(), say=print)
+            await serve(database_url, spool=spool, stop=asyncio.Event(), report=print)
         assert "\n" not in str(refused.value)
     async with daemon() as started:
         await started.says("draining")
@@ -354,7 +354,7 @@ async def test_a_spool_of_another_database_is_refused_and_nothing_of_it_is_moved
         async with Memory.open(f"sqlite:///{tmp_path}/other.db"):
             pass
         with pytest.raises(SpoolForeign, match="belongs to log"):
-            await serve(f"sqlite:///{tmp_path}/other.db", spool=spool, leave=asyncio.Event(), say=print)
+            await serve(f"sqlite:///{tmp_path}/other.db", spool=spool, stop=asyncio.Event(), report=print)
         await recover(database_url, spool=spool)
     assert ask(f"sqlite:///{tmp_path}/other.db", "SELECT count(*) FROM event") == [(0,)]
 

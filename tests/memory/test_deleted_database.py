@@ -52,7 +52,7 @@ async def test_a_file_deleted_or_replaced_during_a_run_is_named_and_all_events_c
     with pytest.raises((SpoolForeign, DatabaseUnavailable), match="pycrorm spool rebind"):
         await recover(url)
     said: list[Rebinding] = []
-    done = await rebind(url, say=said.append)
+    done = await rebind(url, on_rebinding=said.append)
     assert (said, done.recorders, done.before != done.after) == ([done], 1, True)
     report = await recover(url)
     assert (report.drained.stopped, report.failed, report.dead_letters) == ({}, {}, {})
@@ -85,7 +85,7 @@ async def test_events_of_a_database_that_was_made_anew_are_stored_by_rebind_and_
     with pytest.raises((SpoolForeign, DatabaseUnavailable), match="pycrorm spool rebind"):
         async with Memory.open(database_url, spool=spool):
             pass
-    await rebind(database_url, spool=spool, say=lambda _: None)
+    await rebind(database_url, spool=spool, on_rebinding=lambda _: None)
     report = await recover(database_url, spool=spool)
     assert (report.failed, report.drained.stopped) == ({}, {})
     assert ask(database_url, "SELECT text FROM note_action ORDER BY text")[-1:] == [("kept in the spool",)]

@@ -94,8 +94,8 @@ async def lab_at(url: str, folder: Path, settings: Settings, monkeypatch: pytest
         served = serve(
             url,
             spool=spool,
-            leave=leave,
-            say=lab.said.append,
+            stop=leave,
+            report=lab.said.append,
             settings=settings,
             projections=[Trapped()],
             fold_workers=1,

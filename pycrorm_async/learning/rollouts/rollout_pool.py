@@ -293,7 +293,7 @@ async def _drain(place: MemoryLocation, stop: asyncio.Event, ready: asyncio.Even
 
     while not stop.is_set():
         try:
-            await serve(place.url, spool=place.spool, leave=stop, say=log)
+            await serve(place.url, spool=place.spool, stop=stop, report=log)
         except SpoolTaken:
             ready.set()
         except DatabaseUnavailable:
