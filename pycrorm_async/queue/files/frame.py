@@ -151,9 +151,7 @@ def decode_each(buffer: Buffer, offset: int, salt: int) -> Iterator[Fields]:
     """
     unpack, end = _HEADER.unpack, len(buffer)
     while (body_start := offset + HEADER_BYTES) <= end:
-        header = buffer[
-            offset:body_start
-        ]  # a copy, so that a concurrent write cannot change it between unpacking and checking
+        header = buffer[offset:body_start]  # a copy, which no concurrent write changes between the next two steps
         (
             kind,
             type_bytes,

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Final
 
 from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
-from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.files.locks import is_locked
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, MENDED, PROGRESS, TAIL
 from pycrorm_async.queue.files.recorder_folder import folder_error, is_folder_name, parse_folder_name, wrap_os_errors
-from pycrorm_async.queue.files.scan import Survey, ValidPrefix, survey, tails
+from pycrorm_async.queue.files.scan import Survey, survey, tails
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 
@@ -273,10 +273,17 @@ def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
         first=prefix.start.position + 1,
         last=prefix.cut.position,
         safe=max(count.safe, prefix.start.position),
-        segments=tuple(_segment(folder, number, prefix, count) for number in prefix.numbers),
+        segments=tuple(
+            SegmentReport(path.name, _size(path), prefix.bases.get(number), count.segments[number])
+            for number in prefix.numbers
+            for path in [segment_path(folder, number)]
+        ),
         types=dict(sorted(count.types.items())),
         episodes=len(count.episodes | set(prefix.open)),
-        open=tuple(_open(prefix)),
+        open=tuple(
+            OpenEpisode(episode_text(episode), last.sequence, last.wall_ns)
+            for episode, last in sorted(prefix.open.items())
+        ),
         tail_bytes=0 if recorder.alive or damage else sum(len(tail) for _, tail in tails(folder, prefix)),
         cut_off=tuple(each for each in others if each.endswith(TAIL)),
         foreign=tuple(each for each in others if not each.endswith((TAIL, MAKING))),
@@ -304,15 +311,3 @@ def _survey_stable(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
             break
         before = damage
     return count, result
-
-
-def _segment(folder: Path, number: int, prefix: ValidPrefix, count: _Count) -> SegmentReport:
-    path = segment_path(folder, number)
-    return SegmentReport(path.name, _size(path), prefix.bases.get(number), count.segments[number])
-
-
-def _open(prefix: ValidPrefix) -> list[OpenEpisode]:
-    return [
-        OpenEpisode(episode_text(EpisodeId(episode)), last.sequence, last.wall_ns)
-        for episode, last in sorted(prefix.open.items())
-    ]
