@@ -27,8 +27,7 @@ from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.run.batch_fold import PreparedBatch
-from pycrorm_async.projections.run.pipeline import Outlook
+from pycrorm_async.projections.run.batch_fold import BatchPreview
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
@@ -49,7 +48,7 @@ class Assignment(NamedTuple):
 
 
 class Prepare(NamedTuple):
-    """Read and fold these events; answered with an `Outlook`."""
+    """Read and fold these events; answered with an `BatchPreview`."""
 
     spans: Sequence[Span]
 
@@ -72,7 +71,7 @@ class Failure(NamedTuple):
 
 
 Request: TypeAlias = Prepare | Write | FoldRest
-Answer: TypeAlias = Outlook | int | bool | Failure
+Answer: TypeAlias = BatchPreview | int | bool | Failure
 
 
 def main(descriptor: int, daemon: int) -> None:
@@ -101,13 +100,12 @@ def _end_with(daemon: int) -> None:
 
 
 class _RequestHandler:
-    """Executes requests. At most one batch is prepared."""
+    """Executes requests."""
 
     def __init__(self, assignment: Assignment) -> None:
         self._assignment = assignment
         self._log: EventLog | None = None
         self._projector: Projector | None = None
-        self._batch: PreparedBatch | None = None
 
     async def answer(self, request: Request) -> Answer:
         try:
@@ -122,12 +120,9 @@ class _RequestHandler:
     async def _execute(self, request: Request, projector: Projector) -> Answer:
         match request:
             case Prepare(spans):
-                self._batch = None
-                self._batch = batch = await projector.prepare(spans)
-                return Outlook(batch.count, batch.reached, batch.is_whole)
+                return await projector.prepare(spans)
             case Write():
-                prepared, self._batch = self._batch, None
-                return 0 if prepared is None else await projector.write(prepared)
+                return await projector.write()
             case FoldRest(now):
                 return await projector.fold_rest(now=now)
 

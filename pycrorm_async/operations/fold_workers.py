@@ -35,7 +35,9 @@ from pycrorm_async.errors import DatabaseError, DatabaseUnavailable
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.operations.fold_process import FoldProcess
 from pycrorm_async.operations.fold_worker import Assignment, Failure, FoldRest, Prepare, Request, Write
-from pycrorm_async.projections.run.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPipeline, Outlook
+from pycrorm_async.projections.run.batch_fold import BatchPreview
+from pycrorm_async.projections.run.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPipeline
+from pycrorm_async.projections.run.targets import LiveTarget
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.stored import Span
 from pycrorm_async.writer.ports import Tables
@@ -100,7 +102,7 @@ def verdict(settings: Settings, *, unanswered_s: float, stopped_s: float) -> Lit
 
 
 class FoldWorker:
-    """One worker and its current process. Implements `Hand`."""
+    """One worker and its current process. Implements `BatchWorker`."""
 
     def __init__(
         self,
@@ -129,9 +131,9 @@ class FoldWorker:
 
     # --- requests ---------------------------------------------------------------------------------------------
 
-    async def prepare(self, spans: Sequence[Span]) -> Outlook:
+    async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         answer = await self._request(Prepare(spans), "prepares a batch")
-        assert isinstance(answer, Outlook)
+        assert isinstance(answer, BatchPreview)
         return answer
 
     async def write(self) -> int:
@@ -335,21 +337,22 @@ class FoldWorkerTables(Tables):
     def __init__(self, destination: LogAndTables, workers: FoldWorkers) -> None:
         self._destination = destination
         self._workers = workers
-        self._pipeline = FoldPipeline(destination.log)
+        self._pipeline = FoldPipeline(LiveTarget(destination.log))
         self._has_news = True
 
     async def fold_next_batch(self) -> bool:
         if not self._workers.are_wanted:  # start processes only when there are events, to keep an idle daemon small
-            self._workers.want(await self._pipeline.size())
-        hands = self._workers.ready
-        if not hands:
+            with self._destination.log.translated():
+                self._workers.want(await self._pipeline.size())
+        workers = self._workers.ready
+        if not workers:
             folded = await self._destination.fold_next_batch()
             self._workers.want(folded)
             return folded
         try:
             with self._destination.log.translated():
-                count = await self._pipeline.fold_next(hands)
-            self._has_news = count is not None or await hands[0].fold_rest(now=self._has_news)
+                count = await self._pipeline.fold_next(workers)
+            self._has_news = count is not None or await workers[0].fold_rest(now=self._has_news)
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True
         return self._has_news

@@ -10,28 +10,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sqlalchemy import text
-from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
+from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.custom.projection_tables import CustomTables
-from pycrorm_async.projections.run.batch_fold import BatchFold, PreparedBatch
+from pycrorm_async.projections.run.batch_fold import BatchFold, BatchPreview
 from pycrorm_async.projections.run.parked_release import release_parked
+from pycrorm_async.projections.run.pipeline import FoldPipeline
+from pycrorm_async.projections.run.targets import LiveTarget
 from pycrorm_async.projections.schema.generations import (
-    Generation,
-    Hold,
     current_generation,
     grow_tables,
     make_generation,
     show,
 )
-from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 from pycrorm_async.projections.schema.materialised_views import refresh_some
 from pycrorm_async.projections.schema.user_views import UserView, with_user_views
-from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog, advance_folded, park
+from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
 __all__ = ["Projector"]
@@ -40,7 +37,7 @@ _ANYTHING_FOLDED = text("SELECT 1 FROM episode WHERE folded > 0 LIMIT 1")
 
 
 class Projector:
-    """Folds one log into its tables.
+    """Folds one log into its tables. Implements `BatchWorker`.
 
     Args:
         log: open for writing.
@@ -61,11 +58,11 @@ class Projector:
     ) -> None:
         self._log = log
         self._views = views
-        self._batch_events = batch_events
         self._custom = CustomTables(log, projections, installed, batch_events=batch_events)
         self._has_news = True
-        self._folding: BatchFold | None = None
-        self._last_number = 0
+        self._target = LiveTarget(log)
+        self._pipeline = FoldPipeline(self._target, batch_events=batch_events)
+        self._fold: BatchFold | None = None
 
     async def open(self) -> None:
         """Create missing tables and views: those of every memory, of the mapped classes and of the users.
@@ -85,8 +82,8 @@ class Projector:
                 changed = await self._custom.set_up(connection, layout)
                 if current is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
-                generation = await release_parked(connection, _LiveTarget(), generation)
-            self._folding = BatchFold(self._log, _LiveTarget(), generation)
+                generation = await release_parked(connection, self._target, generation)
+            self._fold = BatchFold(self._log, self._target, generation)
             await self._sweep()
 
     async def catch_up(self) -> int:
@@ -97,7 +94,7 @@ class Projector:
         """
         count = 0
         with self._log.translated():
-            while (folded := await self._fold_next()) is not None:
+            while (folded := await self._pipeline.fold_next([self])) is not None:
                 count += folded
             while await self._refresh():
                 pass
@@ -108,7 +105,9 @@ class Projector:
     async def fold_next_batch(self) -> bool:
         """Fold one batch, or do one step of `fold_rest`; return False if nothing was behind the log."""
         with self._log.translated():
-            self._has_news = await self._fold_next() is not None or await self.fold_rest(now=self._has_news)
+            self._has_news = await self._pipeline.fold_next([self]) is not None or await self.fold_rest(
+                now=self._has_news
+            )
         return self._has_news
 
     async def fold_rest(self, *, now: bool) -> bool:
@@ -120,59 +119,33 @@ class Projector:
         with self._log.translated():
             return await self._refresh() or await self._custom.fold_next_batch(now=now)
 
-    async def prepare(self, spans: Sequence[Span]) -> PreparedBatch:
+    async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         """Read and fold the events of these spans, and write nothing. Raises `DatabaseUnavailable`."""
-        assert self._folding is not None, "opened before anything is folded"
         with self._log.translated():
-            return await self._folding.prepare(spans, await self._log.spans(spans))
+            return await self._opened.prepare(spans)
 
-    async def write(self, batch: PreparedBatch) -> int:
-        """Write a prepared batch; return the number of its events written, 0 if the tables changed since `prepare`."""
-        assert self._folding is not None, "opened before anything is folded"
-        before = self._folding.generation.revision
+    async def write(self) -> int:
+        """Write the prepared batch; return the number of its events written, 0 if the tables changed since then."""
+        before = self._opened.generation.revision
         with self._log.translated():
-            count = await self._folding.write(batch)
-            if self._folding.generation.revision != before:
+            count = await self._opened.write()
+            if self._opened.generation.revision != before:
                 await self._sweep()
         return count
 
-    async def _fold_next(self) -> int | None:
-        """Fold a batch; return the number of events, None if no episode is behind."""
-        # Start behind the last batch's episode, so that an episode that always grows does not starve the others.
-        spans = await self._log.unfolded(self._batch_events, after=self._last_number)
-        if not spans:
-            return None
-        self._last_number = spans[-1].number
-        return await self.write(await self.prepare(spans))
+    @property
+    def _opened(self) -> BatchFold:
+        assert self._fold is not None, "opened before anything is folded"
+        return self._fold
 
     async def _refresh(self) -> bool:
-        assert self._folding is not None, "opened before anything is folded"
-        if not self._folding.generation.layout.kept:
+        if not self._opened.generation.layout.kept:
             return False
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).lock_log_changes(connection)
-            generation = await _LiveTarget().generation(connection, "share")
+            generation = await self._target.generation(connection, "share")
             return await refresh_some(connection, generation.layout, generation.number)
 
     async def _sweep(self) -> None:
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).sweep(connection)
-
-
-class _LiveTarget:
-    """The visible generation, with `episode.folded` as its checkpoint. Implements `FoldTarget`."""
-
-    async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
-        generation = await current_generation(connection, hold=hold)
-        if generation is None:
-            raise DatabaseUnavailable("the tables are missing: restore them from a backup, or run `pycrorm rebuild`")
-        return generation
-
-    async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
-        return await show(connection, await grow_tables(connection, generation, layout))
-
-    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
-        return await advance_folded(connection, steps)
-
-    async def park(self, connection: AsyncConnection, number: int, reason: str) -> None:
-        await park(connection, number, reason)

@@ -43,8 +43,9 @@ from pycrorm_async.projections.custom.projection_tables import (
 )
 from pycrorm_async.projections.replaced_tables import REPLACED, readable_generations
 from pycrorm_async.projections.run import checkpoints
-from pycrorm_async.projections.run.batch_fold import TABLES
-from pycrorm_async.projections.run.catch_up import WHOLE, CatchUp, Share, SideTarget
+from pycrorm_async.projections.run.batch_fold import TABLES, BatchFold
+from pycrorm_async.projections.run.pipeline import FoldPipeline
+from pycrorm_async.projections.run.targets import WHOLE, Share, SideTarget
 from pycrorm_async.projections.schema.generations import (
     MAKING,
     PROJECTION,
@@ -122,16 +123,12 @@ class Rebuild:
         self._key = SHOWN if projection is None else f"{PROJECTION}{projection.name}"
         name = None if projection is None else projection.name
         self._place = checkpoints.place_of(generation.number, name)
-        self._making = SideTarget(f"{self._key}{_MAKING}", name, generation.version, number=generation.number)
-        self._catch_up = CatchUp(
-            log,
-            self._making,
-            generation,
-            definition=TABLES if projection is None else CustomFoldDefinition(projection),
-            share=share,
-            after_tables=projection is not None,
-            batch_events=_BATCH_EVENTS,
-        )
+        key = f"{self._key}{_MAKING}"
+        self._making = SideTarget(log, key, name, generation.version, number=generation.number, share=share)
+        definition = TABLES if projection is None else CustomFoldDefinition(projection)
+        self._fold = BatchFold(log, self._making, generation, definition)
+        local = None if log.address.is_sqlite else self._fold
+        self._pipeline = FoldPipeline(self._making, batch_events=_BATCH_EVENTS, local=local)
 
     @classmethod
     async def begin(
@@ -160,7 +157,7 @@ class Rebuild:
                     await make_empty(connection, {checkpoints.TABLE: checkpoints.COLUMNS}, making.number)
                 making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
                 await write_generation(connection, MAKING, making)
-            target = SideTarget(MAKING, None, making.version, number=making.number)
+            target = SideTarget(log, MAKING, None, making.version, number=making.number)
             while (grown := await _grow_slice(log, target, payloads)).layout != making.layout:
                 making = grown
             async with log.engine.begin() as connection:
@@ -198,7 +195,7 @@ class Rebuild:
     async def fold_next_batch(self) -> int | None:
         """Fold a batch; return the number of events, None when none is left of this share."""
         with self._log.translated():
-            return await self._catch_up.fold_next_batch()
+            return await self._pipeline.fold_next([self._fold])
 
     async def show(self) -> None:
         """Make the new tables visible, with at least the events of the old ones. `clear` drops the old ones."""
@@ -251,7 +248,7 @@ class Rebuild:
                 return False
             if late:
                 spans = [Span(each.number, each.folded, each.head) for each in late]
-                if not await self._catch_up.folding.batch_in(connection, spans, await self._log.spans(spans)):
+                if not await self._fold.write_in(connection, spans):
                     await connection.rollback()
                     return False
                 new = await self._making.generation(connection, "change")

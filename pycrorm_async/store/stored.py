@@ -16,6 +16,7 @@ __all__ = [
     "NOTHING_KNOWN",
     "numbers_reserved",
     "Span",
+    "size_of",
     "beyond",
     "share_out",
 ]
@@ -110,6 +111,15 @@ class Span(NamedTuple):
     number: int
     after: int
     last: int
+
+
+def size_of(spans: Sequence[Span]) -> int:
+    """Return the number of events in these spans.
+
+    >>> size_of([Span(1, 0, 7), Span(2, 3, 4)])
+    8
+    """
+    return sum(each.last - each.after for each in spans)
 
 
 def beyond(behind: Sequence[EpisodeRow], reached: Mapping[int, int]) -> list[EpisodeRow]:

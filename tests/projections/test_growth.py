@@ -130,8 +130,8 @@ async def test_tables_are_grown_by_several_transactions_where_one_would_hold_too
     monkeypatch.setattr(growth, "_SLICE", 3)
     types = [with_fields(f"Kind{n}Action", "real", "size") for n in range(8)]
     projector = await stored_and_folded(log, [*declarations(*types), *performing(1, types[7], size=7.0)])
-    assert projector._folding is not None
-    assert projector._folding.generation.revision == 4  # made, and grown three times
+    assert projector._fold is not None
+    assert projector._fold.generation.revision == 4  # made, and grown three times
     assert await ask(log, "SELECT size FROM kind7_action") == [(7.0,)]
     await rebuilt(log)
     assert await ask(log, "SELECT size FROM kind7_action") == [(7.0,)]
@@ -216,7 +216,7 @@ async def test_the_columns_and_the_types_of_a_memory_have_a_bound_that_parks(
     projector = await stored_and_folded(log, [*declarations(*wide), *records])
     assert await told(log) == [(3, "event 3: WideAction would have 60 columns, 50 are allowed")]
     assert (await clean(log)).unmade == {"WideAction": "WideAction would have 60 columns, 50 are allowed"}
-    [(leaves,)] = [(len(projector._folding.generation.layout.leaves),)] if projector._folding else []
+    [(leaves,)] = [(len(projector._fold.generation.layout.leaves),)] if projector._fold else []
     monkeypatch.setattr(layout, "LEAVES_MAX", leaves)
     await log.append([*declarations(SAYING), *performing(4, SAYING, text="too many")])
     await projector.catch_up()

@@ -20,8 +20,9 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.run import pipeline
-from pycrorm_async.projections.run.batch_fold import PreparedBatch
-from pycrorm_async.projections.run.pipeline import FoldPipeline, Outlook
+from pycrorm_async.projections.run.batch_fold import BatchPreview
+from pycrorm_async.projections.run.pipeline import FoldPipeline
+from pycrorm_async.projections.run.targets import LiveTarget
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, mixed, name_of, row
@@ -36,16 +37,12 @@ class InLoop:
     def __init__(self, projector: Projector) -> None:
         self.projector = projector
         self.wrote: list[int] = []
-        self.batch: PreparedBatch | None = None
 
-    async def prepare(self, spans: Sequence[Span]) -> Outlook:
-        self.batch = await self.projector.prepare(spans)
-        return Outlook(self.batch.count, self.batch.reached, self.batch.is_whole)
+    async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
+        return await self.projector.prepare(spans)
 
     async def write(self) -> int:
-        assert self.batch is not None
-        batch, self.batch = self.batch, None
-        self.wrote.append(await self.projector.write(batch))
+        self.wrote.append(await self.projector.write())
         return self.wrote[-1]
 
 
@@ -72,7 +69,7 @@ class Mortal(InLoop):
 
     asked = 0
 
-    async def prepare(self, spans: Sequence[Span]) -> Outlook:
+    async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         self._live()
         return await super().prepare(spans)
 
@@ -93,12 +90,12 @@ class Died(Exception):
 class Eager(InLoop):
     """Writes before it is asked to, and again then."""
 
-    async def prepare(self, spans: Sequence[Span]) -> Outlook:
-        outlook = await super().prepare(spans)
-        batch = self.batch
+    async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
+        preview = await super().prepare(spans)
+        batch = self.projector._opened._prepared
         await super().write()
-        self.batch = batch
-        return outlook
+        self.projector._opened._prepared = batch
+        return preview
 
 
 @pytest.fixture(autouse=True)
@@ -139,7 +136,7 @@ async def hands_of(logs: Sequence[EventLog], kind: type[InLoop], batch_events: i
 
 async def fold_all(log: EventLog, hands: Sequence[InLoop], batch_events: int) -> int:
     """Until nothing is behind; the number of events that were folded, as far as the pipeline knows."""
-    pipeline, count = FoldPipeline(log, batch_events=batch_events), 0
+    pipeline, count = FoldPipeline(LiveTarget(log), batch_events=batch_events), 0
     while True:
         try:
             folded = await pipeline.fold_next(hands)
@@ -237,7 +234,7 @@ async def test_types_that_come_meanwhile_are_learned_by_both(log: EventLog, othe
 
         count = 0
 
-        async def prepare(self, spans: Sequence[Span]) -> Outlook:
+        async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
             Interrupted.count += 1
             if Interrupted.count <= 3:
                 number = Interrupted.count

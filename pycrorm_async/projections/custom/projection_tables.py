@@ -20,8 +20,9 @@ from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.projections.custom.projection import Projection, columns_of
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.run import checkpoints
-from pycrorm_async.projections.run.batch_fold import Batch
-from pycrorm_async.projections.run.catch_up import CatchUp, SideTarget
+from pycrorm_async.projections.run.batch_fold import Batch, BatchFold
+from pycrorm_async.projections.run.pipeline import FoldPipeline
+from pycrorm_async.projections.run.targets import SideTarget
 from pycrorm_async.projections.schema.generations import (
     PROJECTION,
     Generation,
@@ -157,7 +158,7 @@ class CustomTables:
         self._named = named
         self._installed = installed
         self._batch_events = batch_events
-        self._folded: dict[str, CatchUp] = {}
+        self._folded: dict[str, tuple[BatchFold, FoldPipeline]] = {}
         self._checked_s = 0.0
 
     async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
@@ -175,15 +176,10 @@ class CustomTables:
                 _log.warning("%s", fault)
                 continue
             changed = changed or is_new
-            target = SideTarget(f"{PROJECTION}{each.name}", each.name, each.version)
-            self._folded[each.name] = CatchUp(
-                self._log,
-                target,
-                generation,
-                definition=CustomFoldDefinition(each),
-                after_tables=True,
-                batch_events=self._batch_events,
-            )
+            target = SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
+            fold = BatchFold(self._log, target, generation, CustomFoldDefinition(each))
+            local = None if self._log.address.is_sqlite else fold
+            self._folded[each.name] = fold, FoldPipeline(target, batch_events=self._batch_events, local=local)
         return changed
 
     async def fold_next_batch(self, *, now: bool) -> bool:
@@ -192,9 +188,9 @@ class CustomTables:
         if not self._folded or (not now and time_s < self._checked_s + _CHECK_S):
             return False
         count = 0
-        for name, each in [*self._folded.items()]:
+        for name, (fold, pipeline) in [*self._folded.items()]:
             try:
-                count += await each.fold_next_batch() is not None
+                count += await pipeline.fold_next([fold]) is not None
             except DatabaseUnavailable:
                 raise
             except PycrormError as fault:

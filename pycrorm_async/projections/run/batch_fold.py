@@ -13,21 +13,22 @@ again for the tables that exist now. An event that cannot be folded parks its ep
 it are written, later ones are not folded, and all other episodes continue. If the database refuses a row, the batch is
 written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
 
-`FoldTarget` is the generation and its checkpoints: the visible one (`projector`) or one beside it (`catch_up`).
-`FoldDefinition` turns events into rows: those of the built-in tables, here, or those of a custom projection.
+`FoldTarget` is the generation and its checkpoints, of which there are two kinds (`targets`). `FoldDefinition` turns
+events into rows: those of the built-in tables, here, or those of a custom projection.
 """
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.errors import LogDamaged
 from pycrorm_async.projections.fold.fold import CannotFold, fold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
@@ -38,9 +39,9 @@ from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialect import Insertion, Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span, StoredEvent
+from pycrorm_async.store.stored import Span, StoredEvent, size_of
 
-__all__ = ["BatchFold", "FoldTarget", "FoldDefinition", "Batch", "PreparedBatch", "TABLES"]
+__all__ = ["BatchFold", "FoldTarget", "FoldDefinition", "Batch", "BatchPreview", "TABLES"]
 
 _REASON_LENGTH_MAX = 2_000
 """Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
@@ -49,7 +50,21 @@ _SLICE_EVENTS = 100
 
 
 class FoldTarget(GrowthTarget, Protocol):
-    """A generation to fold into, and its checkpoints. Every method runs in the caller's transaction."""
+    """A generation to fold into, and its checkpoints. All methods but `unfolded` run in the caller's transaction.
+
+    Attributes:
+        parks_gaps: whether an event that is missing in the log parks its episode; otherwise `LogDamaged` is raised.
+    """
+
+    parks_gaps: bool
+
+    async def unfolded(self, limit: int, *, after: int, reached: Mapping[int, int]) -> list[Span]:
+        """Return spans of events that this generation lacks, at most `limit` in total; without parked episodes.
+
+        Begins with the episodes whose number is above `after`, or with the first if there are none. `reached` is the
+        last sequence, by number, of a batch that is being written.
+        """
+        ...
 
     async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
         """Read the generation and lock it until the transaction ends."""
@@ -87,17 +102,6 @@ class FoldDefinition(Protocol):
 
 
 @dataclass(frozen=True)
-class _FoldedBatch:
-    """A folded batch: its rows for the generation `number`, (episode, folded before, folded now) for each episode, and
-    the reasons of the episodes to park."""
-
-    rows: Batch
-    number: int
-    steps: list[Progress]
-    parked: dict[int, str]
-
-
-@dataclass(frozen=True)
 class _Types:
     """The declarations that were read, and the layout and batch factory for them at one revision."""
 
@@ -108,28 +112,41 @@ class _Types:
 
 
 @dataclass(frozen=True)
-class PreparedBatch:
-    """A batch between `prepare` and `write`."""
+class _PreparedBatch:
+    """A batch between `prepare` and `write`.
+
+    Attributes:
+        rows: for the generation `number`.
+        steps: (episode, folded before, folded now) for each episode.
+        parked: the reasons of the episodes to park.
+    """
 
     spans: Sequence[Span]
     events: Sequence[StoredEvent]
     types: _Types
-    done: _FoldedBatch
+    rows: Batch
+    number: int
+    steps: list[Progress]
+    parked: dict[int, str]
 
     @property
     def count(self) -> int:
         """The number of its folded events."""
-        return sum(now - before for _, before, now in self.done.steps)
+        return sum(now - before for _, before, now in self.steps)
 
-    @property
-    def is_whole(self) -> bool:
-        """True if all its events are folded, so that it parks no episode."""
-        return not self.done.parked
 
-    @property
-    def reached(self) -> dict[int, int]:
-        """By episode number, the checkpoint after it is written."""
-        return {number: now for number, _, now in self.done.steps}
+class BatchPreview(NamedTuple):
+    """The effect of a prepared batch once it is written.
+
+    Attributes:
+        events: the number folded in the batch.
+        reached: by episode number, the last sequence folded.
+        is_whole: False if the batch parks an episode.
+    """
+
+    events: int
+    reached: Mapping[int, int]
+    is_whole: bool
 
 
 class _TableRows:
@@ -163,7 +180,11 @@ TABLES = _Tables()
 
 
 class BatchFold:
-    """Folds events of one log into one target. `generation` is its state when this process last read it."""
+    """Folds events of one log into one target. Implements `BatchWorker`.
+
+    Attributes:
+        generation: its state when this process last read it.
+    """
 
     def __init__(
         self, log: EventLog, target: FoldTarget, generation: Generation, definition: FoldDefinition = TABLES
@@ -173,26 +194,46 @@ class BatchFold:
         self._definition = definition
         self.generation = generation
         self._types: _Types | None = None
+        self._prepared: _PreparedBatch | None = None
 
-    async def batch(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> int:
-        """Prepare and write these events; return the number folded.
+    async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
+        """Read and fold these events, yielding to the event loop at intervals. Writes nothing."""
+        self._prepared = None
+        events = await self._log.spans(spans)
+        if not self._target.parks_gaps and len(events) < size_of(spans):
+            raise await _damage(self._log, spans, events)
+        self._prepared = batch = await self._folded(spans, events)
+        return BatchPreview(batch.count, {number: now for number, _, now in batch.steps}, not batch.parked)
 
-        It is smaller if an episode was parked, and 0 if another process folded them first.
+    async def write(self) -> int:
+        """Write the prepared batch; return the number of events folded.
+
+        It is smaller if an episode was parked, and 0 if another process folded them first or changed the tables.
         """
-        return await self.write(await self.prepare(spans, events))
+        batch, self._prepared = self._prepared, None
+        return 0 if batch is None else await self._write(batch)
 
-    async def prepare(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> PreparedBatch:
-        """Fold the events into rows, yielding to the event loop at intervals. Writes nothing."""
+    async def write_in(self, connection: AsyncConnection, spans: Sequence[Span]) -> bool:
+        """Fold in the caller's transaction, which must be rolled back if this returns False or raises `RowRefused`."""
+        batch = await self._folded(spans, await self._log.spans(spans))
+        generation = await self._generation(connection, batch)
+        if generation is not None and generation.layout != batch.types.layout:
+            return False
+        return await self._write_rows(connection, batch, generation) is not None
+
+    async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> _PreparedBatch:
         types = await self._types_now()
-        return PreparedBatch(spans, events, types, await self._folded(spans, events, types))
+        rows, number = types.batch(), self.generation.number
+        steps, parked = await _fold_all(spans, events, rows)
+        await rows.ready(self._log.engine, number)
+        return _PreparedBatch(spans, events, types, rows, number, steps, parked)
 
-    async def write(self, batch: PreparedBatch) -> int:
-        """Write a prepared batch; return the number of events folded, as `batch` does."""
+    async def _write(self, batch: _PreparedBatch) -> int:
         try:
             async with self._log.writing() as connection:
-                generation = await self._generation(connection, batch.done, batch.types)
+                generation = await self._generation(connection, batch)
                 grown = generation is not None and generation.layout != batch.types.layout
-                written = generation if grown else await self._write(connection, batch.done, generation)
+                written = generation if grown else await self._write_rows(connection, batch, generation)
                 if written is None:
                     await connection.rollback()
                     return 0
@@ -203,43 +244,29 @@ class BatchFold:
             return await self._isolate(batch.spans, batch.events, refusal)
         return batch.count
 
-    async def batch_in(self, connection: AsyncConnection, spans: Sequence[Span], events: Sequence[StoredEvent]) -> bool:
-        """Fold in the caller's transaction, which must be rolled back if this returns False or raises `RowRefused`."""
-        types = await self._types_now()
-        done = await self._folded(spans, events, types)
-        generation = await self._generation(connection, done, types)
-        if generation is not None and generation.layout != types.layout:
-            return False
-        return await self._write(connection, done, generation) is not None
-
-    async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent], types: _Types) -> _FoldedBatch:
-        rows, number = types.batch(), self.generation.number
-        steps, parked = await _fold_all(spans, events, rows)
-        await rows.ready(self._log.engine, number)
-        return _FoldedBatch(rows, number, steps, parked)
-
-    async def _generation(self, connection: AsyncConnection, done: _FoldedBatch, types: _Types) -> Generation | None:
+    async def _generation(self, connection: AsyncConnection, batch: _PreparedBatch) -> Generation | None:
         """Lock the generation and create missing tables; return None if its number or revision has changed.
 
-        The layout of the result differs from that of `types` if some tables could not be created.
+        The layout of the result differs from that of the batch if some tables could not be created.
         """
+        types = batch.types
         growing = types.layout != self.generation.layout
         if growing:
             await dialect_of(connection).lock_log_changes(connection)
         generation = await self._target.generation(connection, "change" if growing else "share")
-        if (generation.number, generation.revision) != (done.number, types.revision):
+        if (generation.number, generation.revision) != (batch.number, types.revision):
             self.generation = generation
             return None
         return await grow(connection, self._target, generation, types.payloads) if growing else generation
 
-    async def _write(
-        self, connection: AsyncConnection, done: _FoldedBatch, generation: Generation | None
+    async def _write_rows(
+        self, connection: AsyncConnection, batch: _PreparedBatch, generation: Generation | None
     ) -> Generation | None:
         """Write rows and checkpoints; return None, to roll back, without a generation or if a checkpoint has moved."""
-        if generation is None or not await self._target.advance(connection, done.steps):
+        if generation is None or not await self._target.advance(connection, batch.steps):
             return None
-        await done.rows.write(connection, generation.number)
-        for number, reason in done.parked.items():
+        await batch.rows.write(connection, generation.number)
+        for number, reason in batch.parked.items():
             await self._target.park(connection, number, _writable(reason))
         return generation
 
@@ -256,14 +283,16 @@ class BatchFold:
     async def _isolate(self, spans: Sequence[Span], events: Sequence[StoredEvent], refusal: RowRefused) -> int:
         """Fold the batch in smaller parts until the refused row's event is alone, and park its episode there."""
         if len(spans) > 1:
-            return sum([await self.batch([span], part) for span, part in _by_span(spans, events)])
+            return sum([await self._write(await self._folded([span], part)) for span, part in _by_span(spans, events)])
         span = spans[0]
         if len(events) > 1:
             # The second half is folded only if the first is whole, so that no event is folded behind the refused one.
             middle = len(events) // 2
             cut = events[middle - 1].sequence
-            count = await self.batch([span._replace(last=cut)], events[:middle])
-            return count + (await self.batch([span._replace(after=cut)], events[middle:]) if count == middle else 0)
+            count = await self._write(await self._folded([span._replace(last=cut)], events[:middle]))
+            if count < middle:
+                return count
+            return count + await self._write(await self._folded([span._replace(after=cut)], events[middle:]))
         async with self._log.writing() as connection:
             reason = f"event {events[0].sequence}: the database refuses it: {refusal}"
             await self._target.park(connection, events[0].number, _writable(reason))
@@ -274,6 +303,19 @@ def _writable(reason: str) -> str:
     """Shorten and escape a reason for storage: it may quote recorded text that a database refuses."""
     shortened = reason[:_REASON_LENGTH_MAX] + ("…" if len(reason) > _REASON_LENGTH_MAX else "")
     return shortened.encode(errors="backslashreplace").decode().replace("\0", "\\x00")
+
+
+async def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredEvent]) -> LogDamaged:
+    """Return the error for the first event of these spans that is missing."""
+    present = {(each.number, each.sequence) for each in events}
+    number, sequence = next(
+        (span.number, sequence)
+        for span in spans
+        for sequence in range(span.after + 1, span.last + 1)
+        if (span.number, sequence) not in present
+    )
+    ids = {each.number: each.id for each in await log.episodes()}
+    return LogDamaged(ids[number], sequence, f"is missing in {log.address}")
 
 
 async def _fold_all(

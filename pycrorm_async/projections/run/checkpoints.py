@@ -1,7 +1,7 @@
 """Read and write the checkpoint table of a generation: one row for each episode.
 
-Generations that a rebuild fills and those of custom projections have such a table, named after the generation. The
-checkpoints of the visible built-in tables are `episode.folded`, whose index makes a poll for new events take 0.03 ms.
+Generations that a rebuild fills and those of custom projections have such a table, named after the generation
+(`targets`).
 """
 
 from __future__ import annotations
