@@ -227,6 +227,26 @@ async def test_another_version_is_not_folded_before_it_is_rebuilt(
     assert await projector.catch_up() == 0
 
 
+async def test_the_reason_why_a_process_stops_folding_it_stays_until_it_is_set_up_again(log: EventLog) -> None:
+    projector = await folded(log, [*declarations(PICK_UP), *tries(1).records], GraspRate())
+    records = tries(2).records
+    await log.append(records)
+    async with log.engine.begin() as connection:
+        is_server = connection.dialect.name == "postgresql"
+        trigger = "event_is_not_changed ON event" if is_server else "event_is_not_deleted"
+        await connection.exec_driver_sql(f"DROP TRIGGER {trigger}")
+        await connection.exec_driver_sql("DELETE FROM event WHERE episode = 2 AND sequence = 4")
+    await projector.catch_up()
+    (state,) = await states(log, [GraspRate()])
+    assert state.fault is not None
+    assert state.fault.startswith("a process stopped folding the projection grasp_rate")
+    assert "is missing in" in state.fault
+    assert state.behind == len(records)
+    await Projector(log, projections=[GraspRate()]).open()
+    (state,) = await states(log, [GraspRate()])
+    assert state.fault is None
+
+
 async def test_rebuilt_it_is_what_it_was_live(log: EventLog) -> None:
     projector = await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], GraspRate())
     await rebuilt(log, GraspRate())

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import msgspec
 from sqlalchemy import Dialect
 from sqlalchemy.ext.asyncio import AsyncConnection
 
@@ -29,6 +30,7 @@ from pycrorm_async.projections.schema.generations import (
     grow_tables,
     make_empty,
     projections_in,
+    read_generation,
     read_generations,
     write_generation,
 )
@@ -195,10 +197,23 @@ class CustomTables:
                 raise
             except PycrormError as fault:
                 _log.warning("this process stops folding the projection %s: %s", name, fault)
+                await self._note_fault(name, fold.generation, str(fault))
                 del self._folded[name]
         if not count:
             self._checked_s = time_s
         return count > 0
+
+    async def _note_fault(self, name: str, folded: Generation, reason: str) -> None:
+        """Write the reason into the projection's generation, where `pycrorm status` reads it until it is set up again.
+
+        Tables that another process has rebuilt in the meantime get no note.
+        """
+        key = f"{PROJECTION}{name}"
+        async with self._log.engine.begin() as connection:
+            generation = await read_generation(connection, key, hold="change")
+            if generation is not None and generation.number == folded.number:
+                layout = msgspec.structs.replace(generation.layout, fault=reason)
+                await write_generation(connection, key, replace(generation, layout=layout))
 
 
 class ProjectionState(NamedTuple):
@@ -208,7 +223,7 @@ class ProjectionState(NamedTuple):
         name, version: of its tables.
         behind: the number of events that its tables lack.
         parked: the parked episodes by number, with the reasons.
-        fault: the reason why this process cannot fold it; None if it can, or has not its code.
+        fault: the reason why this process cannot fold it, or another one stopped; None if it can, or has not its code.
     """
 
     name: str
@@ -225,9 +240,11 @@ async def states(log: EventLog, projections: Sequence[Projection]) -> list[Proje
     async with log.reading() as connection:
         for name, each in projections_in(await read_generations(connection)).items():
             place = checkpoints.place_of(each.number, name)
-            fault = None
+            fault = each.layout.fault
+            if fault is not None:
+                fault = f"a process stopped folding the projection {name}, start it again to try again: {fault}"
             if name in by_name:
-                fault = fault_in_version(by_name[name], each, layout_of(by_name[name], connection.dialect))
+                fault = fault_in_version(by_name[name], each, layout_of(by_name[name], connection.dialect)) or fault
             left, parked = await checkpoints.left(connection, place), await checkpoints.parked(connection, place)
             result.append(ProjectionState(name, each.version, left, parked, fault))
     return result
