@@ -18,7 +18,7 @@ from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
 from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
-from pycrorm_async.projections.schema.unmade_types import unmade_types
+from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_folder
 from pycrorm_async.store.address import DatabaseAddress
@@ -89,8 +89,8 @@ class RefusedState:
 def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
     """Report recorders, writers, and the lag of database and tables. Changes nothing.
 
-    Exit code 1 if an episode or a recorder is stopped or a designator type has no tables, 3 if the database or the
-    spool is unavailable.
+    Exit code 1 if an episode or a recorder is stopped or a designator type has no tables or a view is left out, 3
+    if the database or the spool is unavailable.
     """
     address = shared_address(url)
     place = Spool(spool or address.default_spool)
@@ -107,10 +107,11 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     projections: list[ProjectionState] = []
     limits_near: list[str] = []
     unmade: dict[str, str] = {}
+    views: dict[str, str] = {}
     kept, log_durability = summarise_kept_segments(place.path), None
     fault: str | None = None
     try:
-        episodes, projections, limits_near, unmade, log_durability = asyncio.run(_query(address))
+        episodes, projections, limits_near, unmade, views, log_durability = asyncio.run(_query(address))
     except DatabaseError as error:
         fault = str(error)
     if as_json:
@@ -127,6 +128,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
                 "projections": [each._asdict() for each in projections],
                 "warnings": limits_near,
                 "unmade": unmade,
+                "failed_views": views,
                 "kept": kept,
                 "stored_on": None if log_durability is None else log_durability.stored_on._asdict(),
                 "went_back": [] if log_durability is None else [each._asdict() for each in log_durability.went_back],
@@ -149,6 +151,8 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
         problem(f"episode {episode.number} ({episode.id}) is stopped: {episode.refused or episode.parked}")
     for dtype, reason in unmade.items():
         problem(f"designator type {dtype[:80]!r} has no tables: {reason}")
+    for name, reason in views.items():
+        problem(f"the view {name} is left out, because the database refuses it: {reason}")
     halted = _report_halted(projections)
     unreadable = [each for each in recorders if each.fault]
     for recorder in unreadable:
@@ -158,7 +162,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
         problem(f"further records of recorder {recorder.name} are not stored: {recorder.given_up}")
     for each in refused:
         problem(f"the database refused events of episode {each.episode}; they are kept in {each.folder}")
-    return 1 if stopped or unmade or halted or given_up or refused or unreadable else 0
+    return 1 if stopped or unmade or views or halted or given_up or refused or unreadable else 0
 
 
 def _report_halted(projections: Sequence[ProjectionState]) -> bool:
@@ -222,7 +226,7 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
 
 async def _query(
     address: DatabaseAddress,
-) -> tuple[list[EpisodeState], list[ProjectionState], list[str], dict[str, str], Durability]:
+) -> tuple[list[EpisodeState], list[ProjectionState], list[str], dict[str, str], dict[str, str], Durability]:
     log = await EventLog.open(address, create=False)
     try:
         rows = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
@@ -236,7 +240,14 @@ async def _query(
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
             )
         projections = await states(log, installed_projections(()))
-        return episode_states, projections, await log.limits_near(), await unmade_types(log), await durability(log)
+        return (
+            episode_states,
+            projections,
+            await log.limits_near(),
+            await unmade_types(log),
+            await failed_views(log),
+            await durability(log),
+        )
     finally:
         await log.close()
 

@@ -40,7 +40,7 @@ def verify(
 
     Changes nothing; recording and folding may continue. Exit code 0 if no problem is result; 1 if tables differ from
     the log or are of an older version (`pycrorm rebuild` replaces them), if an episode is parked or refused, or if a
-    designator type has no tables; 4 if the log is damaged.
+    designator type has no tables or a view is left out; 4 if the log is damaged.
     """
     given_projections = load_projections(projection or ())
     projections = [*given_projections, *installed_projections(given_projections)]
@@ -55,7 +55,7 @@ def verify(
         _print(result)
     if result.damage:
         return 4
-    return 1 if result.drift or result.stopped or result.unmade or result.outdated else 0
+    return 1 if result.drift or result.stopped or result.unmade or result.failed_views or result.outdated else 0
 
 
 async def _verify(
@@ -72,18 +72,19 @@ async def _verify(
 
 
 def _print(result: VerifyResult) -> None:
-    for damage in result.damages[:_FINDINGS_MAX]:
-        stdout.print(f"damage: {damage}", markup=False)
-    for each in result.differences[:_FINDINGS_MAX]:
-        stdout.print(f"drift: episode {each.number}, event {each.sequence}: {each}", markup=False)
-    for stopped in result.stopped[:_FINDINGS_MAX]:
-        stdout.print(f"{stopped.how}: episode {stopped.number}: {stopped.reason}", markup=False)
-    for dtype, reason in [*result.unmade.items()][:_FINDINGS_MAX]:
-        stdout.print(f"no tables: {dtype[:80]!r}: {reason}", markup=False)
+    findings = (
+        [f"damage: {each}" for each in result.damages],
+        [f"drift: episode {each.number}, event {each.sequence}: {each}" for each in result.differences],
+        [f"{each.how}: episode {each.number}: {each.reason}" for each in result.stopped],
+        [f"no tables: {dtype[:80]!r}: {reason}" for dtype, reason in result.unmade.items()],
+        [f"no view: {name}: {reason}" for name, reason in result.failed_views.items()],
+    )
+    for each in findings:
+        for line in each[:_FINDINGS_MAX]:
+            stdout.print(line, markup=False)
     if result.outdated is not None:
         stdout.print(f"outdated: {result.outdated}", markup=False)
-    findings = (result.damages, result.differences, result.stopped, result.unmade)
-    count = result.damage + result.drift + len(result.stopped) + len(result.unmade)
+    count = result.damage + result.drift + sum(map(len, findings[2:]))
     shown = sum(min(len(each), _FINDINGS_MAX) for each in findings)
     if count > shown:
         stdout.print(f"and {count - shown} more")
@@ -96,9 +97,10 @@ def _print(result: VerifyResult) -> None:
         stdout.print(f"{checked}the log is intact, but the tables differ from it; run `pycrorm rebuild`")
     elif result.outdated is not None:
         stdout.print(f"{checked}the tables are outdated; run `pycrorm rebuild`")
-    elif result.stopped or result.unmade:
+    elif result.stopped or result.unmade or result.failed_views:
+        views = f" {len(result.failed_views)} views are left out," if result.failed_views else ""
         stdout.print(
-            f"{checked}{len(result.stopped)} episodes are stopped, {len(result.unmade)} types have no tables,"
+            f"{checked}{len(result.stopped)} episodes are stopped, {len(result.unmade)} types have no tables,{views}"
             " no other problem",
             soft_wrap=True,
         )

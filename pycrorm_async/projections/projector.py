@@ -7,11 +7,13 @@ await projector.catch_up()
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from dataclasses import replace
 
 from sqlalchemy import text
 
-from pycrorm_async.errors import DatabaseForeign
+from pycrorm_async.errors import CallerError, DatabaseForeign
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.custom.projection_tables import CustomTables
 from pycrorm_async.projections.run.batch_fold import BatchFold, BatchPreview
@@ -25,13 +27,15 @@ from pycrorm_async.projections.schema.generations import (
     show,
 )
 from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
-from pycrorm_async.projections.schema.materialised_views import refresh_some
+from pycrorm_async.projections.schema.materialised_views import ViewRefused, refresh_some
 from pycrorm_async.projections.schema.user_views import UserView, with_user_views
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
 __all__ = ["Projector"]
+
+_log = logging.getLogger("pycrorm_async.projections")
 
 _ANYTHING_FOLDED = text("SELECT 1 FROM episode WHERE folded > 0 LIMIT 1")
 
@@ -68,7 +72,7 @@ class Projector:
         """Create missing tables and views: those of every memory, of the mapped classes and of the users.
 
         Raises `DatabaseForeign` for tables of another version, `CallerError` for a view or a projection whose name
-        is taken.
+        is taken, and for a view that the database refuses; refused views of other processes are left out.
         """
         with self._log.translated():
             async with self._log.engine.begin() as connection:
@@ -78,10 +82,13 @@ class Projector:
                     raise DatabaseForeign(f"{self._log.address}: the tables are missing: run `pycrorm rebuild`")
                 generation = current or await make_generation(connection, 1)
                 layout = generation.layout.with_leaves(mapped_leaves())
-                layout = with_user_views(layout, self._views, connection.dialect)
+                layout = with_user_views(layout, self._views, connection.dialect).with_failed_views({})
                 changed = await self._custom.set_up(connection, layout)
                 if current is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
+                for view in self._views:
+                    if (reason := generation.layout.failed_views.get(view.name)) is not None:
+                        raise CallerError(f"the database refuses the view {view.name}: {reason}")
                 generation = await release_parked(connection, self._target, generation)
             self._fold = BatchFold(self._log, self._target, generation)
             await self._sweep()
@@ -143,8 +150,15 @@ class Projector:
             return False
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).lock_log_changes(connection)
-            generation = await self._target.generation(connection, "share")
-            return await refresh_some(connection, generation.layout, generation.number)
+            generation = await self._target.generation(connection, "change")
+            try:
+                return await refresh_some(connection, generation.layout, generation.number)
+            except ViewRefused as fault:
+                _log.warning("%s; it is left out", fault)
+                layout = generation.layout
+                layout = layout.with_failed_views(layout.failed_views | {fault.view: fault.reason})
+                await show(connection, replace(generation, revision=generation.revision + 1, layout=layout))
+                return True
 
     async def _sweep(self) -> None:
         async with self._log.engine.begin() as connection:

@@ -166,6 +166,7 @@ class Rebuild:
                 layout = making.layout
                 if shown is not None:
                     layout = layout.with_views(shown.layout.user_views, shown.layout.kept)
+                    layout = layout.with_failed_views(shown.layout.failed_views)
                 layout = with_user_views(layout, views, connection.dialect)
                 making = await grow_tables(connection, making, layout)
                 await write_generation(connection, MAKING, making)
@@ -223,7 +224,9 @@ class Rebuild:
         engine = self._log.engine
         selects = public_views(making.layout, self.number, dialect_of(engine).stored_column)
         views = {name: view_text(each, engine.dialect) for name, each in selects.items()}
-        async with with_views(self._log.engine, views | making.layout.user_views) as connection:
+        layout = making.layout
+        users = {name: each for name, each in layout.user_views.items() if name not in layout.failed_views}
+        async with with_views(self._log.engine, views | users) as connection:
             more = True
             while more:
                 more = await refresh_some(

@@ -8,13 +8,14 @@ import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from sqlalchemy import func, select
+from sqlalchemy import BigInteger, Text, column, func, select, table
 from sqlalchemy.dialects import sqlite
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
+    EpisodeStarted,
     FailureValue,
     NodeEnded,
     NodeStarted,
@@ -29,10 +30,23 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.generations import current_generation
 from pycrorm_async.projections.schema.layout import LayoutConflict
+from pycrorm_async.projections.schema.unmade_types import failed_views
 from pycrorm_async.projections.schema.user_views import UserView, view_texts
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
-from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
+from tests.projections.event_script import (
+    PICK_UP,
+    SAYING,
+    T0_NS,
+    Script,
+    declarations,
+    declared,
+    field,
+    name_of,
+    pose,
+    row,
+)
 from tests.projections.sql_queries import ask, names, stored_and_folded
 
 pytestmark = pytest.mark.slow
@@ -234,3 +248,52 @@ async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_vie
             layout.with_declaration(declared("NobodysAction", name))
         with pytest.raises(CallerError):
             view_texts([UserView(name, select(ParkArmsAction.arm))], layout, sqlite.dialect())
+
+
+def of_a_table_of_the_user(*, materialised: bool) -> UserView:
+    plans = table("plans", column("process_metadata_id", BigInteger()), column("title", Text()))
+    return UserView("planned", select(plans.c.process_metadata_id, plans.c.title), materialised=materialised)
+
+
+async def make_plans(log: EventLog) -> None:
+    async with log.engine.begin() as connection:
+        await connection.exec_driver_sql("CREATE TABLE plans (process_metadata_id BIGINT, title TEXT)")
+        await connection.exec_driver_sql("INSERT INTO plans VALUES (1, 'tea')")
+
+
+async def drop_plans(log: EventLog) -> None:
+    async with log.engine.begin() as connection:
+        await connection.exec_driver_sql(f"DROP TABLE plans{' CASCADE' * (connection.dialect.name == 'postgresql')}")
+
+
+@pytest.mark.parametrize("materialised", [False, True])
+async def test_a_view_whose_table_was_dropped_is_left_out_and_all_events_are_visible(
+    log: EventLog, materialised: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    await make_plans(log)
+    view = of_a_table_of_the_user(materialised=materialised)
+    await Projector(log, views=[view, UserView("arms", select(PickUpAction.arm))]).open()
+    await drop_plans(log)
+    projector = Projector(log)
+    await projector.open()
+    saying = Script(1)
+    saying.put(EpisodeStarted("a talk", "me", "host", "1.0", "3.11"))
+    saying.put(NodeStarted("action", None, name_of(SAYING), {"text": "hello"}))
+    await log.append([*declarations(SAYING), *saying.records])
+    await projector.catch_up()
+    assert await ask(log, "SELECT text FROM saying_action") == [("hello",)]
+    assert await ask(log, "SELECT * FROM arms") == []
+    if materialised or log.engine.dialect.name == "postgresql":  # SQLite creates views of missing tables
+        assert list(await failed_views(log)) == ["planned"]
+        assert "plans" in (await failed_views(log))["planned"]
+        assert "planned" in caplog.text
+        assert (await verify(log)).failed_views == await failed_views(log)
+    if not materialised and log.engine.dialect.name == "postgresql":
+        with pytest.raises(CallerError, match="the database refuses the view planned"):
+            await Projector(log, views=[view]).open()
+    await make_plans(log)
+    again = Projector(log)
+    await again.open()
+    await again.catch_up()
+    assert await failed_views(log) == {}
+    assert await ask(log, "SELECT title FROM planned") == [("tea",)]

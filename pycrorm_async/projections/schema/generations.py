@@ -222,13 +222,58 @@ async def grow_tables(connection: AsyncConnection, generation: Generation, layou
 
 
 async def show(connection: AsyncConnection, generation: Generation) -> Generation:
-    """Make this generation visible: replace the views in front of the tables that were visible before."""
+    """Make this generation visible: replace the views in front of the tables that were visible before.
+
+    A user's view that the database refuses, such as one of a table that was dropped, is left out: the layout of the
+    result contains the reason, and later calls leave it out too, until a process opens the tables or replaces the view.
+    """
     before = await read_generation(connection, SHOWN, hold="change")
-    views = view_texts_of(connection, generation, projections_in(await read_generations(connection)))
-    await dialect_of(connection).replace_views(connection, before.views if before else {}, views)
-    shown = replace(generation, views=views)
+    projections = projections_in(await read_generations(connection))
+    views = view_texts_of(connection, generation, projections)
+    failed = await _replace_views(connection, before.views if before else {}, views, generation, projections)
+    layout = generation.layout.with_failed_views(generation.layout.failed_views | failed)
+    shown = replace(generation, layout=layout, views={name: each for name, each in views.items() if name not in failed})
     await write_generation(connection, SHOWN, shown)
     return shown
+
+
+async def _replace_views(
+    connection: AsyncConnection,
+    before: Mapping[str, str],
+    views: Mapping[str, str],
+    generation: Generation,
+    projections: Mapping[str, Generation],
+) -> dict[str, str]:
+    """Replace all views except users' views that the database refuses; return those by name, with the reasons."""
+    dialect = dialect_of(connection)
+    users = {name for each in (generation, *projections.values()) for name in each.layout.user_views}
+    created = {name: each for name, each in views.items() if name not in users}
+    refused: dict[str, str] = {}
+    try:
+        async with connection.begin_nested():
+            await dialect.replace_views(connection, before, views)
+    except dialect.faults as error:
+        if dialect.refusal(error) is None or created == views:
+            raise
+    else:
+        return refused
+    async with connection.begin_nested() as attempt:
+        await dialect.replace_views(connection, before, created)  # raises if the fault is not in a user's view
+        await attempt.rollback()
+    for name in [each for each in views if each in users]:
+        try:
+            async with connection.begin_nested() as attempt:
+                await dialect.replace_views(connection, before, created | {name: views[name]})
+                await attempt.rollback()
+            created[name] = views[name]
+        except dialect.faults as error:
+            reason = dialect.refusal(error)
+            if reason is None:
+                raise
+            _log.warning("the view %s is left out, because the database refuses it: %s", name, reason)
+            refused[name] = reason
+    await dialect.replace_views(connection, before, created)
+    return refused
 
 
 def view_texts_of(
@@ -240,8 +285,8 @@ def view_texts_of(
 ) -> dict[str, str]:
     """Return name and SQL of every view in front of these tables; a view may select from those before it.
 
-    With `simulated` the views include simulations. A custom projection is left out if one of its names has become
-    that of a designator type since.
+    With `simulated` the views include simulations. Users' views that failed are left out. So is a custom projection if
+    one of its names has become that of a designator type since.
     """
     layout, number = generation.layout, generation.number
     stored = dialect_of(connection).stored_column
@@ -262,7 +307,8 @@ def view_texts_of(
         selects = projection_views(each.layout, each.number, number, stored, simulated=simulated)
         custom |= {view: view_text(select_, connection.dialect) for view, select_ in selects.items()}
         own |= each.layout.user_views
-    return {**built_in, **custom, **users, **own}
+    users = {name: each for name, each in (users | own).items() if name not in layout.failed_views}
+    return {**built_in, **custom, **users}
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ then on, and its nodes park their own episodes.
 
 Only a refusal of the definition counts (`Dialect.refusal`). A lock timeout, a full disk or an unavailable server aborts
 the whole transaction, and growing is tried again with the next batch. A user's view that cannot be created any more is
-not blamed on a declaration either: recording the declaration as unmade creates the same views, fails too, and raises
-that error.
+not blamed on a declaration either: `show` leaves it out.
 
 One transaction creates the tables of at most `_SLICE` declarations, because a server keeps a lock for each of them
 until COMMIT. A caller whose generation is still smaller than the layout it folded for commits and calls again.

@@ -81,6 +81,8 @@ class Layout(msgspec.Struct, frozen=True):
         outdated: tables of materialised views whose SQL was changed.
         renamed: present names of types, by former name.
         unmade: by fingerprint, the database's reason for refusing the tables of a declaration.
+        failed_views: by name, the database's reason for refusing a user's view, also one of a custom projection.
+        fault: of a custom projection, the reason why a process stopped folding it.
         unreadable: fingerprints of declarations that are not JSON a database can read.
     """
 
@@ -91,6 +93,8 @@ class Layout(msgspec.Struct, frozen=True):
     outdated: tuple[str, ...] = ()
     renamed: dict[str, str] = {}
     unmade: dict[str, str] = {}
+    failed_views: dict[str, str] = {}
+    fault: str | None = None
     unreadable: tuple[str, ...] = ()
 
     def with_leaves(self, leaves: Iterable[Leaf]) -> Self:
@@ -117,8 +121,16 @@ class Layout(msgspec.Struct, frozen=True):
         old = {table for each in self.kept.values() for table in (each.table, each.progress)}
         old -= {table for each in present.values() for table in (each.table, each.progress)}
         return msgspec.structs.replace(
-            self, user_views=self.user_views | dict(views), kept=present, outdated=(*self.outdated, *sorted(old))
+            self,
+            user_views=self.user_views | dict(views),
+            kept=present,
+            outdated=(*self.outdated, *sorted(old)),
+            failed_views={name: reason for name, reason in self.failed_views.items() if name not in views},
         )
+
+    def with_failed_views(self, reasons: Mapping[str, str]) -> Self:
+        """Return the layout with these reasons, by view, why users' views are left out."""
+        return msgspec.structs.replace(self, failed_views=dict(reasons))
 
     def with_declaration(self, declared: DesignatorTypeDeclared) -> Self:
         """Return the layout with the table of this type. Raises `LayoutConflict` with the reason."""

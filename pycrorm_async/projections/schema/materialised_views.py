@@ -13,16 +13,26 @@ from sqlalchemy import Index, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateIndex, CreateTable
 
+from pycrorm_async.errors import DatabaseError
 from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
 from pycrorm_async.projections.schema.tables import Storage, index_name, make_table, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["EPISODE", "make_materialised", "refresh_some", "shown_texts", "materialised_tables"]
+__all__ = ["EPISODE", "ViewRefused", "make_materialised", "refresh_some", "shown_texts", "materialised_tables"]
 
 EPISODE = "process_metadata_id"
 _EPISODES = 200
 """Bounds the episodes refreshed in one transaction, and so the time for which it locks out other writers."""
 _PROGRESS: dict[str, Storage] = {"id": "key", "folded": "integer"}
+
+
+class ViewRefused(DatabaseError):
+    """The database refuses the query of a materialised view, such as one of a table that was dropped."""
+
+    def __init__(self, view: str, reason: str) -> None:
+        super().__init__(f"the database refuses the rows of the view {view}: {reason}")
+        self.view = view
+        self.reason = reason
 
 
 async def make_materialised(connection: AsyncConnection, kept: MaterialisedView, generation: int) -> None:
@@ -56,13 +66,18 @@ async def refresh_some(
 ) -> bool:
     """Refresh the rows of some changed episodes from the connection's views; return False if none has changed.
 
+    Leaves out the views that failed. Raises `ViewRefused`; then the transaction can continue.
+
     Args:
         connection: in a transaction that excludes other refreshes.
         layout, generation: of the tables behind the views.
         folded: SQL that selects, for each episode, the last sequence in those tables.
     """
     done = False
+    dialect = dialect_of(connection)
     for name, kept in layout.kept.items():
+        if name in layout.failed_views:
+            continue
         table, progress = physical_name(kept.table, generation), physical_name(kept.progress, generation)
         episodes = await connection.execute(
             text(
@@ -78,15 +93,21 @@ async def refresh_some(
         done = True
         numbers = ", ".join(str(int(number)) for number, _ in behind)
         columns = ", ".join(f'"{each}"' for each in kept.columns)
-        stored = ", ".join(f'"{dialect_of(connection).stored_column(each)}"' for each in kept.columns)
+        stored = ", ".join(f'"{dialect.stored_column(each)}"' for each in kept.columns)
         query = layout.user_views[name]
         changed = f"{EPISODE} IN ({numbers})"
-        for statement in (
-            f"DELETE FROM {table} WHERE {changed}",  # noqa: S608
-            f"INSERT INTO {table} ({stored}) SELECT {columns} FROM ({query}) AS meaning WHERE {changed}",  # noqa: S608
-            f"DELETE FROM {progress} WHERE id IN ({numbers})",  # noqa: S608
-        ):
-            await connection.exec_driver_sql(statement)  # unlike `text()` it leaves a ':name' alone
-        dialect = dialect_of(connection)
+        try:
+            async with connection.begin_nested():
+                for statement in (
+                    f"DELETE FROM {table} WHERE {changed}",  # noqa: S608
+                    f"INSERT INTO {table} ({stored}) SELECT {columns} FROM ({query}) AS meaning WHERE {changed}",  # noqa: S608
+                    f"DELETE FROM {progress} WHERE id IN ({numbers})",  # noqa: S608
+                ):
+                    await connection.exec_driver_sql(statement)  # unlike `text()` it leaves a ':name' alone
+        except dialect.faults as error:
+            reason = dialect.refusal(error)
+            if reason is None:
+                raise
+            raise ViewRefused(name, reason) from error
         await dialect.insert(connection, await dialect.insertion({(progress, tuple(_PROGRESS)): behind}))
     return done

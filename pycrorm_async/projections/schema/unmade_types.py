@@ -1,4 +1,7 @@
-"""List the designator types of a memory that have no tables, with the reasons; episodes that use one are parked."""
+"""List the designator types of a memory that have no tables, and the users' views that are left out, with the reasons.
+
+Episodes that use such a type are parked.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["unmade_types"]
+__all__ = ["unmade_types", "failed_views"]
 
 
 class _DtypeOnly(msgspec.Struct):
@@ -25,6 +28,13 @@ async def unmade_types(log: EventLog) -> dict[str, str]:
     refused = unite(Layout() if generation is None else generation.layout, payloads).refused
     names = {fingerprint(each): _dtype(each) for each in payloads if fingerprint(each) in refused}
     return {names[each] or each: reason for each, reason in refused.items()}
+
+
+async def failed_views(log: EventLog) -> dict[str, str]:
+    """Return the database's reasons for refusing users' views, by view."""
+    async with log.snapshot() as connection:
+        generation = await read_generation(connection, SHOWN)
+    return {} if generation is None else generation.layout.failed_views
 
 
 def _dtype(payload: bytes) -> str:

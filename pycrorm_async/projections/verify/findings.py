@@ -48,6 +48,7 @@ class VerifyResult:
         not_compared: by name, the reason why the tables of a custom projection were not compared.
         stopped: the parked and refused episodes; the rows of their earlier events were compared.
         unmade: by dtype, the reason why a designator type has no tables.
+        failed_views: by name, the reason why a user's view is left out.
         outdated: the reason why no table was compared: an older fold made them. None for tables of this version.
     """
 
@@ -63,6 +64,7 @@ class VerifyResult:
     not_compared: Mapping[str, str] = field(default_factory=dict)
     stopped: list[StoppedEpisode] = field(default_factory=list)
     unmade: Mapping[str, str] = field(default_factory=dict)
+    failed_views: Mapping[str, str] = field(default_factory=dict)
     outdated: str | None = None
 
     def add_damage(self, number: int | None, sequence: int | None, reason: str) -> None:

@@ -19,7 +19,7 @@ from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation, current_generation
 from pycrorm_async.projections.schema.layout import unite
-from pycrorm_async.projections.schema.unmade_types import unmade_types
+from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
 from pycrorm_async.projections.verify.episode_check import EpisodeCheck
 from pycrorm_async.projections.verify.findings import Damage, StoppedEpisode, VerifyResult
 from pycrorm_async.projections.verify.parts import EpisodeRange, Place, Unreadable
@@ -70,6 +70,7 @@ async def verify(
         if episode is None:
             await _check_database(log, result)
             result.unmade = await unmade_types(log)
+            result.failed_views = await failed_views(log)
         result.stopped = await _stopped(log, episode)
         try:
             total = await _check_heads(log, within, result)
