@@ -26,8 +26,8 @@ from pycrorm_async.cli.options import (
 from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
 from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.fold_process import FoldProcess, forked
-from pycrorm_async.operations.fold_workers import WORKERS
+from pycrorm_async.operations.fold_workers import WORKERS, forked
+from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.operations.recovery import RecoveryReport, recover
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.projections.custom.projection import Projection
@@ -78,7 +78,7 @@ async def _serve_until_signal(
     spool: Path | None,
     projections: Sequence[Projection],
     settings: Settings,
-    processes: Sequence[FoldProcess],
+    processes: Sequence[ChildProcess],
 ) -> DaemonSummary:
     stop = asyncio.Event()
 

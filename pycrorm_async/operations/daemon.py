@@ -26,9 +26,9 @@ import msgspec
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseForeign, SpoolTaken
 from pycrorm_async.operations.destination import open_destination, shared_address
-from pycrorm_async.operations.fold_process import FoldProcess
 from pycrorm_async.operations.fold_worker import Assignment
 from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldWorkerState, FoldWorkerTables
+from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
@@ -55,7 +55,7 @@ async def serve(
     settings: Settings | None = None,
     projections: Sequence[Projection] = (),
     fold_workers: int = 0,
-    forked: Sequence[FoldProcess] = (),
+    forked: Sequence[ChildProcess] = (),
 ) -> DaemonSummary:
     """Drain every recorder of the spool and fold, until `stop` is set. Calls `report` with one line for each report.
 

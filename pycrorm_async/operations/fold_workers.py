@@ -1,12 +1,13 @@
-"""Start, watch and restart the processes that fold for a daemon while the daemon appends.
+"""Start, watch and restart the processes that fold for a daemon while it appends, or for a rebuild.
 
     async with FoldWorkers(2, assignment, settings=settings, say=say, note=note) as workers:
         tables = FoldWorkerTables(destination, workers)
 
-Theory of operation. A worker is a process (`fold_worker`) with one connection to the daemon. The daemon sends a request
-and waits for the answer; between requests a worker has no lock and no transaction. Checkpoints are in the tables, so
-the events that a dead worker had not committed are folded again by another worker or by the daemon. Therefore the
-daemon may kill a worker at any moment, and does so when it exits.
+Theory of operation. A worker is a process (`fold_worker`) with one connection to its parent, a daemon or a rebuild. The
+parent sends a request and waits for the answer; between requests a worker has no lock and no transaction. Checkpoints
+are in the tables, so the events that a dead worker had not committed are folded again by another worker or by the
+parent. Therefore the parent may kill a worker at any moment, and does so when it exits. There are two strategies: the
+workers of a daemon fold the batches of one pipeline in turn, those of a rebuild fold one share of the episodes each.
 
 Each worker has one asyncio task, which starts the process, waits for its end and starts it again. The pause before a
 restart grows with each death, and is short again after a process has lived for `fold_worker_healthy_s`. While no worker
@@ -25,7 +26,8 @@ pid is never hit.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from typing import Any, Final, Literal, Self
 
 import msgspec
@@ -33,17 +35,36 @@ import msgspec
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError, DatabaseUnavailable
 from pycrorm_async.operations.destination import LogAndTables
-from pycrorm_async.operations.fold_process import FoldProcess
-from pycrorm_async.operations.fold_worker import Assignment, Failure, FoldRest, Prepare, Request, Write
+from pycrorm_async.operations.fold_worker import (
+    Assignment,
+    Failure,
+    FoldRest,
+    FoldShare,
+    Prepare,
+    Request,
+    Write,
+    main,
+)
+from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.projections.run.batch_fold import BatchPreview
 from pycrorm_async.projections.run.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPipeline
-from pycrorm_async.projections.run.targets import LiveTarget
+from pycrorm_async.projections.run.targets import LiveTarget, Share
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.stored import Span
 from pycrorm_async.writer.ports import Tables
 from pycrorm_async.writer.retry import Backoff
 
-__all__ = ["WORKERS", "DaemonNote", "FoldWorkers", "FoldWorkerTables", "FoldWorkerState", "FoldWorkerLost", "verdict"]
+__all__ = [
+    "WORKERS",
+    "DaemonNote",
+    "FoldWorker",
+    "FoldWorkers",
+    "FoldWorkerTables",
+    "FoldWorkerState",
+    "FoldWorkerLost",
+    "forked",
+    "verdict",
+]
 
 WORKERS: Final = 2
 """The fold workers of one daemon: one writes while the other prepares. More would compete for the database's writes."""
@@ -113,7 +134,7 @@ class FoldWorker:
         say: Callable[[str], None],
         note: Callable[[], None],
         clock: Clock,
-        forked: FoldProcess | None,
+        forked: ChildProcess | None,
     ) -> None:
         self.state = FoldWorkerState(number, since_wall_ns=clock.wall_ns())
         self.is_ready = False
@@ -126,8 +147,16 @@ class FoldWorker:
         self._note = note
         self._clock = clock
         self._forked = forked
-        self._process: FoldProcess | None = None
+        self._process: ChildProcess | None = None
         self._killed_because: str | None = None
+        self._changed = asyncio.Event()
+
+    async def started(self, *, restarts_max: int) -> bool:
+        """Wait until the worker can take a request; return False if its process was restarted more often than that."""
+        self.wanted.set()
+        while not self.is_ready and self.state.restarts <= restarts_max:
+            await self._changed.wait()
+        return self.is_ready
 
     # --- requests ---------------------------------------------------------------------------------------------
 
@@ -145,6 +174,12 @@ class FoldWorker:
     async def fold_rest(self, *, now: bool) -> bool:
         """Refresh materialised views and fold custom projections by one step; return False if none was behind."""
         return bool(await self._request(FoldRest(now), "folds views or projections and may hold locks of the database"))
+
+    async def fold_share(self, share: Share) -> int | None:
+        """Fold a batch of this share of a rebuild; return the number of its events, None when none is left."""
+        count = await self._request(FoldShare(share), "writes a batch and holds locks of the database")
+        assert count is None or isinstance(count, int)
+        return count
 
     async def _request(self, request: Request, activity: str) -> object:
         if self._process is None or not self.is_ready:
@@ -178,35 +213,36 @@ class FoldWorker:
         """Run one process from its start to its end; return its name and the cause of its end."""
         name = f"fold worker {self.state.number}"
         try:
-            process, self._forked = self._forked or FoldProcess.spawn(), None
+            process, self._forked = self._forked or ChildProcess.start(main, name), None
         except OSError as error:
             return name, f"cannot be started: {error}"
-        self._change("starting", pid=process.process.pid)
+        self._change("starting", pid=process.pid)
         opening = asyncio.create_task(self._open(process), name=f"pycrorm {name} opens")
         try:
-            cause = await process.ended()
+            code = await process.ended()
         finally:
             self.is_ready, self._process = False, None
-            process.process.kill()
+            process.kill()
             opening.cancel()
             await asyncio.gather(opening, return_exceptions=True)
             process.end()
+        cause = f"exited with signal {-code}" if code < 0 else f"exited with exit code {code}"
         reason, self._killed_because = self._killed_because or cause, None
-        return f"{name} (pid {process.process.pid})", reason
+        return f"{name} (pid {process.pid})", reason
 
-    async def _open(self, process: FoldProcess) -> None:
+    async def _open(self, process: ChildProcess) -> None:
         try:
             await self._exchange(process, self._assignment, "starts")
         except FoldWorkerLost:
             return
         except Exception as error:  # noqa: BLE001 - such as a projection that cannot be pickled; reported at restart
             self._killed_because = f"cannot receive its assignment: {error}"
-            process.process.kill()
+            process.kill()
             return
         self._process, self.is_ready = process, True
         self._change("running")
 
-    async def _exchange(self, process: FoldProcess, message: object, activity: str) -> Any:
+    async def _exchange(self, process: ChildProcess, message: object, activity: str) -> Any:
         """Send a message, watch the process, and return the answer. Raises `FoldWorkerLost`.
 
         Cancelling it kills the process, because the late answer would be taken for that of the next request.
@@ -222,18 +258,18 @@ class FoldWorker:
             answer = exchange.result()
         except (EOFError, OSError):
             self.is_ready = False
-            process.process.kill()  # without a connection it could only idle
+            process.kill()  # without a connection it could only idle
             raise FoldWorkerLost from None
         except asyncio.CancelledError:
             self.is_ready = False
             exchange.add_done_callback(lambda done: done.cancelled() or done.exception())
-            process.process.kill()
+            process.kill()
             raise
         if self.state.state == "stopped":
             self._continue()
         return answer
 
-    def _treat(self, process: FoldProcess, activity: str, *, unanswered_s: float, stopped_s: float) -> None:
+    def _treat(self, process: ChildProcess, activity: str, *, unanswered_s: float, stopped_s: float) -> None:
         """Report or kill the process according to `verdict`."""
         settings, is_reported = self._settings, self.state.state == "stopped"
         match verdict(settings, unanswered_s=unanswered_s, stopped_s=stopped_s):
@@ -243,11 +279,11 @@ class FoldWorker:
                 )
                 self._killed_because = f"{cause} while it {activity}, and was killed"
                 self.is_ready = False
-                process.process.kill()
+                process.kill()
             case "report" if not is_reported:
                 left_s = settings.fold_worker_stopped_s - stopped_s
                 self._say(
-                    f"fold worker {self.state.number} (pid {process.process.pid}) is stopped while it {activity};"
+                    f"fold worker {self.state.number} (pid {process.pid}) is stopped while it {activity};"
                     f" replacing it in {left_s:.1f} s unless it continues"
                 )
                 self._change("stopped")
@@ -262,6 +298,8 @@ class FoldWorker:
         if state is not None:
             values |= {"state": state, "since_wall_ns": self._clock.wall_ns()}
         self.state = msgspec.structs.replace(self.state, **values)
+        self._changed.set()
+        self._changed = asyncio.Event()
         self._note()
 
 
@@ -282,7 +320,7 @@ class FoldWorkers:
         settings: Settings,
         say: Callable[[str], None],
         note: Callable[[Sequence[FoldWorkerState]], None],
-        forked: Sequence[FoldProcess] = (),
+        forked: Sequence[ChildProcess] = (),
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._note_all = note
@@ -307,6 +345,9 @@ class FoldWorkers:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
+    def __iter__(self) -> Iterator[FoldWorker]:
+        return iter(self._workers)
+
     @property
     def ready(self) -> list[FoldWorker]:
         """The workers that can take a request now."""
@@ -329,6 +370,17 @@ class FoldWorkers:
         if key != before or now_ns - noted_ns >= _NOTE_S * 1e9:
             self._noted = key, now_ns
             self._note_all(states)
+
+
+@contextmanager
+def forked(count: int) -> Iterator[list[ChildProcess]]:
+    """Fork the first workers of a daemon, and end them with the context. The calling process must have one thread."""
+    with ExitStack() as stack:
+        processes: list[ChildProcess] = []
+        for number in range(1, count + 1):
+            processes.append(ChildProcess.start(main, f"fold worker {number}", fork_beside=processes))
+            stack.callback(processes[-1].end)
+        yield processes
 
 
 class FoldWorkerTables(Tables):

@@ -3,25 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
+import logging
 import os
-import signal
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from multiprocessing import resource_tracker
-from multiprocessing.connection import wait
-from multiprocessing.process import BaseProcess
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import NamedTuple, TypeAlias
 
-from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import PycrormError
+from pycrorm_async.errors import DatabaseError
 from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.operations.fold_worker import Assignment
+from pycrorm_async.operations.fold_workers import FoldWorker, FoldWorkerLost, FoldWorkers
 from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.rebuild import Rebuild, Share, claimed, recorded
+from pycrorm_async.projections.rebuild import Rebuild, claimed, recorded
 from pycrorm_async.projections.replaced_tables import clear
+from pycrorm_async.projections.run.targets import Share
 from pycrorm_async.projections.schema.generations import projections_in, read_generations
 from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -29,8 +28,10 @@ __all__ = ["RebuildSummary", "rebuild_memory", "rebuild_projection", "projection
 
 ReportProgress: TypeAlias = Callable[[str, int, int], None]
 
-_REPORT_S = 0.5
-"""The interval between two progress reports while workers fold."""
+_log = logging.getLogger("pycrorm_async")
+
+_RESTARTS_MAX = 2
+"""Bounds the restarts of a worker that dies again and again, such as for want of memory."""
 _ALONE_EVENTS_MAX = 500_000
 """The largest log that one process folds by default. For 400,000 events two processes took 0.8 times as long as one on
 SQLite, and as long on PostgreSQL."""
@@ -116,13 +117,13 @@ async def _run(
 ) -> RebuildSummary:
     address = shared_address(url)
     await (await EventLog.open(address, create=False)).close()  # raises where no memory exists, instead of creating one
-    log = await _opened(address)
+    log = await EventLog.open(address, create=True, busy_timeout_s=_busy_timeout_s(address))
     try:
         async with claimed(log):
             began = clock.monotonic_ns()
             await clear(log)
             rebuild = await begin(log)
-            await _fold(log, rebuild, workers, report_progress)
+            await _fold(log, url, rebuild, workers, report_progress)
             report_progress("showing", 1, 1)
             await rebuild.show()
             seconds = (clock.monotonic_ns() - began) / 1e9
@@ -143,72 +144,50 @@ async def _run(
         await log.close()
 
 
-async def _opened(address: DatabaseAddress) -> EventLog:
-    timeout_s = _BUSY_TIMEOUT_S if address.is_sqlite else BUSY_TIMEOUT_S
-    return await EventLog.open(address, create=True, busy_timeout_s=timeout_s)
+def _busy_timeout_s(address: DatabaseAddress) -> float:
+    return _BUSY_TIMEOUT_S if address.is_sqlite else BUSY_TIMEOUT_S
 
 
-async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, report_progress: ReportProgress) -> None:
+async def _fold(
+    log: EventLog, url: str, rebuild: Rebuild, workers: int | None, report_progress: ReportProgress
+) -> None:
     _, total = await recorded(log)
+    left = await rebuild.left()
     if workers is None:
         idle = len(os.sched_getaffinity(0)) - os.getloadavg()[0]
-        workers = 2 if idle >= _IDLE_CORES_MIN and await rebuild.left() > _ALONE_EVENTS_MAX else 1
-    if workers > 1:
-        await _run_workers(
-            log.address, rebuild, workers, lambda left: report_progress("rebuilding", max(total - left, 0), total)
-        )
-    # Fold the events that are left: all without workers, otherwise new ones and those of a worker that failed. Its
-    # fault is raised here, in the process that reports it.
-    done = total - await rebuild.left()
-    while (count := await rebuild.fold_next_batch()) is not None:
+        workers = 2 if idle >= _IDLE_CORES_MIN and left > _ALONE_EVENTS_MAX else 1
+    done = total - left
+
+    def report(count: int) -> None:
+        nonlocal done
         done += count
         report_progress("rebuilding", done, max(total, done))
 
-
-async def _run_workers(
-    address: DatabaseAddress, rebuild: Rebuild, workers: int, report_left: Callable[[int], None]
-) -> None:
-    """Fold with spawned processes; return when all have ended. Kills them when it is cancelled."""
-    context = multiprocessing.get_context("spawn")
-    processes: list[BaseProcess] = []
-    try:
-        with _interrupts_blocked():
-            for part in range(workers):
-                process = context.Process(target=_work, args=(address, Share(part, workers)), daemon=True)
-                process.start()
-                processes.append(process)
-        while working := [each.sentinel for each in processes if each.is_alive()]:
-            report_left(await rebuild.left())
-            await asyncio.to_thread(wait, working, _REPORT_S)
-    finally:
-        for each in processes:
-            each.kill()  # loses nothing: its uncommitted events are folded again
-            each.join()
+    if workers > 1:
+        assignment = Assignment(url, log.log_id, busy_timeout_s=_busy_timeout_s(log.address))
+        await _run_workers(assignment, workers, report)
+    # Fold the events that are left: all without workers, otherwise new ones and those of a worker that failed. Its
+    # fault is raised here, in the process that reports it.
+    while (count := await rebuild.fold_next_batch()) is not None:
+        report(count)
 
 
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT in processes started inside. A terminal sends Ctrl-C to all of them; their parent ends them."""
-    resource_tracker.ensure_running()  # starting it unblocks SIGINT, so it must not be started by the first process
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+async def _run_workers(assignment: Assignment, count: int, report: Callable[[int], None]) -> None:
+    """Fold with worker processes, a share each; return when all shares are folded or have failed."""
+    async with (
+        FoldWorkers(count, assignment, settings=Settings(), say=_log.warning, note=lambda _: None) as workers,
+        asyncio.TaskGroup() as group,
+    ):
+        for part, worker in enumerate(workers):
+            share = Share(part, count)
+            group.create_task(_fold_share(worker, share, report), name=f"pycrorm share {part}")
 
 
-def _work(address: DatabaseAddress, share: Share) -> None:
-    collect_seldom()
-    with suppress(PycrormError):
-        asyncio.run(_work_on(address, share))
-
-
-async def _work_on(address: DatabaseAddress, share: Share) -> None:
-    log = await _opened(address)
-    try:
-        rebuild = await Rebuild.join(log, share)
-        parent = multiprocessing.parent_process()
-        while parent is not None and parent.is_alive() and await rebuild.fold_next_batch() is not None:
-            pass
-    finally:
-        await log.close()
+async def _fold_share(worker: FoldWorker, share: Share, report: Callable[[int], None]) -> None:
+    """Fold a share until nothing is left or the worker has failed; then the caller folds the rest and raises."""
+    while await worker.started(restarts_max=_RESTARTS_MAX):
+        with suppress(FoldWorkerLost):
+            with suppress(DatabaseError):
+                while (count := await worker.fold_share(share)) is not None:
+                    report(count)
+            return

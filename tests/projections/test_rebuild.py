@@ -18,6 +18,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.operations import rebuild as rebuilding
+from pycrorm_async.operations.fold_worker import Assignment
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
@@ -122,17 +123,20 @@ async def test_large_logs_are_remade_by_two_processes_where_two_cores_are_idle(
     url = f"sqlite:///{tmp_path}/memory.db"
     await store(url, [*TYPES, *(record for number in range(1, 8) for record in picking(number).records)])
     before, real, shared_out = tables_of(url), rebuilding._run_workers, list[int]()
+    ((all_events,),) = ask(url, "SELECT sum(head) FROM episode")
 
-    async def share_out(address: DatabaseAddress, rebuild: Rebuild, workers: int, look: Callable[[int], None]) -> None:
+    async def share_out(assignment: Assignment, workers: int, report: Callable[[int], None]) -> None:
         shared_out.append(workers)
-        await real(address, rebuild, workers, look)
-        assert await rebuild.left() == 0
+        counts: list[int] = []
+        await real(assignment, workers, counts.append)
+        assert sum(counts) == all_events
+        report(all_events)
 
     monkeypatch.setattr(rebuilding, "_run_workers", share_out)
     monkeypatch.setattr(rebuilding, "_ALONE_EVENTS_MAX", events)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: cores)
     monkeypatch.setattr(os, "getloadavg", lambda: (load, 9.0, 9.0))
-    assert (await rebuild_memory(url, workers=None)).events > 100
+    assert (await rebuild_memory(url, workers=None)).events == all_events > 100
     assert shared_out == begun
     assert differences(before, tables_of(url)) == []
 

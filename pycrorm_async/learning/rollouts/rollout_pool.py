@@ -21,8 +21,8 @@ because answers to the old job may still be in the pipes.
 
 A worker that dies closes its end of the pipe; the parent reads the end of file and raises `WorkerLost`. Its finished
 rollouts survive in its spool folder, which the daemon adopts and drains. If the parent dies, every worker reads the end
-of file, ends its run and closes its memory; the next `recover` or daemon drains the folders. Ctrl-C reaches every
-process of the terminal, so workers are started with SIGINT ignored: the parent alone handles it and stops them.
+of file, ends its run and closes its memory; the next `recover` or daemon drains the folders. Workers ignore the signals
+of a terminal (`processes`): the parent alone handles them and stops the workers.
 
 At exit the parent closes the pipes, waits for the processes in a thread so that the daemon keeps draining meanwhile,
 and stops the daemon last. Only one daemon drains a spool: while another holds it (`SpoolTaken`), the task retries every
@@ -34,14 +34,12 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import logging
-import multiprocessing
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager, suppress
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any, Self
 
@@ -53,6 +51,7 @@ from pycrorm_async.learning.rollouts.rollouts import Tally, batch_rollout
 from pycrorm_async.learning.rollouts.scene import Scene
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.daemon import serve
+from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.settings import Settings
 
 __all__ = ["Workers", "WorkerLost", "MemoryLocation", "Job", "ROLLOUTS_PER_RUN"]
@@ -120,9 +119,9 @@ class Workers:
         try:
             if self._place is not None:
                 self._check_daemon = await self._stack.enter_async_context(_run_daemon(self._place))
-            with _ignore_sigint():
-                for _ in range(self._count):
-                    self._workers.append(_Worker.start(self._place))
+            for _ in range(self._count):
+                process = ChildProcess.start(_run_worker, "pycrorm rollouts", self._place, dies_with_parent=False)
+                self._workers.append(_Worker(process))
             self._is_free = True
         except BaseException:
             await self._close()
@@ -138,7 +137,7 @@ class Workers:
         for worker in self._workers:
             worker.close()
         for worker in self._workers:
-            await asyncio.to_thread(worker.process.join)
+            await asyncio.to_thread(worker.join)
         await self._stack.aclose()
 
     async def roll_out(
@@ -195,18 +194,11 @@ class Workers:
 class _Worker:
     """One worker process and the parent's end of its pipe."""
 
-    def __init__(self, process: SpawnProcess, pipe: Connection) -> None:
-        self.process = process
-        self._pipe = pipe
-
-    @classmethod
-    def start(cls, place: MemoryLocation | None) -> _Worker:
-        context = multiprocessing.get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_run_worker, args=(theirs, place), name="pycrorm rollouts")
-        process.start()
-        theirs.close()  # while this process holds that end too, the death of the worker would not be an end of file
-        return cls(process, ours)
+    def __init__(self, process: ChildProcess) -> None:
+        self._process = process
+        self._pipe = process.connection
+        self.close = self._pipe.close
+        self.join = process.process.join
 
     @property
     def has_message(self) -> bool:
@@ -226,35 +218,18 @@ class _Worker:
         try:
             kind, answer = self._pipe.recv()
         except (EOFError, OSError):
-            self.process.join()
-            ending = _describe_exit(self.process.exitcode)
+            self.join()
+            ending = _describe_exit(self._process.process.exitcode)
             raise WorkerLost(f"a rollout worker {ending}; its finished rollouts are recorded") from None
         if kind == "failed":
             raise WorkerLost(f"a rollout worker failed: {answer}; its finished rollouts are recorded")
         return kind, answer
-
-    def close(self) -> None:
-        self._pipe.close()
 
 
 def _describe_exit(code: int | None) -> str:
     if code is None or code >= 0:
         return f"ended with exit code {code}"
     return f"was killed by {signal.Signals(-code).name}"
-
-
-@contextmanager
-def _ignore_sigint() -> Iterator[None]:
-    """Start processes with SIGINT ignored, because a terminal sends Ctrl-C to every process; the parent stops them."""
-    try:
-        previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    except ValueError:  # only the main thread can set a handler
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
 
 
 @asynccontextmanager

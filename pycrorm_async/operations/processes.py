@@ -1,0 +1,142 @@
+"""Start child processes, each with a connection to its parent, and report how they ended.
+
+    child = ChildProcess.start(serve_requests, "pycrorm fold worker")
+    answer = child.exchange(request)
+
+Theory of operation. There are two ways to start a process. The `pycrorm writer` command forks its first fold workers
+before it opens anything, while it has a single thread: they have imported all modules and are ready at once, so a full
+spool is folded by several processes from the first batch on. All other processes are spawned, because a fork of a
+running program would inherit locks whose owning threads do not exist in the child. A spawned process imports the main
+module, so a script must start it below `if __name__ == "__main__":`.
+
+A terminal or a service manager sends SIGINT and SIGTERM to every process, but only the parent reacts, and ends its
+children. These signals could end a child before it ignores them, so they are blocked around the start and unblocked by
+the child. A child ends with its connection: the end of file arrives when the parent closes it or dies. With
+`dies_with_parent` the kernel also kills it when the parent dies, even while it is stopped or busy.
+
+The parent reaps a child only in `ended` and `end`; until then the kernel cannot reuse the pid, so `kill` always hits
+this process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ctypes
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+__all__ = ["ChildProcess"]
+
+_IGNORED: Final = (signal.SIGINT, signal.SIGTERM)
+_PR_SET_PDEATHSIG: Final = 1
+
+
+class ChildProcess(NamedTuple):
+    """A child process and the connection to it."""
+
+    process: BaseProcess
+    connection: Connection
+
+    @classmethod
+    def start(
+        cls,
+        entry: Callable[..., None],
+        name: str,
+        *args: object,
+        dies_with_parent: bool = True,
+        fork_beside: Iterable[ChildProcess] | None = None,
+    ) -> ChildProcess:
+        """Start a process that calls `entry` with its connection and `args`, which a spawned one receives pickled.
+
+        `fork_beside`: fork, and close the child's copies of the connections to these children. The calling process must
+        have one thread.
+        """
+        context: Any = multiprocessing.get_context("spawn" if fork_beside is None else "fork")
+        ours, theirs = context.Pipe()
+        inherited = [] if fork_beside is None else [ours, *(each.connection for each in fork_beside)]
+        if fork_beside is None:
+            resource_tracker.ensure_running()  # its start unblocks the signals, so it must come first
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, _IGNORED)
+        try:
+            process = context.Process(
+                target=_run,
+                args=(entry, theirs, *args),
+                kwargs={"inherited": inherited, "dies_with_parent": dies_with_parent},
+                name=name,
+                daemon=True,
+            )
+            process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+            theirs.close()  # while this process holds that end too, the child's death would not be an end of file
+        return cls(process, ours)
+
+    @property
+    def pid(self) -> int:
+        assert self.process.pid is not None, "started"
+        return self.process.pid
+
+    def exchange(self, message: object) -> Any:
+        """Send a message and return the answer. Blocks; raises `EOFError` or `OSError` when the process ends."""
+        self.connection.send(message)
+        return self.connection.recv()
+
+    async def ended(self) -> int:
+        """Wait for the end of the process; return its exit code, which is negative for a signal."""
+        ended = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self.process.sentinel, ended.set)
+        try:
+            await ended.wait()
+        finally:
+            loop.remove_reader(self.process.sentinel)
+        self.process.join()
+        assert self.process.exitcode is not None
+        return self.process.exitcode
+
+    def kill(self) -> None:
+        self.process.kill()
+
+    def end(self) -> None:
+        """Kill the process if it is running, and reap it."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+    def is_stopped(self) -> bool:
+        """Return whether the process is stopped, by a signal or by a debugger."""
+        try:
+            status = Path(f"/proc/{self.pid}/stat").read_text(encoding="utf-8", errors="replace")
+        except OSError:  # it has ended
+            return False
+        return status.rpartition(")")[2].split()[0] in ("T", "t")
+
+
+def _run(
+    entry: Callable[..., None],
+    connection: Connection,
+    *args: object,
+    inherited: Iterable[Connection],
+    dies_with_parent: bool,
+) -> None:
+    """Prepare the child and call `entry` in it."""
+    for each in inherited:
+        each.close()
+    for number in _IGNORED:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _IGNORED)
+    parent = multiprocessing.parent_process()
+    if dies_with_parent and parent is not None:
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent.pid:  # the parent died before the call above
+            os._exit(0)
+    with connection, suppress(EOFError, ConnectionError):
+        entry(connection, *args)
