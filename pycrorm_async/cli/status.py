@@ -15,7 +15,8 @@ from pycrorm_async.cli.output import note, print_json, print_table, problem, std
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
+from pycrorm_async.operations.fold_worker import FoldWorkerState
+from pycrorm_async.operations.fold_workers import DaemonNote
 from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
 from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types

@@ -26,8 +26,9 @@ import msgspec
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseForeign, SpoolTaken
 from pycrorm_async.operations.destination import open_destination, shared_address
-from pycrorm_async.operations.fold_worker import Assignment
-from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldWorkerState, FoldWorkerTables
+from pycrorm_async.operations.fold_requests import Assignment
+from pycrorm_async.operations.fold_worker import FoldWorkerState
+from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldWorkerTables
 from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection

@@ -12,8 +12,9 @@ from typing import NamedTuple, TypeAlias
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.operations.fold_worker import Assignment
-from pycrorm_async.operations.fold_workers import FoldWorker, FoldWorkerLost, FoldWorkers
+from pycrorm_async.operations.fold_requests import Assignment
+from pycrorm_async.operations.fold_worker import FoldWorker, FoldWorkerLost
+from pycrorm_async.operations.fold_workers import FoldWorkers
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.rebuild import Rebuild, claimed, recorded
 from pycrorm_async.projections.replaced_tables import clear

@@ -19,8 +19,9 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.fold_worker import Assignment, Failure, Write, _RequestHandler
-from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkerState
+from pycrorm_async.operations.fold_requests import Assignment, Failure, Write, _RequestHandler
+from pycrorm_async.operations.fold_worker import FoldWorkerState
+from pycrorm_async.operations.fold_workers import DaemonNote
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress

@@ -18,7 +18,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.operations import rebuild as rebuilding
-from pycrorm_async.operations.fold_worker import Assignment
+from pycrorm_async.operations.fold_requests import Assignment
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
