@@ -182,11 +182,9 @@ class Rebuild:
         return cls(log, making, share=share)
 
     async def left(self) -> int:
-        """Return the number of events in the log that the new tables lack."""
+        """Return the number of events in the log that the new tables lack, without those of parked episodes."""
         async with self._log.reading() as connection:
-            done = await checkpoints.total(connection, self._place)
-        _, events = await recorded(self._log)
-        return events - done
+            return await checkpoints.left(connection, self._place)
 
     async def parked(self) -> dict[int, str]:
         """Return the parked episodes by number, with the reasons."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from pycrorm_async.projections.custom.projection import Changes, Event, Projection
-from pycrorm_async.projections.run import batch_fold
+from pycrorm_async.projections.fold.row_writer import TableRows
 
 TRAP = "PYCRORM_TRAP"
 
@@ -61,4 +61,4 @@ def _trapped(write_rows: Callable[..., Any]) -> Callable[..., Any]:
 
 
 if TRAP in os.environ and os.environ[TRAP + "_DAEMON"] != str(os.getpid()):
-    vars(batch_fold)["write_rows"] = _trapped(vars(batch_fold)["write_rows"])
+    TableRows.write = _trapped(TableRows.write)  # type: ignore[method-assign]

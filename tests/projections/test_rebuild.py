@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import msgspec
+import psutil
 import pytest
 from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
@@ -138,6 +139,28 @@ async def test_large_logs_are_remade_by_two_processes_where_two_cores_are_idle(
     monkeypatch.setattr(os, "getloadavg", lambda: (load, 9.0, 9.0))
     assert (await rebuild_memory(url, workers=None)).events == all_events > 100
     assert shared_out == begun
+    assert differences(before, tables_of(url)) == []
+
+
+async def test_workers_that_are_killed_are_started_again_and_the_tables_are_the_same(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    episodes = [picking(number, nodes=124).records for number in range(1, 71)]  # two batches for each of two workers
+    await store(url, [*TYPES, *(record for records in episodes for record in records)])
+    before, killed = tables_of(url), set[int]()
+
+    def kill_once(_step: str, _done: int, _total: int) -> None:
+        if not killed:
+            workers = [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
+            killed.update(each.pid for each in workers)
+            for each in workers:
+                each.kill()
+
+    await rebuild_memory(url, workers=2, report_progress=kill_once)
+    assert killed
+    lines = [each for each in caplog.messages if "exited with signal 9; restarting it in 1 s" in each]
+    assert {int(each.partition("(pid ")[2].partition(")")[0]) for each in lines} == killed
     assert differences(before, tables_of(url)) == []
 
 

@@ -9,17 +9,15 @@ from __future__ import annotations
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.projections.fold.fold import fold
+from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, NodeEnd, Rows
 from pycrorm_async.projections.schema.tables import CORE, column_type, physical_name
 from pycrorm_async.store.dialect import Insertion, RowsByTable
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["insertion_of", "stored_rows", "write_rows"]
-
-
-async def insertion_of(engine: AsyncEngine, rows: Rows, generation: int) -> Insertion:
-    """Prepare the statements that insert these rows, before a transaction is open."""
-    return await dialect_of(engine).insertion(stored_rows(engine, rows.to_insert(), generation))
+__all__ = ["TableRows", "stored_rows"]
 
 
 def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> RowsByTable:
@@ -30,25 +28,39 @@ def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> Rows
     }
 
 
-async def write_rows(connection: AsyncConnection, rows: Rows, insertion: Insertion, generation: int) -> None:
-    """Insert and update the rows in the caller's transaction, which also writes the checkpoints.
+class TableRows:
+    """The rows of a batch of events in the built-in tables. Implements `Batch`."""
 
-    Raises `RowRefused` for a row whose id exists already: then the fold or the log is at fault.
-    """
-    dialect = dialect_of(connection)
-    await dialect.insert(connection, insertion)
-    for table, fields, ends in (
-        ("task_tree_node", NodeEnd._fields, rows.node_ends),
-        ("process_metadata", EpisodeEnd._fields, rows.episode_ends),
-    ):
-        if ends:
-            kinds = {name: column_type(CORE[table][name]).compile(dialect=connection.dialect) for name in fields}
-            await dialect.update_rows(connection, physical_name(table, generation), kinds, ends)
-    for number in rows.lost:
-        await connection.execute(
-            text(
-                f"UPDATE {physical_name('task_tree_node', generation)} SET status = 'LOST'"  # noqa: S608
-                " WHERE process_metadata_id = :number AND status = 'RUNNING'"
-            ),
-            {"number": number},
-        )
+    def __init__(self, designators: Designators) -> None:
+        self._designators = designators
+        self._rows = Rows()
+        self._insertion: Insertion = None
+
+    def fold(self, event: StoredEvent) -> None:
+        fold(event, self._designators, self._rows)
+
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self._rows.to_insert(), generation))
+
+    async def write(self, connection: AsyncConnection, generation: int) -> None:
+        """Insert and update the rows in the caller's transaction, which also writes the checkpoints.
+
+        Raises `RowRefused` for a row whose id exists already: then the fold or the log is at fault.
+        """
+        dialect, rows = dialect_of(connection), self._rows
+        await dialect.insert(connection, self._insertion)
+        for table, fields, ends in (
+            ("task_tree_node", NodeEnd._fields, rows.node_ends),
+            ("process_metadata", EpisodeEnd._fields, rows.episode_ends),
+        ):
+            if ends:
+                kinds = {name: column_type(CORE[table][name]).compile(dialect=connection.dialect) for name in fields}
+                await dialect.update_rows(connection, physical_name(table, generation), kinds, ends)
+        for number in rows.lost:
+            await connection.execute(
+                text(
+                    f"UPDATE {physical_name('task_tree_node', generation)} SET status = 'LOST'"  # noqa: S608
+                    " WHERE process_metadata_id = :number AND status = 'RUNNING'"
+                ),
+                {"number": number},
+            )

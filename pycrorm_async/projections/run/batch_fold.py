@@ -29,14 +29,13 @@ from typing import NamedTuple, Protocol
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import LogDamaged
-from pycrorm_async.projections.fold.fold import CannotFold, fold
+from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.fold.parameters import Designators
-from pycrorm_async.projections.fold.row_batch import Rows
-from pycrorm_async.projections.fold.row_writer import insertion_of, write_rows
+from pycrorm_async.projections.fold.row_writer import TableRows
 from pycrorm_async.projections.schema.generations import Generation, Hold
 from pycrorm_async.projections.schema.growth import GrowthTarget, grow
 from pycrorm_async.projections.schema.layout import Layout, unite
-from pycrorm_async.store.dialect import Insertion, Progress, RowRefused
+from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent, size_of
@@ -149,31 +148,13 @@ class BatchPreview(NamedTuple):
     is_whole: bool
 
 
-class _TableRows:
-    """The rows of the built-in tables. Implements `Batch`."""
-
-    def __init__(self, designators: Designators) -> None:
-        self._designators = designators
-        self._rows = Rows()
-        self._insertion: Insertion = None
-
-    def fold(self, event: StoredEvent) -> None:
-        fold(event, self._designators, self._rows)
-
-    async def ready(self, engine: AsyncEngine, generation: int) -> None:
-        self._insertion = await insertion_of(engine, self._rows, generation)
-
-    async def write(self, connection: AsyncConnection, generation: int) -> None:
-        await write_rows(connection, self._rows, self._insertion, generation)
-
-
 class _Tables:
     """The fold into the built-in tables. Implements `FoldDefinition`."""
 
     def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
         layout, accepted, refused = unite(layout, payloads)
         designators = Designators(accepted, refused)
-        return layout, lambda: _TableRows(designators)
+        return layout, lambda: TableRows(designators)
 
 
 TABLES = _Tables()

@@ -24,7 +24,7 @@ __all__ = [
     "behind",
     "late",
     "folded",
-    "total",
+    "left",
     "parked",
     "advance",
     "park",
@@ -89,14 +89,6 @@ ORDER BY episode.number LIMIT :limit"""),  # noqa: S608
 def folded(place: str) -> str:
     """Return SQL that selects, for each episode, the last sequence in this generation."""
     return f"SELECT id AS number, folded FROM {place}"  # noqa: S608
-
-
-async def total(connection: AsyncConnection, place: str) -> int:
-    """Return the number of events folded into this generation."""
-    result = await connection.execute(
-        text(f"SELECT coalesce(sum(folded), 0) FROM {place}")  # noqa: S608
-    )
-    return int(result.scalar_one())
 
 
 async def left(connection: AsyncConnection, place: str) -> int:

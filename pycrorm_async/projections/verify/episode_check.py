@@ -15,6 +15,7 @@ from pycrorm_async.projections.fold.fold import CannotFold, UndecodablePayload, 
 from pycrorm_async.projections.fold.node_row import STATUS
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
+from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.store.stored import Span, StoredEvent
 
@@ -22,19 +23,16 @@ __all__ = ["EpisodeCheck"]
 
 
 class EpisodeCheck:
-    """The check of the episode with this number, up to the last part read.
+    """The check of the episode with this number, up to the last part read. Adds its findings to `result`.
 
     Attributes:
-        events, behind, remarks: the number of events, of those that are not folded, and of unusual orders.
-        damages: sequence and reason of each.
         compared: whether the rows are compared completely, because the tables ended before the last part did.
         carried: ids of the running nodes, which a later part compares.
     """
 
-    def __init__(self, number: int) -> None:
+    def __init__(self, number: int, result: VerifyResult) -> None:
         self.number = number
-        self.events = self.behind = self.remarks = 0
-        self.damages: list[tuple[int, str]] = []
+        self._result = result
         self.compared = False
         self.carried: frozenset[int] = frozenset()
         self._nodes: dict[int, list[Any]] = {}
@@ -97,8 +95,8 @@ class EpisodeCheck:
 
     def _one(self, event: StoredEvent, folded: int, designators: Designators, rows: Rows) -> None:
         shown = event.sequence <= folded
-        self.events += 1
-        self.behind += not shown
+        self._result.events += 1
+        self._result.behind += not shown
         try:
             happening = happening_of(event)
             if self._order is not None:
@@ -106,7 +104,7 @@ class EpisodeCheck:
                     if finding.kind == "damage":
                         self._damaged(finding.sequence, finding.text)
                     else:
-                        self.remarks += 1
+                        self._result.remarks += 1
             if shown and self._lost is None:
                 fold_happening(event, happening, designators, rows)
         except CannotFold as reason:
@@ -125,4 +123,4 @@ class EpisodeCheck:
             self._open_when_lost = {key.sequence for key in keys if key.number == self.number}
 
     def _damaged(self, sequence: int, reason: str) -> None:
-        self.damages.append((sequence, reason))
+        self._result.add_damage(self.number, sequence, reason)

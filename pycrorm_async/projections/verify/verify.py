@@ -5,7 +5,7 @@ Writes nothing. Each part is read in one snapshot, so that recording and folding
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter
 
@@ -139,7 +139,7 @@ class _TablesCheck:
         self._result = result
         self._total = total
         self._report_progress = report_progress
-        self._unfinished = EpisodeCheck(0)
+        self._unfinished = EpisodeCheck(0, result)
         self._comparison: Comparison | None = None
 
     async def comparison(self, connection: AsyncConnection) -> Comparison:
@@ -172,7 +172,7 @@ class _TablesCheck:
         read: dict[int, EpisodeCheck] = {}
         for span in spans:
             if span.after == 0:
-                self._unfinished = EpisodeCheck(span.number)
+                self._unfinished = EpisodeCheck(span.number, self._result)
                 self._result.episodes += 1
             read[span.number] = self._unfinished
             self._unfinished.read(span, events.get(span.number, {}), folded[span.number], designators, rows)
@@ -182,7 +182,6 @@ class _TablesCheck:
             carried = self._unfinished.carried
             if self._unfinished.compared:
                 high = Place(place.number + 1)
-        self._take_over(read.values())
         made = Range(low.row or None, high and high.row, low.number or None, high and high.number)
         await self._compare(connection, comparison, rows, made, carried, settled - carried, read)
         self._report_progress(self._result.events, max(self._total, self._result.events))
@@ -221,17 +220,6 @@ class _TablesCheck:
         for each in sorted(differences, key=attrgetter("number", "sequence")):
             if each.number not in read or not read[each.number].hides(each):
                 self._result.add_difference(each)
-
-    def _take_over(self, episodes: Iterable[EpisodeCheck]) -> None:
-        """Move the findings of this part from the episodes' checks to the result."""
-        for each in episodes:
-            for sequence, reason in each.damages:
-                self._result.add_damage(each.number, sequence, reason)
-            self._result.events += each.events
-            self._result.behind += each.behind
-            self._result.remarks += each.remarks
-            each.events = each.behind = each.remarks = 0
-            each.damages.clear()
 
 
 def _cut(episodes: Sequence[EpisodeRow], at: Place, limit: int) -> tuple[list[Span], Place | None]:
