@@ -257,18 +257,16 @@ async def _replace_views(
             raise
     else:
         return refused
-    async with connection.begin_nested() as attempt:
-        await dialect.replace_views(connection, before, created)  # raises if the fault is not in a user's view
-        await attempt.rollback()
-    for name in [each for each in views if each in users]:
+    for name in ("", *(each for each in views if each in users)):  # first without any
+        added = {name: views[name]} if name else {}
         try:
             async with connection.begin_nested() as attempt:
-                await dialect.replace_views(connection, before, created | {name: views[name]})
+                await dialect.replace_views(connection, before, created | added)
                 await attempt.rollback()
-            created[name] = views[name]
+            created |= added
         except dialect.faults as error:
             reason = dialect.refusal(error)
-            if reason is None:
+            if reason is None or not name:
                 raise
             _log.warning("the view %s is left out, because the database refuses it: %s", name, reason)
             refused[name] = reason

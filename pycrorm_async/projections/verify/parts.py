@@ -8,6 +8,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.row_comparison import Comparison
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -45,9 +46,11 @@ class PartCheck(Protocol):
     """Compares one kind of tables with the log.
 
     Attributes:
+        result: to which the findings are added.
         missing_table: the error for a table that is missing.
     """
 
+    result: VerifyResult
     missing_table: str
 
     async def comparison(self, connection: AsyncConnection) -> Comparison | None:
@@ -61,10 +64,6 @@ class PartCheck(Protocol):
 
         Raises `Unreadable`, and then has reported nothing.
         """
-        ...
-
-    def skip(self, fault: Unreadable) -> None:
-        """Report that an event cannot be read. The check continues with the next episode."""
         ...
 
 
@@ -91,7 +90,7 @@ class EpisodeRange(NamedTuple):
                 if limit > 1:  # shorten the part until the unreadable event is alone
                     limit = max(limit // 8, 1)
                 else:
-                    check.skip(fault)
+                    check.result.add_damage(fault.span.number, fault.span.last, f"cannot be read: {fault}")
                     at = Place(fault.span.number + 1)
 
     async def _check_part(self, log: EventLog, check: PartCheck, at: Place, limit: int) -> Place | None:

@@ -136,7 +136,7 @@ class _TablesCheck:
     ) -> None:
         self._log = log
         self._dialect = dialect_of(log.engine)
-        self._result = result
+        self.result = result
         self._total = total
         self._report_progress = report_progress
         self._unfinished = EpisodeCheck(0, result)
@@ -149,9 +149,6 @@ class _TablesCheck:
         if self._comparison is None or self._comparison.generation != generation:
             self._comparison = Comparison(generation, self._dialect.stored_column)
         return self._comparison
-
-    def skip(self, fault: Unreadable) -> None:
-        self._result.add_damage(fault.span.number, fault.span.last, f"cannot be read: {fault}")
 
     async def check(
         self, connection: AsyncConnection, comparison: Comparison, at: Place, within: EpisodeRange, limit: int
@@ -172,8 +169,8 @@ class _TablesCheck:
         read: dict[int, EpisodeCheck] = {}
         for span in spans:
             if span.after == 0:
-                self._unfinished = EpisodeCheck(span.number, self._result)
-                self._result.episodes += 1
+                self._unfinished = EpisodeCheck(span.number, self.result)
+                self.result.episodes += 1
             read[span.number] = self._unfinished
             self._unfinished.read(span, events.get(span.number, {}), folded[span.number], designators, rows)
         carried: frozenset[int] = frozenset()
@@ -184,7 +181,7 @@ class _TablesCheck:
                 high = Place(place.number + 1)
         made = Range(low.row or None, high and high.row, low.number or None, high and high.number)
         await self._compare(connection, comparison, rows, made, carried, settled - carried, read)
-        self._report_progress(self._result.events, max(self._total, self._result.events))
+        self._report_progress(self.result.events, max(self._total, self.result.events))
         return place
 
     async def _events_of(self, connection: AsyncConnection, spans: Sequence[Span]) -> dict[int, dict[int, StoredEvent]]:
@@ -214,12 +211,12 @@ class _TablesCheck:
             with self._log.translated():
                 differences = await comparison.differences(connection, rows, within, carried=carried, settled=settled)
         except DamageError as fault:
-            self._result.add_damage(None, None, str(fault))
+            self.result.add_damage(None, None, str(fault))
             return
-        self._result.rows += comparison.count
+        self.result.rows += comparison.count
         for each in sorted(differences, key=attrgetter("number", "sequence")):
             if each.number not in read or not read[each.number].hides(each):
-                self._result.add_difference(each)
+                self.result.add_difference(each)
 
 
 def _cut(episodes: Sequence[EpisodeRow], at: Place, limit: int) -> tuple[list[Span], Place | None]:

@@ -16,7 +16,7 @@ from pycrorm_async.projections.run.batch_fold import Batch
 from pycrorm_async.projections.schema.generations import Generation, projections_in, read_generations
 from pycrorm_async.projections.schema.tables import OWN
 from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.parts import EpisodeRange, Place, Unreadable
+from pycrorm_async.projections.verify.parts import EpisodeRange, Place
 from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -46,7 +46,7 @@ class ProjectionCheck:
 
     def __init__(self, projection: Projection, result: VerifyResult) -> None:
         self._projection = projection
-        self._result = result
+        self.result = result
         name = projection.name
         self.missing_table = f"a table of the projection {name} is missing: run `pycrorm rebuild {name}`"
 
@@ -88,13 +88,10 @@ class ProjectionCheck:
         lost = {each.number for each in findings}
         made = Range(at.number << 31 or None, None if following is None else following << 31, None, None)
         differences = await comparison.differences(connection, rows, made, carried=(), settled=())
-        self._result.rows += comparison.count
+        self.result.rows += comparison.count
         for each in (*findings, *(each for each in differences if each.number not in lost)):
-            self._result.add_difference(each._replace(table=each.table.removeprefix(OWN)))
+            self.result.add_difference(each._replace(table=each.table.removeprefix(OWN)))
         return None if following is None or following == within.end else Place(following)
-
-    def skip(self, fault: Unreadable) -> None:
-        raise AssertionError("reads whole episodes, which `Unreadable` cannot shorten") from fault
 
     def _place(self, generation: Generation) -> str:
         return checkpoints.place_of(generation.number, self._projection.name)
