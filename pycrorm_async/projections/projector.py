@@ -72,7 +72,7 @@ class Projector:
         """Create missing tables and views: those of every memory, of the mapped classes and of the users.
 
         Raises `DatabaseForeign` for tables of another version, `CallerError` for a view or a projection whose name
-        is taken, and for a view that the database refuses; refused views of other processes are left out.
+        is taken, and for a new view that the database refuses; one that was created before is left out.
         """
         with self._log.translated():
             async with self._log.engine.begin() as connection:
@@ -86,9 +86,10 @@ class Projector:
                 changed = await self._custom.set_up(connection, layout)
                 if current is None or layout != generation.layout or changed:
                     generation = await show(connection, await grow_tables(connection, generation, layout))
-                for view in self._views:
-                    if (reason := generation.layout.failed_views.get(view.name)) is not None:
-                        raise CallerError(f"the database refuses the view {view.name}: {reason}")
+                registered = {} if current is None else current.layout.user_views
+                for name, reason in generation.layout.failed_views.items():
+                    if registered.get(name) != layout.user_views.get(name):  # new or changed by this caller
+                        raise CallerError(f"the database refuses the view {name}: {reason}")
                 generation = await release_parked(connection, self._target, generation)
             self._fold = BatchFold(self._log, self._target, generation)
             await self._sweep()

@@ -288,9 +288,10 @@ async def test_a_view_whose_table_was_dropped_is_left_out_and_all_events_are_vis
         assert "plans" in (await failed_views(log))["planned"]
         assert "planned" in caplog.text
         assert (await verify(log)).failed_views == await failed_views(log)
+        await Projector(log, views=[view]).open()
     if not materialised and log.engine.dialect.name == "postgresql":
-        with pytest.raises(CallerError, match="the database refuses the view planned"):
-            await Projector(log, views=[view]).open()
+        with pytest.raises(CallerError, match="the database refuses the view again"):
+            await Projector(log, views=[UserView("again", view.meaning)]).open()
     await make_plans(log)
     again = Projector(log)
     await again.open()
