@@ -155,7 +155,7 @@ async def _run(
         learned = await experiments.run(experiment, place, report_progress)
         studied = None
         if study_rollouts:
-            studied = await study(experiment, learned, place, rollouts=study_rollouts, watch=report_progress)
+            studied = await study(experiment, learned, place, rollouts=study_rollouts, report_progress=report_progress)
         kitchen = replace(KITCHEN, limits=experiment.scene.limits)
         return learned, await pick_up_in_kitchen(learned.policy, place, seed=experiment.seed, scene=kitchen), studied
 

@@ -39,7 +39,7 @@ from pycrorm_async.hooks.episode import Episode, NodeRecord, current_task
 from pycrorm_async.hooks.episode_events import EpisodeOpening
 from pycrorm_async.hooks.sampler import Sampler
 from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Thought, thinking
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.world.bullet import BulletWorld
@@ -104,7 +104,7 @@ class Recorder:
 
     def _start(self, description: str, *, plan: str | None = None, seed: int | None = None) -> Episode:
         """Start an episode; a simulation if this context is in one."""
-        simulation, world = thinking.get(), current_world.get()
+        simulation, world = current_simulation.get(), current_world.get()
         new_id = episode_id(self._clock.wall_ns(), self._randomness(10))
         opening = EpisodeOpening(
             description,
@@ -194,7 +194,7 @@ class Recorder:
         episode = current_episode.get()
         if episode is None or episode.closed or episode.id not in self._open:
             return None
-        return episode if episode.simulated is (thinking.get() is not None) else None
+        return episode if episode.simulated is (current_simulation.get() is not None) else None
 
     # --- the port of the plan layer ----------------------------------------------------------------------------------
 
@@ -284,22 +284,22 @@ class Recorder:
             if sequence >= episode.continue_at:
                 self._continue(episode)
 
-    def thought_began(self, thought: Thought) -> None:
+    def simulation_started(self, simulation: Simulation) -> None:
         if self._emitter.is_closed:
             return
         outer = current_episode.get()
-        thought.record = record = _SimulationRecord(
-            outer.node_reference(thought.by) if outer is not None else None, outer
+        simulation.record = record = _SimulationRecord(
+            outer.node_reference(simulation.by) if outer is not None else None, outer
         )
         try:
-            record.episode = self._start(_description_of(thought))
+            record.episode = self._start(_description_of(simulation))
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("EpisodeStarted", error)
         # None if the episode could not start, so that no simulated event gets into the outer episode.
         current_episode.set(record.episode)
 
-    def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
-        record: _SimulationRecord | None = thought.record
+    def simulation_ended(self, simulation: Simulation, failure: BaseException | None) -> None:
+        record: _SimulationRecord | None = simulation.record
         if record is None:
             return
         if record.episode is not None:
@@ -357,16 +357,16 @@ class _SimulationRecord:
         self.episode: Episode | None = None
 
 
-def _simulating_node(simulation: Thought | None) -> NodeReference | None:
+def _simulating_node(simulation: Simulation | None) -> NodeReference | None:
     record = simulation.record if simulation is not None else None
     return record.node if isinstance(record, _SimulationRecord) else None
 
 
-def _description_of(thought: Thought) -> str:
-    if thought.description is not None:
-        return thought.description[:EPISODE_TEXT_MAX]
-    if thought.by is not None and thought.by.designator is not None:
-        return f"simulation in {thought.by.designator.dtype}"
+def _description_of(simulation: Simulation) -> str:
+    if simulation.description is not None:
+        return simulation.description[:EPISODE_TEXT_MAX]
+    if simulation.by is not None and simulation.by.designator is not None:
+        return f"simulation in {simulation.by.designator.dtype}"
     return "simulation"
 
 

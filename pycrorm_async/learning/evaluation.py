@@ -111,7 +111,12 @@ def scene_variants(scene: Scene) -> tuple[Scene, ...]:
 
 
 async def study(
-    experiment: Experiment, learned: ExperimentResult, place: MemoryLocation, *, rollouts: int, watch: ReportProgress
+    experiment: Experiment,
+    learned: ExperimentResult,
+    place: MemoryLocation,
+    *,
+    rollouts: int,
+    report_progress: ReportProgress,
 ) -> Study:
     """Evaluate the learned policy, `rollouts` rollouts per point and scene.
 
@@ -123,7 +128,7 @@ async def study(
             for phase in (learned.default, learned.evaluation, learned.held_out)
         ]
     async with Workers(experiment.workers, None) as workers:
-        evaluator = _Evaluator(experiment, workers, rollouts, watch)
+        evaluator = _Evaluator(experiment, workers, rollouts, report_progress)
         return Study(
             tuple([each async for each in evaluator.curve(default, held_out)]),
             tuple([await evaluator.compare(scene, learned.policy) for scene in scene_variants(experiment.scene)]),
@@ -141,11 +146,13 @@ async def study(
 class _Evaluator:
     """Run the evaluation's rollouts in workers that record nothing."""
 
-    def __init__(self, experiment: Experiment, workers: Workers, rollouts: int, watch: ReportProgress) -> None:
+    def __init__(
+        self, experiment: Experiment, workers: Workers, rollouts: int, report_progress: ReportProgress
+    ) -> None:
         self._experiment = experiment
         self._workers = workers
         self._rollouts = rollouts
-        self._watch = watch
+        self._report_progress = report_progress
         self._seed = experiment.seed + _STUDY_SEED
 
     async def curve(self, default: pd.DataFrame, held_out: pd.DataFrame) -> AsyncIterator[CurvePoint]:
@@ -187,4 +194,6 @@ class _Evaluator:
         runs = recorded_rollouts.missing_runs(
             (), count, length_max=min(ROLLOUTS_PER_RUN, -(-count // self._experiment.workers))
         )
-        return await self._workers.roll_out(job, runs, lambda tally: self._watch(name, tally.rollouts, count, tally))
+        return await self._workers.roll_out(
+            job, runs, lambda tally: self._report_progress(name, tally.rollouts, count, tally)
+        )

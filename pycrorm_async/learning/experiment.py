@@ -146,11 +146,13 @@ class ExperimentResult:
 class _PhaseRunner:
     """Run the phases of one experiment with workers, and query each phase's results from the memory."""
 
-    def __init__(self, experiment: Experiment, workers: Workers, reading: Reading, watch: ReportProgress) -> None:
+    def __init__(
+        self, experiment: Experiment, workers: Workers, reading: Reading, report_progress: ReportProgress
+    ) -> None:
         self._experiment = experiment
         self._workers = workers
         self._reading = reading
-        self._watch = watch
+        self._report_progress = report_progress
         self.phases: list[Phase] = []
 
     async def phase(self, name: str, policy: Policy, seed: int, count: int) -> pd.DataFrame:
@@ -170,7 +172,9 @@ class _PhaseRunner:
             counted = await self._workers.roll_out(
                 job,
                 runs,
-                lambda tally: self._watch(name, len(recorded) + tally.rollouts, count, recorded_tally + tally),
+                lambda tally: self._report_progress(
+                    name, len(recorded) + tally.rollouts, count, recorded_tally + tally
+                ),
             )
         seconds = time.monotonic() - began
         if counted.rollouts:
@@ -198,7 +202,7 @@ class _PhaseRunner:
 
 
 async def run(
-    experiment: Experiment, place: MemoryLocation, watch: ReportProgress = lambda *_: None
+    experiment: Experiment, place: MemoryLocation, report_progress: ReportProgress = lambda *_: None
 ) -> ExperimentResult:
     """Run the experiment; with `resume`, only its missing rollouts.
 
@@ -208,7 +212,7 @@ async def run(
         WorkerLost: a worker process died; its finished rollouts are recorded.
         InternalError: the memory and the workers' counts differ.
     """
-    async with _open_runner(experiment, place, watch) as runner:
+    async with _open_runner(experiment, place, report_progress) as runner:
         policy, frames = default_policy(), []
         for number in range(experiment.rounds):
             name = "default policy" if number == 0 else f"learned policy, round {number + 1}"
@@ -228,12 +232,12 @@ async def run(
 
 @asynccontextmanager
 async def _open_runner(
-    experiment: Experiment, place: MemoryLocation, watch: ReportProgress
+    experiment: Experiment, place: MemoryLocation, report_progress: ReportProgress
 ) -> AsyncIterator[_PhaseRunner]:
     # Killed workers may have left records in the spool; `recover` stores them and creates the tables.
     await recover(place.url, spool=place.spool)
     async with Workers(experiment.workers, place) as workers, Reading.open(place.url) as reading:
-        yield _PhaseRunner(experiment, workers, reading, watch)
+        yield _PhaseRunner(experiment, workers, reading, report_progress)
 
 
 def _learn_from(frames: Sequence[pd.DataFrame], experiment: Experiment) -> Policy:

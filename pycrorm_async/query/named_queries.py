@@ -112,7 +112,7 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             nodes=row.nodes,
             failed=row.failed,
             simulated=row.simulated,
-            thought_by=SimulatingNode(row.thought_by, row.thinker_number, row.thinker_id, row.thinker_dtype)
+            thought_by=SimulatingNode(row.thought_by, row.simulating_number, row.simulating_id, row.simulating_dtype)
             if row.thought_by is not None
             else None,
             continues=row.continues,
@@ -124,23 +124,24 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
 
 def _overview() -> Select[*tuple[Any, ...]]:
     node, episode = TaskTreeNode, ProcessMetaData
-    thinker, thinking = aliased(ProcessMetaData), aliased(TaskTreeNode)
+    simulating_episode, simulating_node = aliased(ProcessMetaData), aliased(TaskTreeNode)
     ended_badly = node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST])
     of_it = node.process_metadata_id == episode.id
     nodes = select(func.count()).where(of_it).scalar_subquery()
     failed = select(func.count()).where(of_it, ended_badly).scalar_subquery()
-    thinking_id = thinker.id * row_id(1, 0, SLOT_NODE) + episode.thought_by_node * row_id(0, 1, SLOT_NODE)
+    first_row = simulating_episode.id * row_id(1, 0, SLOT_NODE)
+    simulating_node_id = first_row + episode.thought_by_node * row_id(0, 1, SLOT_NODE)
     return (
         select(
             episode.__table__,
             nodes.label("nodes"),
             failed.label("failed"),
-            thinker.id.label("thinker_number"),
-            thinking.id.label("thinker_id"),
-            thinking.dtype.label("thinker_dtype"),
+            simulating_episode.id.label("simulating_number"),
+            simulating_node.id.label("simulating_id"),
+            simulating_node.dtype.label("simulating_dtype"),
         )
-        .outerjoin(thinker, thinker.uuid == episode.thought_by)
-        .outerjoin(thinking, thinking.id == thinking_id)
+        .outerjoin(simulating_episode, simulating_episode.uuid == episode.thought_by)
+        .outerjoin(simulating_node, simulating_node.id == simulating_node_id)
         .order_by(episode.id)
     )
 
@@ -194,11 +195,11 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
 
 async def _simulations_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
     """Return the numbers of the simulations of this episode, by the id of the node that performed them."""
-    thinker, simulation = aliased(ProcessMetaData), ProcessMetaData
+    simulating_episode, simulation = aliased(ProcessMetaData), ProcessMetaData
     query = (
         select(simulation.id, simulation.thought_by_node)
-        .join(thinker, thinker.uuid == simulation.thought_by)
-        .where(thinker.id == number, simulation.thought_by_node.is_not(None))
+        .join(simulating_episode, simulating_episode.uuid == simulation.thought_by)
+        .where(simulating_episode.id == number, simulation.thought_by_node.is_not(None))
         .order_by(simulation.id)
     )
     numbers: dict[int, list[int]] = {}

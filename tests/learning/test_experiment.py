@@ -86,7 +86,7 @@ async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_ofte
     assert [each.tally for each in again.phases] == [each.tally for each in learned.phases]
 
     asked = replace(SMALL, resume=True, workers=1)
-    studied = await study(asked, learned, place, rollouts=60, watch=lambda *_: None)
+    studied = await study(asked, learned, place, rollouts=60, report_progress=lambda *_: None)
     assert [each.rollouts for each in studied.curve] == [500]
     assert {each.rollouts for each in studied.costs} == {240, 200}
     turned = [each for each in studied.scenes if each.scene.yaw]
@@ -228,7 +228,7 @@ async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
     small = replace(SMALL, rollouts=300, evaluate=20, held_out=60, workers=1, min_samples_leaf=5, resume=True)
     learned = await run(small, place)
     assert learned.default.tally.rollouts == 300
-    studied = await study(small, learned, place, rollouts=5, watch=lambda *_: None)
+    studied = await study(small, learned, place, rollouts=5, report_progress=lambda *_: None)
     assert studied.curve == ()
 
 

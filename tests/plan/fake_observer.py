@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Thought, recorder, thinking
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation, recorder
 from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, current_node
 from pycrorm_async.world import ObjectType
 
@@ -25,7 +25,7 @@ class Recording:
         self.places: list[tuple[str, tuple[Candidate, ...], int | None, int, TaskTreeNode | None]] = []
         self.open: list[TaskTreeNode] = []
         self.ended: list[TaskTreeNode] = []
-        self.thoughts: list[Thought] = []
+        self.thoughts: list[Simulation] = []
 
     async def heard(self, count: int) -> None:
         """Until it was told so much."""
@@ -82,14 +82,14 @@ class Recording:
     ) -> None:
         self.told.append(f"saw {' '.join(each.thing.name for each in seen)}".strip())
 
-    def thought_began(self, thought: Thought) -> None:
-        if thought.record is not None or thinking.get() is not thought or current_node.get() is not None:
+    def simulation_started(self, thought: Simulation) -> None:
+        if thought.record is not None or current_simulation.get() is not thought or current_node.get() is not None:
             raise OrderBroken(f"{thought} begins, and is not what is thought")
         thought.record = self
         self.thoughts.append(thought)
         self.told.append(f"think {thought.description}")
 
-    def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
+    def simulation_ended(self, thought: Simulation, failure: BaseException | None) -> None:
         if not self.thoughts or self.thoughts.pop() is not thought:
             raise OrderBroken(f"{thought} ends, and is not the innermost")
         if thought.world is not None and not thought.world.entered:

@@ -18,7 +18,7 @@ from pycrorm_async.plan import (
     TaskStatus,
     collected_tree,
 )
-from pycrorm_async.plan.execution.observer import thinking
+from pycrorm_async.plan.execution.observer import current_simulation
 from pycrorm_async.plan.failures import NotALanguageExpression
 from pycrorm_async.world import Pose, current_world
 from tests.plan.conftest import Scene
@@ -72,7 +72,7 @@ async def test_what_a_condition_performs_is_really_performed_while_the_plan_thin
 
     class Looking(ActionAbstract):
         async def perform(self) -> None:
-            thought.append(thinking.get() is not None)
+            thought.append(current_simulation.get() is not None)
 
     async def looks() -> bool:
         await Looking().perform()

@@ -29,7 +29,7 @@ from pycrorm_async.plan import (
     collected_tree,
     simulated_robot,
 )
-from pycrorm_async.plan.execution.observer import thinking
+from pycrorm_async.plan.execution.observer import current_simulation
 from pycrorm_async.plan.failures import PerceptionObjectNotInWorld
 from pycrorm_async.plan.object_designators import designator_of, in_world
 from pycrorm_async.plan.task_tree import TaskStatus, current_node
@@ -240,7 +240,7 @@ async def test_whatever_leaves_a_thought_goes_through_and_the_world_is_as_before
         raise raised
     assert caught.value is raised
     assert scene.world.save_state() == before
-    assert (current_world.get(), current_node.get(), thinking.get()) == (scene.world, None, None)
+    assert (current_world.get(), current_node.get(), current_simulation.get()) == (scene.world, None, None)
     assert len(tree) == 2
 
 
@@ -286,7 +286,7 @@ async def test_a_thought_that_nobody_awaits_any_more_is_closed_without_touching_
         assert copy.entered
         dream.close()
     assert not copy.entered
-    assert (current_world.get(), current_node.get(), thinking.get()) == (scene.world, None, None)
+    assert (current_world.get(), current_node.get(), current_simulation.get()) == (scene.world, None, None)
     assert listening.told == ["think None", "thought GeneratorExit"]
 
 
@@ -396,7 +396,7 @@ def test_a_thought_in_a_world_that_was_left_is_refused_and_changes_nothing() -> 
     try:
         with pytest.raises(WorldClosed), SimulatedTaskTree():
             pass
-        assert (current_world.get(), thinking.get()) == (world, None)
+        assert (current_world.get(), current_simulation.get()) == (world, None)
     finally:
         current_world.reset(token)
 

@@ -211,7 +211,7 @@ async def test_every_value_that_was_changed_is_told_and_nothing_else(log: EventL
         ]
         assert (found.drift, found.damage) == (len(values), 0)
         set_columns(database_url, table, row, {each: row[each] for each in values})
-    assert filled == 16
+    assert filled == 17
     assert_clean(await look(log))
 
 

@@ -28,7 +28,7 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import ActionAbstract, PlaceActionPerformable
-from pycrorm_async.plan.execution.observer import PlanObserver, Thought, recorder
+from pycrorm_async.plan.execution.observer import PlanObserver, Simulation, recorder
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
@@ -110,11 +110,11 @@ class Witness:
     def object_detected(self, **arguments: Any) -> None:
         self.memory.object_detected(**arguments)
 
-    def thought_began(self, thought: Thought) -> None:
-        self.memory.thought_began(thought)
+    def simulation_started(self, thought: Simulation) -> None:
+        self.memory.simulation_started(thought)
 
-    def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
-        self.memory.thought_ended(thought, failure)
+    def simulation_ended(self, thought: Simulation, failure: BaseException | None) -> None:
+        self.memory.simulation_ended(thought, failure)
 
 
 def tree_text(nodes: list[Any]) -> str:

@@ -27,6 +27,7 @@ from pycrorm_async.events.types import (
     ObjectMoved,
     ObjectReference,
     ObjectRemoved,
+    RefusalValue,
     RobotValue,
     SeenValue,
     StateSampled,
@@ -61,6 +62,7 @@ CAREFUL = declared(
     field("via", "list", 6, item="pose"), bases=("PickUpAction",),
 )  # fmt: skip
 EITHER = declared("Either", "either", field("count", "integer", 2), kind="language")
+REFUSED = (RefusalValue(pose(2), "LEFT: too far"),)
 TYPES = (NAVIGATE, PICK_UP, CAREFUL, MOVE, EITHER)
 REACHED = UserView("reached", select(PickUpAction.arm, PoseRow.x).join(PickUpAction.object).join(PoseRow))
 
@@ -81,7 +83,7 @@ def everything(number: int, thinker: NodeReference | None = None) -> Script:
     put(StateSampled(ObjectReference(table, table), {"base.x": 0.5}, move))
     put(JointsMoved(ObjectReference(table, table), {"drawer": 0.25}, move))
     put(NodeEnded(move, "SUCCEEDED"))
-    put(LocationResolved("CostmapLocation", (CandidateValue(pose(1), ("LEFT",)),), 0, 4, drive))
+    put(LocationResolved("CostmapLocation", (CandidateValue(pose(1), ("LEFT",)),), 0, 4, drive, REFUSED))
     seen = SeenValue("milk", "MILK", pose(1), ObjectReference(milk, milk), 1.0)
     put(ObjectDetected("camera", "MILK", (seen,), drive))
     put(NodeEnded(drive, "SUCCEEDED"))

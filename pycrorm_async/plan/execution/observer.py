@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pycrorm_async.plan.task_tree import TaskTreeNode
     from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = ["PlanObserver", "Candidate", "Refusal", "Seen", "Thought", "recorder", "thinking"]
+__all__ = ["PlanObserver", "Candidate", "Refusal", "Seen", "Simulation", "recorder", "current_simulation"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class Seen:
     visible: float | None = None
 
 
-class Thought:
+class Simulation:
     """A running simulation: plans performed in a copy of the world (see `execution.simulation`).
 
     Attributes:
@@ -120,11 +120,11 @@ class PlanObserver(Protocol):
         """Called after a perception, with the perceived objects, the best visible first."""
         ...
 
-    def thought_began(self, thought: Thought) -> None:
-        """Called when a simulation starts in this context. May set `thought.record`."""
+    def simulation_started(self, simulation: Simulation) -> None:
+        """Called when a simulation starts in this context. May set `simulation.record`."""
         ...
 
-    def thought_ended(self, thought: Thought, failure: BaseException | None) -> None:
+    def simulation_ended(self, simulation: Simulation, failure: BaseException | None) -> None:
         """Called exactly once at the end of every started simulation, before its world closes.
 
         `failure` is the exception that left the simulation, if any.
@@ -134,5 +134,5 @@ class PlanObserver(Protocol):
 
 recorder: ConnectedVar[PlanObserver] = ConnectedVar("recorder")
 
-thinking: ContextVar[Thought | None] = ContextVar("thinking", default=None)
+current_simulation: ContextVar[Simulation | None] = ContextVar("current_simulation", default=None)
 """The innermost simulation of this context; None outside a simulation."""

@@ -19,7 +19,7 @@ from types import TracebackType
 from typing import Any
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan.execution.observer import Thought, recorder, thinking
+from pycrorm_async.plan.execution.observer import Simulation, current_simulation, recorder
 from pycrorm_async.plan.task_tree import CollectedTree, collecting, current_node
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.world_copy import copied
@@ -71,12 +71,12 @@ def _simulate(description: str | None) -> Iterator[CollectedTree]:
     world, node, observer, tree = current_world.get(), current_node.get(), recorder.get(), CollectedTree()
     with ExitStack() as stack:
         copy = stack.enter_context(copied(world)) if world is not None else None
-        thought = Thought(description, copy, node)
-        _set(stack, thinking, thought)
+        simulation = Simulation(description, copy, node)
+        _set(stack, current_simulation, simulation)
         _set(stack, current_node, None)
         _set(stack, collecting, (tree,))
         if observer is not None:
-            observer.thought_began(thought)
+            observer.simulation_started(simulation)
         failure: BaseException | None = None
         try:
             yield tree
@@ -85,7 +85,7 @@ def _simulate(description: str | None) -> Iterator[CollectedTree]:
             raise
         finally:
             if observer is not None:
-                observer.thought_ended(thought, failure)
+                observer.simulation_ended(simulation, failure)
             del failure  # its traceback holds this frame: break the reference cycle
 
 
