@@ -300,16 +300,12 @@ def _check_declaration(path: Path, offset: int, type_name: str, payload: bytes) 
     """Check a record without an episode: dead-lettering cannot skip it, so a bad one would block the whole folder."""
     if type_name != _DECLARES:
         raise SpoolDamaged(path, offset, f"holds a {type_name} that belongs to no episode")
-    if b"\0" in payload or not _is_utf8(payload):
-        raise SpoolDamaged(path, offset, "the declaration is not valid UTF-8 without NUL, so no database can store it")
-
-
-def _is_utf8(payload: bytes) -> bool:
     try:
-        payload.decode()
+        is_text = "\0" not in payload.decode()
     except UnicodeDecodeError:
-        return False
-    return True
+        is_text = False
+    if not is_text:
+        raise SpoolDamaged(path, offset, "the declaration is not valid UTF-8 without NUL, so no database can store it")
 
 
 def read_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
