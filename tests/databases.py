@@ -24,7 +24,7 @@ import asyncpg
 __all__ = ["Server", "server_in", "server_in_memory", "ask", "ask_to_change", "await_events", "in_a_loop_of_its_own"]
 
 _ROOM_BYTES: Final = 4 << 30
-"""A server takes 200 MB, and each process that runs tests starts one, or two."""
+"""A server takes at most half a gigabyte, and each process that runs tests starts one, or two."""
 
 
 class Server:
@@ -93,10 +93,13 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
         lock = folder.with_name(f"{folder.name}.lock")
         PostgresServer._lock = type(PostgresServer._lock)(lock)
         server = get_server(str(folder))
+        # The next server changes the lock of the class: this one would take that at its end, and leave its file behind.
+        server._lock = PostgresServer._lock
     running = Server(folder, server)
     if not syncs:
         # Whether a table was vacuumed or analysed meanwhile shall depend on no clock.
-        for change in ("SET fsync = off", "SET full_page_writes = off", "SET autovacuum = off"):
+        settings = ("fsync = off", "full_page_writes = off", "autovacuum = off", "max_wal_size = '128MB'")
+        for change in (f"SET {each}" for each in settings):
             in_a_loop_of_its_own(_run(running.url(), f"ALTER SYSTEM {change}", ()))
         in_a_loop_of_its_own(_run(running.url(), "SELECT pg_reload_conf()", ()))
     try:
