@@ -7,10 +7,11 @@ import gc
 import sys
 import sysconfig
 import traceback
-from contextlib import nullcontext, redirect_stdout
+from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -26,17 +27,19 @@ from pycrorm_async.cli.options import (
 )
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
 from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
-from pycrorm_async.errors import EpisodeParked
+from pycrorm_async.errors import CallerError, EpisodeParked
 from pycrorm_async.hooks.values.texts import message_of
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.settings import Settings
+from pycrorm_async.settings import OnFull, OnUnrecordable, Settings
 
 __all__ = ["run"]
 
 _DRAIN_WAIT_S = 2
 """Bounds the wait until a daemon drains the new recorder; a running daemon scans the spool more often than that."""
+_SAMPLE_INTERVAL_MS = range(1, 86_400_001)
+"""Bounds `--sample-interval-ms`: a day, longer than any motion."""
 
 
 def run(
@@ -57,6 +60,28 @@ def run(
     writer: WriterOption = "thread",
     projection: ProjectionOption = None,
     file_access: FileAccessOption = "owner",
+    sample_interval_ms: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N", help="Sample the robot's state every N milliseconds while a motion runs; default: no samples."
+        ),
+    ] = None,
+    on_unrecordable: Annotated[
+        str,
+        typer.Option(
+            metavar="|".join(get_args(OnUnrecordable)),
+            autocompletion=lambda: list(get_args(OnUnrecordable)),
+            help="A parameter that cannot be recorded is recorded as missing, or its perform is refused.",
+        ),
+    ] = "record_missing",
+    on_full: Annotated[
+        str,
+        typer.Option(
+            metavar="|".join(get_args(OnFull)),
+            autocompletion=lambda: list(get_args(OnFull)),
+            help="A node that starts while the spool is full waits for space, or fails.",
+        ),
+    ] = "wait",
     show_traceback: Annotated[
         bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")
     ] = False,
@@ -67,8 +92,14 @@ def run(
     A function without an argument is recorded as one episode; a function that takes the memory opens its own episodes.
     Exit code 1 if the plan failed; everything it did before is recorded.
     """
+    settings = Settings(
+        writer=writer,
+        file_access=file_access,
+        sample_interval_ms=_milliseconds("--sample-interval-ms", sample_interval_ms),
+        on_unrecordable=_choice("--on-unrecordable", on_unrecordable, get_args(OnUnrecordable)),
+        on_full=_choice("--on-full", on_full, get_args(OnFull)),
+    )
     loaded = load_plan(plan)
-    settings = Settings(writer=writer, file_access=file_access)
     memory = Memory.open(url, spool=spool, settings=settings, projections=load_projections(projection or ()))
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
@@ -106,6 +137,24 @@ def run(
         stderr.print("".join(traceback.format_exception(failure)), markup=False)
     problem(f"the plan {loaded.name} failed: {_one_line(failure)}")
     return 1
+
+
+def _choice(option: str, value: str, choices: Sequence[Any]) -> Any:
+    """Return the value if it is one of the choices. Raises `CallerError`, which is printed as one line."""
+    if value not in choices:
+        raise CallerError(f"{option} is {value!r}: use {' or '.join(map(repr, choices))}")
+    return value
+
+
+def _milliseconds(option: str, text: str | None) -> int | None:
+    """Parse an interval. Raises `CallerError`."""
+    if text is None:
+        return None
+    with suppress(ValueError):
+        if int(text) in _SAMPLE_INTERVAL_MS:
+            return int(text)
+    first, last = _SAMPLE_INTERVAL_MS[0], _SAMPLE_INTERVAL_MS[-1]
+    raise CallerError(f"{option} is {text!r}: it must be a whole number of milliseconds from {first} to {last:,}")
 
 
 @dataclass

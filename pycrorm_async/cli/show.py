@@ -26,18 +26,21 @@ def show(
         str | None,
         typer.Option(help="Show this moment: seconds since the start, or an event such as '#300'.", metavar="WHEN"),
     ] = None,
+    full: Annotated[
+        bool, typer.Option("--full", help="Print texts, lists and joints in full; --json always does.")
+    ] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show an episode's task tree with statuses and durations; with --at, tree and world at one moment."""
     if at is None:
-        _show(episode, url, spool, as_json=as_json)
+        _show(episode, url, spool, full=full, as_json=as_json)
     else:
-        _show_moment(episode, at, url, spool, as_json=as_json)
+        _show_moment(episode, at, url, spool, full=full, as_json=as_json)
 
 
-def _show(episode: str, url: str, spool: Path | None, *, as_json: bool) -> None:
+def _show(episode: str, url: str, spool: Path | None, *, full: bool, as_json: bool) -> None:
     async def query() -> tuple[EpisodeSummary, list[NodeSummary]]:
         async with Reading.open(url) as reading:
             summary = await reading.episode(episode)
@@ -61,10 +64,10 @@ def _show(episode: str, url: str, spool: Path | None, *, as_json: bool) -> None:
             "simulated": simulated_by(summary) if summary.simulated else None,
         },
     )
-    print_tree(tree)
+    print_tree(tree, full=full)
 
 
-def _show_moment(episode: str, at: str, url: str, spool: Path | None, *, as_json: bool) -> None:
+def _show_moment(episode: str, at: str, url: str, spool: Path | None, *, full: bool, as_json: bool) -> None:
     time, sequence = parse_moment(at)
 
     async def query() -> Moment:
@@ -76,4 +79,4 @@ def _show_moment(episode: str, at: str, url: str, spool: Path | None, *, as_json
     if as_json:
         print_json(snapshot)
     else:
-        print_snapshot(snapshot, at if sequence is not None else f"{time:g} s")
+        print_snapshot(snapshot, at if sequence is not None else f"{time:g} s", full=full)

@@ -30,8 +30,8 @@ def parse_moment(text: str) -> tuple[float | None, int | None]:
         ) from None
 
 
-def print_snapshot(snapshot: Moment, requested: str) -> None:
-    """Print the episode's facts, its task tree, and a table of the objects in the world."""
+def print_snapshot(snapshot: Moment, requested: str, *, full: bool = False) -> None:
+    """Print the episode's facts, its task tree, and a table of the objects in the world; with `full`, uncut."""
     robot = snapshot.world.robot
     print_facts(
         f"Episode {snapshot.number}: {snapshot.description}",
@@ -48,10 +48,10 @@ def print_snapshot(snapshot: Moment, requested: str) -> None:
             "robot": _robot_text(robot) if robot is not None else None,
         },
     )
-    print_tree(snapshot.tree)
+    print_tree(snapshot.tree, full=full)
     if snapshot.world.objects:
         columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
-        print_table("World", columns, [_row(each) for each in snapshot.world.objects])
+        print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])
 
 
 def _running_text(snapshot: Moment) -> str:
@@ -70,18 +70,20 @@ def _robot_text(robot: RobotThen) -> str:
     return f"{robot.name} at ({x:.3f}, {y:.3f}), heading {_degrees(robot.pose.yaw)}{torso}"
 
 
-def _row(each: ObjectThen) -> tuple[object, ...]:
+def _row(each: ObjectThen, *, full: bool) -> tuple[object, ...]:
     parent = each.attached_to
     attached = " ".join(filter(None, parent)) if parent is not None else ""
-    return each.name, each.object_type, *each.pose.position, _degrees(each.pose.yaw), attached, _joints_text(each)
+    joints = _joints_text(each, full=full)
+    return each.name, each.object_type, *each.pose.position, _degrees(each.pose.yaw), attached, joints
 
 
 def _degrees(angle: float) -> str:
     return f"{math.degrees(angle):.1f}°"
 
 
-def _joints_text(each: ObjectThen) -> str:
+def _joints_text(each: ObjectThen, *, full: bool) -> str:
     """List the joints whose position is not 0."""
     positions = [f"{joint} {position:.3f}" for joint, position in each.joints.items() if position != 0.0]
-    more = f" and {len(positions) - _JOINTS_MAX} more" if len(positions) > _JOINTS_MAX else ""
-    return ", ".join(positions[:_JOINTS_MAX]) + more
+    listed = positions if full else positions[:_JOINTS_MAX]
+    more = f" and {len(positions) - len(listed)} more" if len(positions) > len(listed) else ""
+    return ", ".join(listed) + more

@@ -138,3 +138,76 @@ def test_what_is_no_moment_of_an_episode_is_one_line(ridden: Path, arguments: li
     done = pycrorm("show", *arguments, cwd=ridden)
     assert (done.returncode, done.stdout) == (2, "")
     assert one_line_of(done) == f"pycrorm: {said}"
+
+
+LONG = """
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.world import BulletWorld, Object, ObjectType
+
+@dataclass
+class FailActionPerformable(ActionAbstract):
+    text: str
+    numbers: list[int]
+    weight: float
+    async def perform(self):
+        raise PlanFailure("m" * int(self.text[:3]) + " end")
+
+async def plan():
+    with BulletWorld():
+        robot = Object("pr2", ObjectType.ROBOT)
+        robot.set_joint_positions({
+            "torso_lift_joint": 0.1, "head_pan_joint": 0.2, "head_tilt_joint": 0.3, "l_elbow_flex_joint": -0.4
+        })
+        for length in ("096", "097", "500"):
+            try:
+                await FailActionPerformable(length + "t" * 300, [1, 2, 3], object()).perform()
+            except PlanFailure:
+                pass
+"""
+
+
+@pytest.fixture(scope="module")
+def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("failed")
+    (place / "long.py").write_text(LONG)
+    done = pycrorm("run", "long.py", cwd=place)
+    assert done.returncode == 0, done.stderr
+    return place
+
+
+def test_a_message_and_a_text_that_are_cut_end_with_an_ellipsis(failed: Path) -> None:
+    for moment in ((), ("--at", "1e6")):
+        shown = " ".join(pycrorm("show", "1", *moment, cwd=failed).stdout.replace("│", " ").split())
+        assert f"PlanFailure: {'m' * 96} end" in shown
+        assert f"PlanFailure: {'m' * 97} en…" in shown
+        assert f"PlanFailure: {'m' * 100}…" in shown
+        assert f"text=500{'t' * 57}… numbers=3 entries weight=? FAILED" in shown
+
+
+def test_full_shows_all_of_it(failed: Path) -> None:
+    for moment in ((), ("--at", "1e6")):
+        done = pycrorm("show", "1", "--full", *moment, cwd=failed)
+        assert (done.returncode, "…" in done.stdout) == (0, False)
+        shown = "".join(done.stdout.replace("│", " ").split())  # without the breaks of the lines
+        assert f"text=500{'t' * 300}numbers=[1,2,3]weight=?(" in shown
+        assert f"PlanFailure:{'m' * 500}end" in shown
+
+
+def test_a_document_is_never_cut(failed: Path) -> None:
+    for moment in ((), ("--at", "1e6")):
+        last = answer("show", "1", *moment, cwd=failed)["tree"][-1]
+        assert last["failure_message"] == "m" * 500 + " end"
+        assert (last["parameters"]["text"], last["parameters"]["numbers"]) == ("500" + "t" * 300, [1, 2, 3])
+
+
+def test_full_lists_every_joint_of_the_world(failed: Path) -> None:
+    joints = "head_pan_joint 0.200", "head_tilt_joint 0.300", "l_elbow_flex_joint -0.400", "torso_lift_joint 0.100"
+    cut, full = (
+        "".join(line.split("│")[-2].strip() for line in pycrorm(*words, cwd=failed).stdout.splitlines() if "│ " in line)
+        for words in (("show", "1", "--at", "#7"), ("show", "1", "--at", "#7", "--full"))
+    )
+    assert "and 1 more" in cut
+    assert "more" not in full
+    assert all(each.replace(" ", "") in full.replace(" ", "") for each in joints)
