@@ -35,7 +35,7 @@ __all__ = ["WORKERS", "DaemonNote", "FoldWorkers", "FoldWorkerTables", "forked"]
 WORKERS: Final = 2
 """The fold workers of one daemon: one writes while the other prepares. More would compete for the database's writes."""
 _NOTE_S: Final = 1.0
-"""The shortest interval between two notes of the number of batches; a change of state is noted at once."""
+"""The longest delay of a note of the number of batches; a change of state is noted at once."""
 
 
 class DaemonNote(msgspec.Struct, frozen=True):
@@ -66,8 +66,8 @@ class FoldWorkers:
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self._note_all = note
-        self._clock = clock
-        self._noted: tuple[list[object], int] = ([], 0)
+        self._noted: list[object] = []
+        self._later: asyncio.TimerHandle | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._workers: list[FoldWorker] = []
         for number, first in zip(range(1, count + 1), [*forked, *[None] * count], strict=False):
@@ -86,6 +86,8 @@ class FoldWorkers:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._later is not None:
+            self._later.cancel()
 
     def __iter__(self) -> Iterator[FoldWorker]:
         return iter(self._workers)
@@ -106,12 +108,18 @@ class FoldWorkers:
             worker.wanted.set()
 
     def _note(self) -> None:
-        states, now_ns = [each.state for each in self._workers], self._clock.wall_ns()
+        """Note the states now if one has changed, otherwise the number of batches a little later."""
+        states = [each.state for each in self._workers]
         key: list[object] = [(each.state, each.since_wall_ns, each.pid) for each in states]
-        before, noted_ns = self._noted
-        if key != before or now_ns - noted_ns >= _NOTE_S * 1e9:
-            self._noted = key, now_ns
+        if key != self._noted:
+            self._noted = key
             self._note_all(states)
+        elif self._later is None:
+            self._later = asyncio.get_running_loop().call_later(_NOTE_S, self._note_batches)
+
+    def _note_batches(self) -> None:
+        self._later = None
+        self._note_all([each.state for each in self._workers])
 
 
 @contextmanager

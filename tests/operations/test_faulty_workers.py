@@ -146,6 +146,20 @@ async def test_what_a_worker_raises_is_said_and_it_goes_on_folding(
         assert (lab.worker().pid, lab.worker().restarts) == (before.pid, 0)
 
 
+@pytest.mark.soak_on("postgresql")
+async def test_status_counts_the_batches_of_a_worker_that_folds_no_more(
+    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with lab_at(database_url, tmp_path, PATIENT, monkeypatch) as lab:
+        before = lab.worker().batches
+        for _ in range(3):
+            await lab.write()
+            await lab.memory.flush()
+        async with asyncio.timeout(20):
+            while lab.worker().batches < before + 3:  # noqa: ASYNC110
+                await asyncio.sleep(0.01)
+
+
 async def test_a_worker_that_is_stopped_in_its_transaction_is_named_and_then_replaced(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
