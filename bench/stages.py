@@ -22,6 +22,7 @@ import tempfile
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,7 +46,9 @@ from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.world import BulletWorld
 
 _TASKS = 100
-_SAMPLED = Settings(sample_interval_ms=50)
+_UNHURRIED = Settings(connect_timeout_s=120)
+"""Opening many memories at once may take long on a busy machine."""
+_SAMPLED = replace(_UNHURRIED, sample_interval_ms=50)
 
 
 class NothingMotion(BaseMotion):
@@ -61,7 +64,7 @@ class Kind(NamedTuple):
     recorded: bool
     tasks: int = 1
     motion: bool = False
-    settings: Settings | None = None
+    settings: Settings = _UNHURRIED
 
 
 KINDS = {

@@ -15,7 +15,9 @@ import sqlite3
 import subprocess
 import sys
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
@@ -225,7 +227,10 @@ async def test_a_long_plan_costs_less_than_a_hundred_bytes_of_memory_a_node(tmp_
     done = await in_a_process(GROWING, url_of(tmp_path), str(WINDOW_NODES))
     assert done.returncode == 0, done.stderr
     _, *sizes = json.loads(done.stdout)  # buffers grow to their final sizes in the first two windows
-    assert (sizes[-1] - sizes[0]) / (5 * WINDOW_NODES) < 100, sizes  # the reference system: 33,000
+    windows = combinations(enumerate(sizes), 2)
+    # The median of all slopes: a buffer that grows once more on a busy machine is no slope.
+    slope = median((later - earlier) / (last - first) / WINDOW_NODES for (first, earlier), (last, later) in windows)
+    assert slope < 100, sizes  # the reference system: 33,000
     assert len(await asked(tmp_path, select(TaskTreeNode.id))) == 7 * WINDOW_NODES + 1
 
 
