@@ -22,6 +22,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Dialect, ForeignKey, String
+from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
 
@@ -29,6 +30,7 @@ from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RobotState
 from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import JsonText
+from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
     from pycrorm_async.orm.tree import TaskTreeNode
@@ -138,6 +140,9 @@ class Designator(Base):
         items: the entries of its list and dict fields.
         parameters: its fields as recorded. Deferred: load them with `undefer(Action.parameters)` or
             `await action.awaitable_attrs.parameters`.
+        status, start_time, end_time, reason: of its node. A type with a field of such a name has the field instead.
+        duration: of its node, in s; None while it runs, and if it is LOST.
+        episode: the same as `process_metadata`.
         node: its node of the task tree, mainly for joins: `select(...).join(PickUpAction.node)`. Not loaded by default:
             use `selectinload(Action.node)` or `await action.awaitable_attrs.node`.
     """
@@ -167,6 +172,11 @@ class Designator(Base):
     robot_state_id: Mapped[int | None] = mapped_column(ForeignKey("robot_state.id"))
     parameters: Mapped[dict[str, Any]] = mapped_column(JsonText(), deferred=True)
     _lineage: Mapped[str] = mapped_column("lineage", ClassOfRow())
+    _status: Mapped[TaskStatus] = mapped_column("status")
+    _start_time: Mapped[datetime] = mapped_column("start_time")
+    _end_time: Mapped[datetime | None] = mapped_column("end_time")
+    _duration: Mapped[float | None] = mapped_column("duration")
+    _reason: Mapped[str | None] = mapped_column("reason")
 
     robot_state: Mapped[RobotState | None] = relationship(viewonly=True, lazy="selectin")
     items: Mapped[list[ParameterItem]] = relationship(
@@ -176,6 +186,38 @@ class Designator(Base):
     node: Mapped[TaskTreeNode] = relationship(
         primaryjoin="foreign(Designator.id) == TaskTreeNode.id", viewonly=True, lazy="select"
     )
+
+    # Hybrids, because a subclass may map a field of such a name, which a column of the same name would collide with.
+
+    @hybrid_property
+    def status(self) -> TaskStatus:
+        """The status of its node."""
+        return self._status
+
+    @hybrid_property
+    def start_time(self) -> datetime:
+        """The start of its node."""
+        return self._start_time
+
+    @hybrid_property
+    def end_time(self) -> datetime | None:
+        """The end of its node; None while it runs, and if it is LOST."""
+        return self._end_time
+
+    @hybrid_property
+    def duration(self) -> float | None:
+        """The duration of its node in s; None while it runs, and if it is LOST."""
+        return self._duration
+
+    @hybrid_property
+    def reason(self) -> str | None:
+        """The class of the failure that its node ended with."""
+        return self._reason
+
+    @hybrid_property
+    def episode(self) -> ProcessMetaData:
+        """The episode that it belongs to."""
+        return self.process_metadata
 
     def entries(self, field: str) -> list[Any]:
         """Return the values of a list field, in order."""

@@ -26,6 +26,7 @@ class TaskTreeNode(Base):
             object, and for parents, use `await node.awaitable_attrs.parent`.
         end_time: None while it runs, and if it is LOST.
         start_ns, end_ns: monotonic time, for exact durations.
+        duration: in s; None while it runs, and if it is LOST.
         reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
         result: the return value of perform, as JSON.
         simulated: whether it belongs to a simulation, performed in a copy of the world.
@@ -52,6 +53,7 @@ class TaskTreeNode(Base):
     torso_height: Mapped[float | None]
     robot_object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
     simulated: Mapped[bool]
+    duration: Mapped[float | None]
 
     action: Mapped[Designator | None] = relationship(viewonly=True, lazy="selectin")
     parent: Mapped[TaskTreeNode | None] = relationship(
@@ -61,8 +63,8 @@ class TaskTreeNode(Base):
 
     @property
     def duration_s(self) -> float | None:
-        """The duration in s; None while it runs, and if it is LOST."""
-        return None if self.end_ns is None else (self.end_ns - self.start_ns) / 1e9
+        """The same as `duration`."""
+        return self.duration
 
 
 class LocationCandidate(Base):

@@ -37,7 +37,7 @@ class Moment(TypeDecorator[datetime]):
         return (value - _EPOCH) // _MICROSECOND
 
     def process_result_value(self, value: int | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
-        return None if value is None else _EPOCH + timedelta(microseconds=value)
+        return None if value is None else _EPOCH + value * _MICROSECOND
 
 
 class EnumName(TypeDecorator[Any]):
@@ -49,14 +49,13 @@ class EnumName(TypeDecorator[Any]):
     def __init__(self, enum: type[Enum]) -> None:
         super().__init__()
         self.enum = enum
+        self._members = dict(enum.__members__)  # `__members__` makes a mapping at every access
 
     def process_bind_param(self, value: Enum | str | None, dialect: Dialect) -> str | None:  # noqa: ARG002
         return value.name if isinstance(value, Enum) else value
 
     def process_result_value(self, value: str | None, dialect: Dialect) -> Enum | str | None:  # noqa: ARG002
-        if value is None:
-            return None
-        return self.enum.__members__.get(value, value)
+        return None if value is None else self._members.get(value, value)
 
 
 class JsonText(TypeDecorator[Any]):

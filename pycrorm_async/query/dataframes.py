@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sqlalchemy import BigInteger, Boolean, Float, Integer, Select, String, inspect, type_coerce
+from sqlalchemy import BigInteger, Boolean, ColumnElement, Float, Integer, Select, String, inspect, type_coerce
 from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy.ext.hybrid import HybridExtensionType
+from sqlalchemy.orm import Mapper
 
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.orm.types import EnumName, Moment
@@ -66,6 +68,18 @@ def _columns(statement: Select[*tuple[Any, ...]]) -> Iterator[_FrameColumn]:
         for attribute in entity.mapper.column_attrs:
             if not attribute.deferred and not attribute.key.startswith("_"):
                 yield _column(attribute.key, getattr(each["expr"], attribute.key), attribute.columns[0].type)
+        for name, column in _hybrids(entity.mapper).items():
+            yield _column(name, getattr(each["expr"], name), column.type)
+
+
+def _hybrids(mapper: Mapper[Any]) -> dict[str, ColumnElement[Any]]:
+    """Return the columns that hybrid attributes of a class show, by the attribute's name."""
+    hybrids = (
+        name
+        for name, each in mapper.all_orm_descriptors.items()
+        if each.extension_type is HybridExtensionType.HYBRID_PROPERTY and f"_{name}" in mapper.column_attrs
+    )
+    return {name: mapper.column_attrs[f"_{name}"].columns[0] for name in hybrids}
 
 
 def _column(name: str, expression: Any, kind: Any) -> _FrameColumn:

@@ -26,6 +26,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.orm import Action, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
+from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.address import DatabaseAddress
@@ -160,6 +161,20 @@ async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_the
         assert found.entries == "x"
         assert [(each.x, each.frame) for each in found.stops] == [(1.0, "map"), (2.0, "map")]
         assert found.loads == {"milk": 2, "cup": 1}
+
+
+async def test_a_field_of_a_made_class_is_the_field_if_every_action_has_an_attribute_of_its_name(log: EventLog) -> None:
+    fields = field("duration", "real", 2), field("reason", "text", 3), field("episode", "integer", 4)
+    wait = declared("WaitAction", "wait_action", *fields)
+    script = Script()
+    parameters = {"duration": 60.0, "reason": "rain", "episode": 7}
+    script.put(NodeStarted("action", None, name_of(wait), parameters))
+    await stored_and_folded(log, [*declarations(wait), *script.records])
+    async with classes_of(log) as classes:
+        (found,) = await every(log, select(Action))
+        assert (found.duration, found.reason, found.episode, found.status) == (60.0, "rain", 7, TaskStatus.RUNNING)
+        made = classes.of("WaitAction")
+        assert await every(log, select(made.duration).where(made.duration > 50)) == [60.0]
 
 
 async def test_a_class_is_found_by_type_table_or_designator(log: EventLog) -> None:

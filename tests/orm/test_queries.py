@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 from sqlalchemy.ext.asyncio import AsyncSession
-from sqlalchemy.orm import selectinload, undefer
+from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
 from pycrorm_async.events.types import (
@@ -69,8 +69,9 @@ from tests.projections.event_script import (
     name_of,
     pose,
     row,
+    time_us,
 )
-from tests.projections.sql_queries import stored_and_folded
+from tests.projections.sql_queries import ask, stored_and_folded
 
 pytestmark = pytest.mark.slow
 
@@ -82,6 +83,18 @@ MOVE_JOINTS = declared(
     field("positions", "list", 3, item="real"),
     kind="motion",
 )
+WAIT = declared("WaitAction", "orm_wait", field("duration", "real", 2), field("status", "text", 3))
+
+
+class ORMWait(Action):
+    """Its fields have names that every action has."""
+
+    __tablename__ = "orm_wait"
+
+    duration: Mapped[float]
+    status: Mapped[str]  # type: ignore[assignment]
+
+
 CLASSES = sorted(
     (each for each in vars(pycrorm_async.orm).values() if isinstance(each, type) and issubclass(each, Base)),
     key=lambda each: each.__name__,
@@ -286,6 +299,62 @@ async def test_an_action_leads_to_its_node_when_asked(log: EventLog, script: Scr
         assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
     (pick,) = await every(log, select(PickUpAction).options(selectinload(PickUpAction.node)))
     assert (pick.node.status, pick.node.reason) == (TaskStatus.FAILED, "IKError")
+
+
+async def test_an_action_says_when_it_was_performed_and_how_it_ended(log: EventLog, script: Script) -> None:
+    drive, pick, opening = await every(log, select(Action).order_by(Action.start_time))
+    assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
+    assert (pick.status, pick.reason, pick.duration) == (TaskStatus.FAILED, "IKError", 3.0)
+    assert (pick.start_time, pick.end_time) == (moment(11), moment(14))
+    assert (opening.status, opening.end_time, opening.duration) == (TaskStatus.LOST, None, None)
+    assert pick.episode is pick.process_metadata
+    (move,) = await every(log, select(MoveMotion))
+    assert (move.status, move.duration) == (TaskStatus.SUCCEEDED, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("condition", "expected"),
+    [
+        (Action.status == TaskStatus.FAILED, [11]),
+        (Action.duration >= 3, [6, 11]),
+        (Action.end_time.is_(None), [15]),
+        (Action.start_time > moment(6), [11, 15]),
+        (Action.reason == "IKError", [11]),
+        (Action.episode.has(description="Tutorial"), [6, 11, 15]),
+    ],
+)
+async def test_actions_are_filtered_and_ordered_by_their_course(
+    log: EventLog, script: Script, condition: Any, expected: list[int]
+) -> None:
+    slowest_last = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
+    assert await every(log, slowest_last) == [row(each) for each in expected]
+
+
+async def test_an_action_joins_its_episode(log: EventLog, script: Script) -> None:
+    question = select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode)
+    async with AsyncSession(log.engine) as session:
+        assert (await session.execute(question)).all() == [("Tutorial", 3.0)]
+
+
+@pytest.mark.parametrize("view", ["action", "motion", "designator", "task_tree_node"])
+async def test_sql_by_hand_reads_the_course_of_an_action_from_one_view(
+    log: EventLog, script: Script, view: str
+) -> None:
+    columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
+    course = await ask(log, f"SELECT {columns} FROM {view} WHERE dtype IN ('PickUpAction', 'MoveMotion') ORDER BY id")
+    move = (1, "MoveMotion", "SUCCEEDED", time_us(8), time_us(9), 1.0, None)
+    pick = (1, "PickUpAction", "FAILED", time_us(11), time_us(14), 3.0, "IKError")
+    assert course == {"action": [pick], "motion": [move]}.get(view, [move, pick])
+
+
+async def test_a_field_named_like_the_course_of_an_action_is_the_field(log: EventLog) -> None:
+    script = Script()
+    node = script.put(NodeStarted("action", None, name_of(WAIT), {"duration": 60.0, "status": "patient"}))
+    script.put(NodeEnded(node, "SUCCEEDED"))
+    await stored_and_folded(log, [*declarations(WAIT), *script.records])
+    (wait,) = await every(log, select(ORMWait).where(ORMWait.duration > 50, Action.duration < 50))
+    assert (wait.duration, wait.status, wait.reason) == (60.0, "patient", None)
+    assert await every(log, select(Action.duration)) == [1.0]
 
 
 async def test_an_enum_member_this_process_does_not_know_is_its_name(log: EventLog) -> None:

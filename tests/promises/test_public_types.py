@@ -16,6 +16,7 @@ ROOT = Path(__file__).parent.parent.parent
 PROGRAM = """\
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from typing import assert_type
 
 from sqlalchemy import select
@@ -24,7 +25,8 @@ from sqlalchemy.orm import Mapped
 from pycrorm_async import Memory, MemoryStatus, Projection, Reading, Settings, UserView
 from pycrorm_async.orm import AccessingMotion, Action, FaceAtAction, GraspingAction, Monitor
 from pycrorm_async.orm import MoveAndPickUpAction, MoveMotion, NavigateAction, Object as ObjectRow, OpeningMotion
-from pycrorm_async.orm import PickUpAction, PlaceAction, Pose, TaskTreeNode
+from pycrorm_async.orm import PickUpAction, PlaceAction, Pose, ProcessMetaData, TaskTreeNode
+from pycrorm_async.plan import TaskStatus
 from pycrorm_async.plan import ActionAbstract, NavigateAction as Navigate, PlanFailure, simulated_robot
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose as WorldPose
 
@@ -76,6 +78,16 @@ def motion_rows(move: MoveMotion, opening: OpeningMotion, accessing: AccessingMo
     assert_type(monitor.interval_s, float)
 
 
+def course(action: Action, pick: PickUpAction, node: TaskTreeNode) -> None:
+    assert_type(action.status, TaskStatus)
+    assert_type(action.start_time, datetime)
+    assert_type(pick.end_time, datetime | None)
+    assert_type(pick.duration, float | None)
+    assert_type(pick.reason, str | None)
+    assert_type(action.episode, ProcessMetaData)
+    assert_type(node.duration, float | None)
+
+
 def own_rows(greet: ORMGreet, careful: ORMCarefulPickUp) -> None:
     assert_type(greet.id, int)
     assert_type(greet.whom, str)
@@ -111,6 +123,9 @@ async def main() -> Sequence[Action]:
             assert_type(arms, Sequence[Arms])
             places = (await session.scalars(select(PlaceAction.target_location_id))).all()
             assert_type(places, Sequence[int])
+            slow = select(Action.duration).where(Action.duration > 1, Action.status == TaskStatus.FAILED)
+            slow = slow.join(Action.episode).order_by(Action.duration.desc())
+            assert_type((await session.scalars(slow)).all(), Sequence[float | None])
             query = select(PickUpAction.grasp, ObjectRow.name, TaskTreeNode.end_ns)
             query = query.join(PickUpAction.object).join(PickUpAction.node)
             for grasp, name, end_ns in await session.execute(query):

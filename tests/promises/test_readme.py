@@ -33,7 +33,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 [TIDY] = python_of("pycrorm_async/plan/README.md")
-THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
+COURSE, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 [BETTER] = python_of("pycrorm_async/learning/README.md")
 
 
@@ -127,6 +127,24 @@ def test_the_projection_of_ones_own_counts_what_was_tried(tmp_path: Path) -> Non
         question = "SELECT id, arm, grasp, status FROM pick_up_action JOIN task_tree_node USING (id)"
         assert tried == plain.execute(question).fetchall()
     assert [status for *_, status in tried] == ["SUCCEEDED"]
+
+
+async def test_actions_say_how_long_they_took(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tidy.py").write_text(TIDY)
+    done = await asyncio.to_thread(pycrorm, "run", "tidy.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    names: dict[str, Any] = {}
+    exec("from pycrorm_async import Memory", names)
+    body = textwrap.indent(COURSE.replace("> 0.1", ">= 0"), "        ")
+    exec(
+        f"async def asked():\n    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n{body}",
+        names,
+    )
+    await names["asked"]()
+    lines = [line.split(maxsplit=4) for line in capsys.readouterr().out.splitlines()]
+    assert ("TransportAction", "SUCCEEDED") in [(dtype, status) for dtype, status, *_ in lines]
+    durations = [float(duration) for _, _, duration, *_ in lines]
+    assert durations == sorted(durations, reverse=True)
 
 
 async def test_a_moment_is_told_and_made_again_in_another_world(

@@ -215,7 +215,12 @@ async def test_a_frame_has_moments_in_utc(reading: Reading) -> None:
 
 async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Reading) -> None:
     frame = await reading.dataframe(select(NavigateAction))
-    assert list(frame.columns) == ["id", "process_metadata_id", "dtype", "kind", "robot_state_id", "pose_id"]
+    assert list(frame.columns) == [
+        "id", "process_metadata_id", "dtype", "kind", "robot_state_id", "pose_id",
+        "status", "start_time", "end_time", "duration", "reason",
+    ]  # fmt: skip
+    assert [*frame.status, *frame.duration, *frame.reason] == ["SUCCEEDED"] * 2 + [4.0] * 2 + [None] * 2
+    assert list(frame.start_time) == [pd.Timestamp(moment(4))] * 2
     frame = await reading.dataframe(select(Pose.id, Object.id).join(Object.pose).order_by(Pose.id))
     assert list(frame.columns) == ["id", "id_1"]
     assert frame.id.tolist() == frame.id_1.tolist() == [row(3), row(3, number=2)]

@@ -16,6 +16,7 @@ from sqlalchemy import (
     Boolean,
     Column,
     ColumnElement,
+    Double,
     Select,
     Table,
     Text,
@@ -197,7 +198,17 @@ def _designator_type(layout: Layout) -> View:
 def _task_tree_node(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     nodes = core["task_tree_node"]
     action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
-    return select(*nodes.c, action_id.label("action_id"))
+    return select(*nodes.c, action_id.label("action_id"), _duration(nodes))
+
+
+def _duration(nodes: Table) -> ColumnElement[Any]:
+    """Return the column `duration` (s); null while the node runs, and if it is LOST."""
+    return (cast(nodes.c.end_ns - nodes.c.start_ns, Double()) / 1e9).label("duration")
+
+
+def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
+    """Return the columns that say when a node was performed and how it ended."""
+    return nodes.c.status, nodes.c.start_time, nodes.c.end_time, _duration(nodes), nodes.c.reason
 
 
 def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
@@ -217,6 +228,7 @@ def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
         robot_state_id.label("robot_state_id"),
         func.coalesce(started, "{}").label("parameters"),
         _lineage(nodes, layout).label("lineage"),
+        *_course(nodes),
     ).where(nodes.c.dtype.is_not(None))
 
 
@@ -235,7 +247,8 @@ def _lineage(nodes: Table, layout: Layout) -> ColumnElement[str]:
 def _of_kind(kind: str) -> _Cut:
     def view(core: dict[str, Table], _layout: Layout) -> Select[Any]:
         nodes = core["task_tree_node"]
-        return select(nodes.c.id).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
+        columns = nodes.c.id, nodes.c.process_metadata_id, nodes.c.dtype, *_course(nodes)
+        return select(*columns).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
 
     return view
 
