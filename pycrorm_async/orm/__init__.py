@@ -50,7 +50,7 @@ from pycrorm_async.orm.objects import (
 )
 from pycrorm_async.orm.perception import Detection, StateSample
 from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
-from pycrorm_async.orm.views import PickUpWithContextView
+from pycrorm_async.orm.views import PickUpWithContextView, RootFailure
 
 __all__ = [
     "Base",
@@ -115,4 +115,5 @@ __all__ = [
     "Code",
     "Retry",
     "PickUpWithContextView",
+    "RootFailure",
 ]

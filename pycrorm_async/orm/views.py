@@ -1,15 +1,17 @@
-"""Map the built-in view for learning; users register more of them with `projections.schema.user_views`."""
+"""Map the built-in views for learning and for failures; `projections.schema.user_views` has those of users."""
 
 from __future__ import annotations
 
-from sqlalchemy import ForeignKey
-from sqlalchemy.orm import Mapped, mapped_column
+from datetime import datetime
 
-from pycrorm_async.orm.base import Base
+from sqlalchemy import ForeignKey
+from sqlalchemy.orm import Mapped, mapped_column, relationship
+
+from pycrorm_async.orm.base import Base, ProcessMetaData
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
-__all__ = ["PickUpWithContextView"]
+__all__ = ["PickUpWithContextView", "RootFailure"]
 
 
 class PickUpWithContextView(Base):
@@ -57,3 +59,41 @@ class PickUpWithContextView(Base):
     object_qz: Mapped[float] = mapped_column(deferred=True)
     object_qw: Mapped[float] = mapped_column(deferred=True)
     height_over_torso: Mapped[float | None] = mapped_column(deferred=True)
+
+
+class RootFailure(Base):
+    """A node that ended as FAILED or ERROR and has no child that did: the place where a failure began.
+
+    Attributes:
+        id: of the node.
+        dtype: of the failed designator; None if the plan itself failed.
+        path: the names of the nodes from the root to this one, as in `root > TransportAction > PickUpAction`.
+        object: the name of the object that the designator, or else the nearest one around it, has as a parameter.
+        arm: the arm that the designator, or else the nearest one around it, has as a parameter.
+        reason: the class of the failure.
+        message: its message.
+        recovered: whether a node around this one succeeded all the same.
+        episode: the same as `process_metadata`.
+    """
+
+    __tablename__ = "root_failure"
+
+    id: Mapped[int] = mapped_column(ForeignKey("task_tree_node.id"), primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    dtype: Mapped[str | None]
+    status: Mapped[TaskStatus]
+    path: Mapped[str]
+    object: Mapped[str | None]
+    arm: Mapped[Arms | None]
+    reason: Mapped[str | None]
+    message: Mapped[str | None]
+    recovered: Mapped[bool]
+    start_time: Mapped[datetime]
+    end_time: Mapped[datetime | None]
+
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+    @property
+    def episode(self) -> ProcessMetaData:
+        """The episode in which it failed."""
+        return self.process_metadata

@@ -50,11 +50,13 @@ from pycrorm_async.orm import (
     ProcessMetaData,
     Quaternion,
     RobotState,
+    RootFailure,
     TaskTreeNode,
 )
 from pycrorm_async.orm.types import Moment
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.projections.event_script import (
@@ -83,6 +85,7 @@ MOVE_JOINTS = declared(
     field("positions", "list", 3, item="real"),
     kind="motion",
 )
+RETRY = declared("Retry", "retry", field("times", "integer", 2), kind="language")
 WAIT = declared("WaitAction", "orm_wait", field("duration", "real", 2), field("status", "text", 3))
 
 
@@ -345,6 +348,94 @@ async def test_sql_by_hand_reads_the_course_of_an_action_from_one_view(
     move = (1, "MoveMotion", "SUCCEEDED", time_us(8), time_us(9), 1.0, None)
     pick = (1, "PickUpAction", "FAILED", time_us(11), time_us(14), 3.0, "IKError")
     assert course == {"action": [pick], "motion": [move]}.get(view, [move, pick])
+
+
+def failing() -> Script:
+    """A transport fails in a motion of its second try, and the plan goes on; then the plan itself breaks."""
+    script = Script()
+    put = script.put
+    put(EpisodeStarted("Breakfast", "me", "host", "1.0", "3.11"))  # 1
+    root = put(NodeStarted("root"))  # 2
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 3
+    retry = put(NodeStarted("language", root, name_of(RETRY), {"times": 2}))  # 4
+    for arm in ("LEFT", "RIGHT"):  # 5 to 9, 10 to 14
+        seen = {"object_designator": ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
+        pick = put(NodeStarted("action", retry, name_of(PICK_UP), seen))
+        move = put(NodeStarted("motion", pick, name_of(MOVE), {"target": pose(7, 8)}))
+        put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), move))
+        fault = FailureValue("plan.failures.IKError", f"{arm} is too short", [])
+        put(NodeEnded(move, "FAILED", fault))
+        put(NodeEnded(pick, "FAILED", fault))
+    put(NodeEnded(retry, "SUCCEEDED"))  # 15
+    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1))
+    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 16
+    put(NodeEnded(opening, "CANCELLED"))  # 17
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7)}))  # 18
+    put(NodeEnded(drive, "SUCCEEDED"))  # 19
+    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 20
+    put(NodeEnded(opening, "ERROR", FailureValue("builtins.KeyError", "door")))  # 21
+    put(NodeEnded(root, "ERROR", FailureValue("builtins.KeyError", "door")))  # 22
+    put(EpisodeEnded("ERROR"))  # 23
+    put = (second := Script(2)).put
+    put(EpisodeStarted("Lunch", "me", "host", "1.0", "3.11"))  # 1
+    root = put(NodeStarted("root"))  # 2
+    put(NodeEnded(root, "ERROR", FailureValue("builtins.ValueError", "no table")))  # 3
+    script.records += second.records
+    return script
+
+
+async def test_a_failure_is_shown_where_it_began_with_path_object_arm_and_message(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
+    first, second, opening, plan = await every(log, select(RootFailure).order_by(RootFailure.id))
+    path = "root > Retry > PickUpAction > MoveMotion"
+    assert (first.id, first.dtype, first.status) == (row(6), "MoveMotion", TaskStatus.FAILED)
+    assert (first.path, first.object, first.arm) == (path, "milk", Arms.LEFT)
+    assert (first.reason, first.message, first.recovered) == ("IKError", "LEFT is too short", True)
+    assert (first.start_time, first.end_time, first.episode.description) == (moment(6), moment(8), "Breakfast")
+    assert (second.id, second.path, second.arm, second.message) == (row(11), path, Arms.RIGHT, "RIGHT is too short")
+    assert (opening.id, opening.path, opening.status) == (row(20), "root > OpenAction", TaskStatus.ERROR)
+    assert (opening.object, opening.arm, opening.reason) == ("handle", Arms.LEFT, "KeyError")
+    assert (opening.message, opening.recovered) == ("door", False)
+    assert (plan.id, plan.dtype, plan.path, plan.object) == (row(2, number=2), None, "root", None)
+    assert (plan.arm, plan.message, plan.recovered) == (None, "no table", False)
+    lost = select(RootFailure.path).where(~RootFailure.recovered, RootFailure.object == "handle")
+    assert await every(log, lost) == ["root > OpenAction"]
+
+
+async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:
+    note = declared("NoteAction", "note_action", field("lines", "dict", 2, item="text"))
+    script = Script()
+    lines = {"object": "milk", "row": "first"}
+    node = script.put(NodeStarted("action", None, name_of(note), {"lines": lines}))
+    script.put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
+    await stored_and_folded(log, [*declarations(note), *script.records])
+    (failure,) = await every(log, select(RootFailure))
+    assert (failure.path, failure.object, failure.recovered) == ("NoteAction", None, False)
+
+
+async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventLog) -> None:
+    script = failing()
+    for place, each in enumerate(script.records[:-3]):  # the second episode is none
+        if each.type in ("EpisodeStarted", "NodeStarted"):
+            simulated = each.payload.replace(b"{", b'{"simulated":true,', 1)
+            script.records[place] = each._replace(payload=simulated)
+    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *script.records])
+    reading = Reading(log)
+    counts = []
+    for also in (False, True):
+        async with reading.session(simulated=also) as session:
+            counts.append(len((await session.scalars(select(RootFailure))).all()))
+    assert counts == [1, 4]
+
+
+async def test_sql_by_hand_counts_where_failures_began(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
+    question = "SELECT path, object, count(*) FROM root_failure GROUP BY path, object ORDER BY path"
+    assert await ask(log, question) == [
+        ("root", None, 1),
+        ("root > OpenAction", "handle", 1),
+        ("root > Retry > PickUpAction > MoveMotion", "milk", 2),
+    ]
 
 
 async def test_a_field_named_like_the_course_of_an_action_is_the_field(log: EventLog) -> None:

@@ -25,7 +25,7 @@ from sqlalchemy.orm import Mapped
 from pycrorm_async import Memory, MemoryStatus, Projection, Reading, Settings, UserView
 from pycrorm_async.orm import AccessingMotion, Action, FaceAtAction, GraspingAction, Monitor
 from pycrorm_async.orm import MoveAndPickUpAction, MoveMotion, NavigateAction, Object as ObjectRow, OpeningMotion
-from pycrorm_async.orm import PickUpAction, PlaceAction, Pose, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import PickUpAction, PlaceAction, Pose, ProcessMetaData, RootFailure, TaskTreeNode
 from pycrorm_async.plan import TaskStatus
 from pycrorm_async.plan import ActionAbstract, NavigateAction as Navigate, PlanFailure, simulated_robot
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose as WorldPose
@@ -86,6 +86,14 @@ def course(action: Action, pick: PickUpAction, node: TaskTreeNode) -> None:
     assert_type(pick.reason, str | None)
     assert_type(action.episode, ProcessMetaData)
     assert_type(node.duration, float | None)
+
+
+def failures(failure: RootFailure) -> None:
+    assert_type(failure.path, str)
+    assert_type(failure.object, str | None)
+    assert_type(failure.arm, Arms | None)
+    assert_type(failure.recovered, bool)
+    assert_type(failure.episode, ProcessMetaData)
 
 
 def own_rows(greet: ORMGreet, careful: ORMCarefulPickUp) -> None:

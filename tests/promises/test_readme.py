@@ -33,7 +33,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 [TIDY] = python_of("pycrorm_async/plan/README.md")
-COURSE, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
+COURSE, BEGAN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 [BETTER] = python_of("pycrorm_async/learning/README.md")
 
 
@@ -145,6 +145,38 @@ async def test_actions_say_how_long_they_took(tmp_path: Path, capsys: pytest.Cap
     assert ("TransportAction", "SUCCEEDED") in [(dtype, status) for dtype, status, *_ in lines]
     durations = [float(duration) for _, _, duration, *_ in lines]
     assert durations == sorted(durations, reverse=True)
+
+
+FAILING = """\
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract, PlanFailure
+
+@dataclass
+class KnockActionPerformable(ActionAbstract):
+    door: str
+
+    async def perform(self):
+        raise PlanFailure("nobody is in")
+
+async def plan():
+    await (KnockActionPerformable("front") | KnockActionPerformable("back")).perform()
+"""
+
+
+async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
+    (tmp_path / "knock.py").write_text(FAILING)
+    done = await asyncio.to_thread(pycrorm, "run", "knock.py", cwd=tmp_path)
+    assert done.returncode == 1, done.stderr
+    names: dict[str, Any] = {}
+    exec("from pycrorm_async import Memory", names)
+    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
+    body = textwrap.indent(BEGAN, "        ") + "        return frame"
+    exec(f"async def asked():\n{opened}{body}", names)
+    frame = await names["asked"]()
+    assert frame.drop(columns="object").to_dict("records") == [
+        {"path": "root > Parallel > KnockAction", "reason": "PlanFailure", "times": 2}
+    ]
+    assert frame.object.tolist() == [None]
 
 
 async def test_a_moment_is_told_and_made_again_in_another_world(

@@ -38,6 +38,7 @@ from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.pick_up_view import pick_ups_with_context
+from pycrorm_async.projections.schema.root_failure_view import root_failures
 from pycrorm_async.projections.schema.tables import CORE, OWN, column_type, make_table
 
 __all__ = ["public_views", "projection_views", "View"]
@@ -264,6 +265,10 @@ def _robot_state(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     ).where(nodes.c.robot_pose_id.is_not(None))
 
 
+def _root_failure(core: dict[str, Table], _layout: Layout) -> Select[Any]:
+    return root_failures(core["task_tree_node"], core["object"])
+
+
 def _pose(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     poses = core["pose"]
     return select(*poses.c, poses.c.id.label("position_id"), poses.c.id.label("orientation_id"))
@@ -288,6 +293,7 @@ _CUT: dict[str, tuple[str, _Cut]] = {
     "motion": ("task_tree_node", _of_kind("motion")),
     "language": ("task_tree_node", _of_kind("language")),
     "robot_state": ("task_tree_node", _robot_state),
+    "root_failure": ("task_tree_node", _root_failure),
     "pose": ("pose", _pose),
     "position": ("pose", _position),
     "quaternion": ("pose", _quaternion),

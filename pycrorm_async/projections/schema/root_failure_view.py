@@ -1,0 +1,113 @@
+"""Define `root_failure`: every failed node without a failed child, which is where a failure began.
+
+Path, object, arm and `recovered` are found by climbing from the failed node to the root, one lookup by primary key for
+each ancestor. A query that does not select them does not climb: both databases compute only the columns they need. The
+object and the arm are those of the nearest node that has such a parameter, because a motion that failed often has
+neither while the action around it has both. They are read from the events of these nodes, since a lookup in the leaf
+tables would need one subquery for every type of a memory.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+from sqlalchemy import Boolean, ColumnElement, Select, Table, Text, exists, literal_column, select
+from sqlalchemy.ext.compiler import compiles
+
+from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
+from pycrorm_async.task_status import TaskStatus
+
+__all__ = ["root_failures"]
+
+_FAILED = (TaskStatus.FAILED.name, TaskStatus.ERROR.name)
+_SLOT_BITS = SLOT_MAX.bit_length()
+_NUMBER_BITS = SEQUENCE_MAX.bit_length() + _SLOT_BITS
+
+_CLIMB = """WITH RECURSIVE up(id, parent_id, path, status, depth) AS (
+ SELECT {node}.id, {node}.parent_id, coalesce({node}.dtype, {node}.kind), {node}.status, 0
+ UNION ALL
+ SELECT above.id, above.parent_id, coalesce(above.dtype, above.kind) || ' > ' || up.path, above.status, up.depth + 1
+ FROM up JOIN {node} AS above ON above.id = up.parent_id)"""
+_PATH = f"({_CLIMB} SELECT path FROM up ORDER BY depth DESC LIMIT 1)"  # noqa: S608  constants only, also below
+_RECOVERED = f"EXISTS ({_CLIMB} SELECT 1 FROM up WHERE status = '{TaskStatus.SUCCEEDED.name}')"  # noqa: S608
+_STARTED = f"""{_CLIMB} SELECT {{value}} FROM up JOIN event
+ ON event.episode = up.id >> {_NUMBER_BITS} AND event.sequence = (up.id >> {_SLOT_BITS}) & {SEQUENCE_MAX}"""  # noqa: S608
+_NEAREST = "ORDER BY up.depth LIMIT 1"
+_FIRST_ID = f"((up.id >> {_NUMBER_BITS}) << {_NUMBER_BITS})"
+"""The id of the episode's row 0; an object's row has this id plus its sequence in the place of a sequence."""
+_OBJECT_ROW = f"SELECT name FROM {{object}} AS moved WHERE moved.id = {_FIRST_ID}"  # noqa: S608
+
+_ARM_SQLITE = "coalesce(json_extract(payload, '$.parameters.arm'), json_extract(payload, '$.parameters.gripper'))"
+_ARM_POSTGRESQL = (
+    "coalesce(CAST(payload AS json) -> 'parameters' ->> 'arm', CAST(payload AS json) -> 'parameters' ->> 'gripper')"
+)
+_OBJECT_SQLITE = f"""CASE WHEN json_extract(field.value, '$.object') IS NULL THEN json_extract(field.value, '$.name')
+ ELSE ({_OBJECT_ROW} + (json_extract(field.value, '$.row') << {_SLOT_BITS})) END"""
+_OBJECT_POSTGRESQL = f"""CASE WHEN field.value ->> 'object' IS NULL THEN field.value ->> 'name'
+ ELSE ({_OBJECT_ROW} + (CAST(field.value ->> 'row' AS bigint) << {_SLOT_BITS})) END"""
+_FIELDS_SQLITE = """, json_each(payload, '$.parameters') AS field WHERE field.type = 'object' AND (
+ (json_extract(field.value, '$.object') IS NOT NULL AND json_type(field.value, '$.row') = 'integer')
+ OR (json_extract(field.value, '$.dtype') IS NOT NULL AND json_extract(field.value, '$.name') IS NOT NULL))"""
+_FIELDS_POSTGRESQL = """, json_each(CAST(payload AS json) -> 'parameters') AS field WHERE
+ json_typeof(field.value) = 'object' AND (
+ (field.value ->> 'object' IS NOT NULL AND field.value ->> 'row' ~ '^[0-9]+$')
+ OR (field.value ->> 'dtype' IS NOT NULL AND field.value ->> 'name' IS NOT NULL))"""
+
+
+class _Sql(ColumnElement[Any]):
+    """An expression given as SQL for each database."""
+
+    inherit_cache = False
+
+    def __init__(self, type_: Any, sqlite: str, postgresql: str | None = None) -> None:
+        self.type = type_
+        self.sqlite = sqlite
+        self.postgresql = postgresql or sqlite
+
+    def self_group(self, against: Any = None) -> Self:  # noqa: ARG002  SQLAlchemy's signature
+        return self
+
+
+@compiles(_Sql)
+def _of_sqlite(element: _Sql, _compiler: Any, **_options: Any) -> str:
+    return element.sqlite
+
+
+@compiles(_Sql, "postgresql")
+def _of_postgresql(element: _Sql, _compiler: Any, **_options: Any) -> str:
+    return element.postgresql
+
+
+def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
+    """Return the view's query."""
+    child = nodes.alias("child")
+    failed_child = exists(
+        select(literal_column("1")).where(child.c.parent_id == nodes.c.id, child.c.status.in_(_FAILED))
+    )
+
+    def sql(text: str, **named: str) -> str:
+        return text.format(node=nodes.name, object=objects.name, **named)
+
+    def nearest(value: str, condition: str) -> str:
+        return f"({sql(_STARTED, value=sql(value))} {condition} {_NEAREST})"
+
+    object_ = _Sql(Text(), nearest(_OBJECT_SQLITE, _FIELDS_SQLITE), nearest(_OBJECT_POSTGRESQL, _FIELDS_POSTGRESQL))
+    arm = _Sql(
+        Text(),
+        nearest(_ARM_SQLITE, f"WHERE {_ARM_SQLITE} IS NOT NULL"),
+        nearest(_ARM_POSTGRESQL, f"WHERE {_ARM_POSTGRESQL} IS NOT NULL"),
+    )
+    return select(
+        nodes.c.id,
+        nodes.c.process_metadata_id,
+        nodes.c.dtype,
+        nodes.c.status,
+        _Sql(Text(), sql(_PATH)).label("path"),
+        object_.label("object"),
+        arm.label("arm"),
+        nodes.c.reason,
+        nodes.c.failure_message.label("message"),
+        _Sql(Boolean(), sql(_RECOVERED)).label("recovered"),
+        nodes.c.start_time,
+        nodes.c.end_time,
+    ).where(nodes.c.status.in_(_FAILED), ~failed_child)
