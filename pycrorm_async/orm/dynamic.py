@@ -1,15 +1,15 @@
-"""Generate mapped classes for declared types without one; the classes belong to one memory.
+"""Generate mapped classes, for one memory, for the declared types that no class of this process maps.
 
     classes = DynamicClasses()
     united = unite(layout, payloads)
     classes.learn(united.accepted.values(), united.layout.renamed)
-    classes.use_in(engine)                          # this engine's rows of SayingAction become SayingAction objects
+    classes.use_in(engine)                          # its rows of type SayingAction are read as SayingAction objects
     SayingAction = classes.of("SayingAction")
     classes.dispose()
 
-Enum fields are names (text), because the enum's class may not be importable. A type that descends from one with a class
-has the attributes of both. Two memories in one process may have different `SayingAction`s: each class has its own
-identity, and only the engines that use it resolve that identity.
+Enum fields are member names (text), because the enum's class may not be importable. A generated class inherits from the
+class of its nearest base type. Two memories in one process may have different `SayingAction`s: each class has a
+polymorphic identity of its own, and only the engines of its memory map rows to it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from pycrorm_async.orm.types import Moment
 __all__ = ["DynamicClasses"]
 
 _DEPTH_MAX = 32
-"""Bounds the ancestors of a class, because a query joins the views of all of them, and SQLite joins at most 64."""
+"""Bounds the ancestors of a class: a query joins the view of each, and SQLite joins at most 64 tables and views."""
 _ROOTS: dict[str, type[Designator]] = {"action": Action, "motion": Motion, "language": Language}
 _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "integer": BigInteger(),
@@ -47,7 +47,7 @@ _TYPES: dict[FieldType, TypeEngine[Any]] = {
 
 
 class DynamicClasses:
-    """The generated classes of one memory, until `dispose`. Used from one thread."""
+    """The generated classes of one memory, until `dispose`. Not thread-safe."""
 
     def __init__(self) -> None:
         self._registry = registry()
@@ -61,10 +61,10 @@ class DynamicClasses:
     def learn(
         self, declarations: Iterable[DesignatorTypeDeclared], renamed: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Generate classes for declared types without one, and add new fields to existing classes.
+        """Generate classes for declared types without one, and add new fields to classes generated before.
 
-        Pass all declarations that the tables accepted, in their order, and no others: classes of contradicting
-        declarations would make every query of a common base fail. `renamed` maps former names of types to present ones.
+        Pass all declarations for which the memory has tables, in the order of their declaration, and no others: a class
+        without tables would make every query of its base fail. `renamed` maps former names of types to present ones.
         """
         self._renamed = dict(renamed)
         self._declared = {}

@@ -1,10 +1,10 @@
-"""Define the column types: times, enum members and JSON.
+"""Define column types for times, enum members and JSON.
 
 | Python | column |
 |---|---|
-| aware `datetime` | integer, µs since 1970 UTC |
-| enum member | its name as text; a name that the enum lacks stays text |
-| JSON | text |
+| aware `datetime` | integer, µs since 1970-01-01 00:00 UTC |
+| enum member | its name as text; a name that the enum lacks is read as `str` |
+| what JSON can hold; None is NULL | JSON text |
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MICROSECOND = timedelta(microseconds=1)
 
 
 class Moment(TypeDecorator[datetime]):
-    """An aware datetime, exact to the microsecond. A naive one is refused, because its time zone is ambiguous."""
+    """An aware datetime, exact to the microsecond and read in UTC. A naive one is refused: it names no time zone."""
 
     impl = BigInteger
     cache_ok = True
@@ -41,7 +41,7 @@ class Moment(TypeDecorator[datetime]):
 
 
 class EnumName(TypeDecorator[Any]):
-    """A member of `enum`, stored by name. Compares with members and with names."""
+    """A member of `enum`, stored by name. A query may compare the column with members and with names."""
 
     impl = String
     cache_ok = True
@@ -59,7 +59,7 @@ class EnumName(TypeDecorator[Any]):
 
 
 class JsonText(TypeDecorator[Any]):
-    """A JSON document."""
+    """A value stored as JSON text; None is NULL."""
 
     impl = Text
     cache_ok = True

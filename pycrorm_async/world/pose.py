@@ -1,4 +1,4 @@
-"""A pose is a frozen value: position in metres, unit quaternion xyzw, the frame of both, and the time of creation.
+"""A pose is a frozen value: a position in metres and a unit quaternion xyzw, the frame of both, and a time.
 
 >>> Pose([1.3, 0.7, 0.95]).position.z
 0.95
@@ -31,7 +31,7 @@ __all__ = [
 
 
 class Vector(NamedTuple):
-    """A position or direction, metres."""
+    """A position or a displacement, m."""
 
     x: float
     y: float
@@ -39,7 +39,7 @@ class Vector(NamedTuple):
 
 
 class Quaternion(NamedTuple):
-    """A rotation as quaternion; unit length inside a `Pose`."""
+    """A rotation as a quaternion; a `Pose` keeps it at length one."""
 
     x: float
     y: float
@@ -50,11 +50,11 @@ class Quaternion(NamedTuple):
 IDENTITY = Quaternion(0.0, 0.0, 0.0, 1.0)
 
 COORDINATE_MAX = 1e9
-"""Bounds the absolute value of coordinates (m) and joint positions (rad or m), so that no sum of them is infinite."""
+"""Bounds coordinates (m) and joint positions (rad or m) that a world accepts, so that no sum of them is infinite."""
 
 
 def product(a: Sequence[float], b: Sequence[float]) -> Quaternion:
-    """Return the Hamilton product a ⊗ b of two xyzw quaternions: the rotation b followed by a."""
+    """Return the Hamilton product a ⊗ b of two xyzw quaternions, which rotates by b first, then by a."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return Quaternion(
@@ -78,27 +78,28 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
 
 
 def yaw_quaternion(angle: float) -> Quaternion:
-    """Return the rotation by `angle` rad about z."""
+    """Return the rotation by `angle` rad about the z axis."""
     return Quaternion(0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
 
 
 class MalformedPose(CallerError, ValueError):
-    """The arguments of a pose are not numbers, a frame's name and whole nanoseconds."""
+    """A pose cannot have this position, orientation, frame or time."""
 
 
 @dataclass(frozen=True, slots=True, init=False, repr=False)
 class Pose:
-    """A position and an orientation in a frame. Equality ignores the time.
+    """A position and an orientation in a frame. Equality ignores `time_ns`. A world refuses a pose that holds NaN.
 
     Args:
         position: x, y, z in metres.
-        orientation: quaternion x, y, z, w of any length but zero; stored with length one.
-        frame: name of the frame of both.
-        time_ns: UTC in ns since 1970; None means now.
+        orientation: quaternion x, y, z, w of any length but zero; stored normalised.
+        frame: name of the frame in which both are given.
+        time_ns: ns since 1970 UTC; None means now.
 
     Raises:
-        MalformedPose: a wrong number of components, components that are not numbers, a quaternion of length zero, a
-            frame that is not a str, or a time that is not an integer of 64 bits. It is a ValueError too.
+        MalformedPose: a wrong number of components, components that are not numbers, a quaternion of length zero or
+            without a finite length, a frame that is not a str, or a time that is not a signed 64-bit integer.
+            `MalformedPose` is a `ValueError` too.
     """
 
     position: Vector
@@ -120,19 +121,15 @@ class Pose:
         except (TypeError, ValueError, OverflowError):
             raise MalformedPose(f"a position needs three numbers x, y, z in metres, got {position!r}") from None
         try:
-            qx, qy, qz, qw = orientation
+            qx, qy, qz, qw = map(float, orientation)
             length = math.hypot(qx, qy, qz, qw)
         except (TypeError, ValueError, OverflowError):
             raise MalformedPose(f"an orientation needs four numbers x, y, z, w, got {orientation!r}") from None
-        if length == 0:
-            raise MalformedPose("an orientation needs a quaternion of length other than zero")
-        unit = abs(length - 1.0) < 1e-15
-        scale = 1.0 if unit else 1.0 / length
-        put(
-            self,
-            "orientation",
-            Quaternion(float(qx * scale), float(qy * scale), float(qz * scale), float(qw * scale)),
-        )
+        if length in (0, math.inf):
+            raise MalformedPose(f"an orientation needs a finite length other than zero, got {orientation!r}")
+        if abs(length - 1.0) >= 1e-15:  # a unit quaternion keeps its exact bits
+            qx, qy, qz, qw = qx / length, qy / length, qz / length, qw / length
+        put(self, "orientation", Quaternion(qx, qy, qz, qw))
         if not isinstance(frame, str):
             raise MalformedPose(f"a pose's frame must be a str, got {frame!r}")
         put(self, "frame", frame)
@@ -142,20 +139,20 @@ class Pose:
         return f"Pose(position={list(self.position)}, orientation={list(self.orientation)}, frame={self.frame!r})"
 
     def __matmul__(self, inner: Pose) -> Pose:
-        """Convert `inner`, a pose relative to this one, to this pose's frame."""
+        """Convert `inner`, a pose relative to this one, to the frame named by `self.frame`; its time is now."""
         moved = rotated(self.orientation, inner.position)
         x, y, z = self.position
         return Pose((x + moved.x, y + moved.y, z + moved.z), product(self.orientation, inner.orientation), self.frame)
 
     def inverse(self) -> Pose:
-        """Return the pose P for which `self @ P` is the identity."""
+        """Return the pose P for which `self @ P` is, up to rounding, the origin with the identity rotation."""
         x, y, z, w = self.orientation
         back = Quaternion(-x, -y, -z, w)
         moved = rotated(back, self.position)
         return Pose((-moved.x, -moved.y, -moved.z), back, self.frame)
 
     def relative_to(self, other: Pose) -> Pose:
-        """Return this pose relative to `other`; both must be in the same frame."""
+        """Return this pose relative to `other`. Does not check that both are in the same frame."""
         return other.inverse() @ self
 
     def distance(self, other: Pose) -> float:
@@ -164,19 +161,19 @@ class Pose:
 
     @property
     def yaw(self) -> float:
-        """Heading in the plane, rad in (-π, π]."""
+        """Heading in the xy plane, rad from +x, in [-π, π]."""
         x, y, z, w = self.orientation
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def _nanoseconds(time: object) -> int:
-    """Check that the time fits the log's 64 bits; the log would refuse the whole episode for a larger one."""
+    """Return the time as an int, checked to fit the 64 bits in which a memory stores it."""
     try:
-        whole = operator.index(time)  # type: ignore[arg-type]  # the call is the check
+        whole = operator.index(time)  # type: ignore[arg-type]  # raises TypeError unless it is an integer
     except TypeError:
-        whole = _NS_END
-    if not -_NS_END <= whole < _NS_END:
-        raise MalformedPose(f"a pose's time must be a whole number of ns since 1970 below 2**63, got {time!r}")
+        whole = None
+    if whole is None or not -_NS_END <= whole < _NS_END:
+        raise MalformedPose(f"a pose's time must be a whole number of ns since 1970 of at most 64 bits, got {time!r}")
     return whole
 
 

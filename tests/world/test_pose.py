@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,10 @@ def test_an_orientation_of_any_length_is_the_same_rotation(length: float) -> Non
     assert turned.yaw == pytest.approx(2 * math.asin(0.6))
 
 
-def test_no_quaternion_at_all_is_refused() -> None:
-    with pytest.raises(ValueError, match="length other than zero"):
-        Pose([0, 0, 0], [0, 0, 0, 0])
+@pytest.mark.parametrize("number", [0.0, 1e308, math.inf])
+def test_a_quaternion_without_a_direction_is_refused(number: float) -> None:
+    with pytest.raises(ValueError, match="an orientation needs a finite length other than zero, got "):
+        Pose([0, 0, 0], [number] * 4)
 
 
 @pytest.mark.parametrize(
@@ -38,8 +40,8 @@ def test_no_quaternion_at_all_is_refused() -> None:
         ({"frame": None}, "a pose's frame must be a str, got None"),
         ({"frame": 3}, "a pose's frame must be a str, got 3"),
         ({"time_ns": 1.5e18}, "whole number of ns since 1970"),
-        ({"time_ns": "now"}, "whole number of ns since 1970 below 2..63, got 'now'"),
-        ({"time_ns": 2**63}, "whole number of ns since 1970 below 2..63, got 9223372036854775808"),
+        ({"time_ns": "now"}, "whole number of ns since 1970 of at most 64 bits, got 'now'"),
+        ({"time_ns": 2**63}, "whole number of ns since 1970 of at most 64 bits, got 9223372036854775808"),
     ],
 )
 def test_what_is_no_pose_is_refused_in_a_line_that_says_what_is_wrong(arguments: dict[str, Any], said: str) -> None:
@@ -52,4 +54,5 @@ def test_numbers_of_numpy_become_plain_ones() -> None:
     pose = Pose(np.array([1, 2, 3]), np.array([0.0, 0.0, 1.0, 0.0], np.float32), time_ns=np.int64(5))  # type: ignore[arg-type]
     assert (pose.position, pose.orientation, pose.time_ns) == ((1.0, 2.0, 3.0), (0.0, 0.0, 1.0, 0.0), 5)
     assert {type(each) for each in (*pose.position, *pose.orientation)} == {float}
+    assert Pose(orientation=[Decimal(0), Decimal(0), Decimal(2), Decimal(0)]).orientation == (0.0, 0.0, 1.0, 0.0)  # type: ignore[list-item]
     assert type(pose.time_ns) is int

@@ -1,4 +1,7 @@
-"""These functions make texts that the log can hold from exceptions and from values whose code may raise anything."""
+"""Describe exceptions and arbitrary values as texts, also if their `__str__` or `__repr__` raises.
+
+Methods of `str` are called as `str.method(text)`, so that those of a user's subclass do not run.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +11,19 @@ from typing import Any
 __all__ = ["clean", "clean_repr", "cut", "message_of", "reading_fault"]
 
 _REPR_MAX = 200
-"""Bounds the characters of a repr that stands for a missing value; enough to recognise the value."""
+"""Bounds the characters of a repr that is recorded in place of a value; enough to recognise the value."""
 _TEXT_MAX = 150
-"""Bounds the characters of a text inside a repr, below `_REPR_MAX` so that the mark with its full length fits."""
+"""Bounds the characters of a text inside a repr; below `_REPR_MAX`, so that the mark with the text's length fits."""
 
 
 def reading_fault(error: BaseException) -> str:
-    """Describe why a value is missing if the value's own code raised `error`."""
+    """Return the reason why a value was not recorded, if reading the value raised `error`."""
     message = cut(clean(message_of(error)), _REPR_MAX)
     return f"reading it raised {type(error).__name__}{': ' if message else ''}{message}"
 
 
 def message_of(failure: BaseException) -> str:
-    """Return the message of an exception. Never raises anything but `KeyboardInterrupt`."""
+    """Return the message of an exception. Raises nothing except `KeyboardInterrupt`."""
     try:
         return str(failure)
     except KeyboardInterrupt:
@@ -30,12 +33,12 @@ def message_of(failure: BaseException) -> str:
 
 
 def clean(text: str) -> str:
-    """Replace U+0000 and lone surrogates, which the log cannot hold, by escapes."""
+    """Replace U+0000 and lone surrogates, which no event can hold, with escapes."""
     return str.replace(text, "\x00", "\\x00").encode("utf-8", "backslashreplace").decode()
 
 
 def cut(text: str, characters_max: int) -> str:
-    """Shorten a text to `characters_max` characters; a shortened text ends with a mark that gives its full length."""
+    """Truncate a text after `characters_max` characters and append a mark that gives its full length."""
     return text[:characters_max] + _cut_mark(len(text), "characters", characters_max)
 
 
@@ -44,16 +47,16 @@ def _cut_mark(length: int, unit: str, length_max: int = _TEXT_MAX) -> str:
 
 
 def clean_repr(value: Any) -> str:
-    """Return a shortened repr without building the whole repr of a large container.
+    """Return a shortened repr; a large list, tuple, set or dict is not represented as a whole first.
 
-    Never raises anything but `KeyboardInterrupt`.
+    Raises nothing except `KeyboardInterrupt`.
     """
     text = clean(_Brief().repr(value))
     return text if len(text) <= _REPR_MAX else f"{text[:_REPR_MAX]}…"
 
 
 class _Brief(Repr):
-    """The standard library's bounded repr, extended to bytes and subclasses of str; it names a repr that raises."""
+    """The standard library's bounded repr, also of bytes and subclasses of str. Names a type whose repr raises."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,12 +72,13 @@ class _Brief(Repr):
             if isinstance(x, str) and type(x).__repr__ is str.__repr__:
                 return repr(str.__getitem__(x, slice(_TEXT_MAX))) + _cut_mark(str.__len__(x), "characters")
             if isinstance(x, bytes | bytearray):
-                return repr(bytes(x[:_TEXT_MAX])) + _cut_mark(len(x), "bytes")
+                kind = bytes if isinstance(x, bytes) else bytearray
+                return repr(kind(x[:_TEXT_MAX])) + _cut_mark(len(x), "bytes")
             return super().repr1(x, level)
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # noqa: BLE001  a user's __repr__ may raise anything
             return f"<a {type(x).__name__} whose repr raised {type(error).__name__}>"
 
-    def repr_instance(self, x: Any, level: int) -> str:  # noqa: ARG002  the signature of `Repr`
+    def repr_instance(self, x: Any, level: int) -> str:  # noqa: ARG002  `Repr` gives the signature
         return str.__str__(repr(x))

@@ -1,12 +1,12 @@
-"""Put events from any thread into a recorder's live queue; read them back and acknowledge them in the writer's task.
+"""A recorder's live queue: any thread puts events; one task of the writer reads and acknowledges them.
 
-`put_nowait` copies one frame into a mapped file under a lock. It makes no system call, so it neither waits for a disk
-nor releases the interpreter lock. On return the event is *written*: it survives `kill -9`. The sync thread makes it
-*synced*, and only then `get_batch` supplies it; `acknowledge` makes it *stored*.
+`put_nowait` copies one frame into a mapped file under a lock. It writes to no file descriptor, so it does not wait for
+a disk. On return the event is *written*: it survives `kill -9`. The sync thread makes it *synced*, and only then does
+`get_batch` return it; `acknowledge` makes it *stored*.
 
-After a failed sync the queue refuses every event with the disk's error (`queue_files.py`), and supplies the events
-synced before. It does not continue in a new file, because that would need a second copy of all unsynced records; a new
-recorder does not. Where the files themselves were deleted or replaced, the mapping is that copy, and the queue moves
+After a failed sync the queue refuses every new event with the disk's error (`queue_files.py`), and still supplies the
+events synced before. It cannot continue in a new file, because it has no second copy of the unsynced records. If the
+files were deleted or replaced instead, the mapped memory is such a copy, and the queue moves to another folder
 (`relocation.py`).
 """
 
@@ -36,24 +36,24 @@ from pycrorm_async.settings import Settings
 __all__ = ["RecorderQueue"]
 
 _LAST_SYNC_S = 30.0
-"""Bounds the wait of `release` for the last sync."""
+"""Bounds the time that `release` waits for the last sync; a disk that takes longer has failed."""
 _log = logging.getLogger("pycrorm_async")
 _WAIT_WARNING_S = 2.0
-"""A plan that waits longer than this for space logs a warning, once per wait."""
+"""`room` logs one warning if it waits longer than this."""
 
 
 class RecorderQueue(QueueFiles):
-    """An asyncio queue whose items survive the process. Constructed by `create`, for one recorder in one process.
+    """A queue whose items survive the process; `create` makes it, for one recorder in one process.
 
-    Producers are any threads and tasks. The consumer is one task of one loop, possibly of another thread; it takes the
-    lock `drain` with its first `get_batch`. A queue that is `offered` has its consumer in another process
-    (`sources/live_source.py`), which reports its stored and folded positions in the file `progress`.
+    Any thread or task may put. The consumer is one task of one event loop, in any thread; its first `get_batch` takes
+    the file lock `drain`. If the queue is `offered`, the consumer is in another process (`sources/live_source.py`) and
+    reports in the file `progress` how far it has stored and folded.
     """
 
     def __init__(
         self, *, folder: Path, recorder: bytes, settings: Settings, clock: Clock, alive: FileLock, offered: bool
     ) -> None:
-        """For `create`, which creates and locks the folder. Raises `SpoolUnavailable`."""
+        """Use `create`, which makes and locks the folder first. Raises `SpoolUnavailable`."""
         super().__init__(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
         self._source = OwnSource(self, self._notifier)
         call_in_forked_child(self._abandon)
@@ -65,10 +65,10 @@ class RecorderQueue(QueueFiles):
     ) -> RecorderQueue:
         """Create a queue in its own folder below `spool`; `recorder`, a UUIDv7, names the folder.
 
-        With `offered` another process drains it. Raises `SpoolUnavailable` if the folder cannot be created or written,
-        and `CallerError` for contradictory settings. Blocks for the few milliseconds of allocating the first segment.
+        If `offered`, another process drains it. Raises `SpoolUnavailable` if the folder cannot be created or written,
+        and `CallerError` for contradictory settings. Blocks for a few milliseconds to allocate the first segment.
         """
-        Capacity.of(settings)
+        Capacity.of(settings)  # raises for contradictory settings before anything is created
         folder, alive = make_folder(spool, episode_text(recorder), settings.file_access)
         try:
             return cls(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
@@ -83,12 +83,19 @@ class RecorderQueue(QueueFiles):
     def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
-        From any thread, but not from a signal handler, which may interrupt the holder of the lock. Raises `SpoolFull`
-        if less than the reserve would stay free, with `reserved` if no space is left, and after `fail` `SpoolStuck`
-        instead; `SpoolClosed` after `close` and in a forked child; `SpoolUnavailable` after the disk failed;
-        `EpisodeRefused` for a start when no more open episodes fit into a segment's header; `InternalError` for events
-        that our hooks never put: an event outside its episode's `EpisodeStarted` and `EpisodeEnded`, which has no
-        sequence, and a record above `record_bytes_max` that no segment can hold. A refused event leaves no gap.
+        May be called from any thread, but not from a signal handler, which could interrupt the holder of the lock. A
+        refused event leaves no gap in the sequences.
+
+        Args:
+            reserved: the event may use the reserve (`spool_reserve_bytes`), which other events leave free.
+
+        Raises:
+            SpoolFull: the event does not fit; `SpoolStuck` instead after `fail`.
+            SpoolClosed: after `close`, and in a forked child.
+            SpoolUnavailable: the disk failed.
+            EpisodeRefused: for an `EpisodeStarted`, if the header of a segment cannot list one more open episode.
+            InternalError: an event before its `EpisodeStarted` or after its `EpisodeEnded`, or a record above
+                `record_bytes_max` that no segment can hold. The hooks put neither.
         """
         try:
             return self._appender.put(heading, payload, reserved)
@@ -97,11 +104,11 @@ class RecorderQueue(QueueFiles):
 
     @property
     def full(self) -> bool:
-        """True if an ordinary event as large as the largest refused one would be refused now."""
+        """True if an event that is not reserved, as large as the largest one refused so far, would be refused now."""
         return not self._appender.admits_again(reserved=False)
 
     async def room(self) -> None:
-        """Wait until such an ordinary event fits again, or until the queue refuses all events.
+        """Wait until the queue is not `full`, or until it refuses all events.
 
         Raises `SpoolStuck` when waiting cannot help, because draining has stopped (`fail`).
         """
@@ -120,9 +127,10 @@ class RecorderQueue(QueueFiles):
         )
 
     def block_until_room(self, timeout_s: float) -> bool:
-        """Block this thread until a reserved event fits; False after `timeout_s`. Raises `SpoolStuck` as `room` does.
+        """Block this thread until a reserved event fits or the queue refuses all events; False after `timeout_s`.
 
-        Returns False at once in the sync thread, which frees the space: a finalizer there may end a plan.
+        Raises `SpoolStuck` as `room` does. Returns False at once in the sync thread, which frees the space: a finalizer
+        that runs there may end a plan, and with it record an event.
         """
         if self._sync_thread.is_this_thread:
             return False
@@ -149,30 +157,34 @@ class RecorderQueue(QueueFiles):
 
     @property
     def is_drained(self) -> bool:
-        """True if this or another process drains the queue now."""
+        """True if a task of this process or another process is draining the queue now."""
         with wrap_os_errors(self.folder):
             return self._source.drains or is_locked(self.folder / DRAIN)
 
     @property
     def declarations_unrepeated(self) -> int:
-        """Number of declarations too large to be repeated in later segments."""
+        """Number of type declarations too large to be repeated at the start of later segments."""
         return self._appender.declarations.unrepeated
 
     @property
     def bytes_spooled(self) -> int:
-        """Bytes of segments that are not deleted; the current one counts up to its last frame."""
+        """Bytes of all segments not deleted yet; the current one counts up to the end of its last frame."""
         return self._appender.bytes_held
 
     async def synced_to(self, position: int | None = None) -> None:
         """Wait until the records up to this position, by default all written ones, are synced.
 
-        From any loop; all waiters share one sync. Raises `SpoolUnavailable` if the disk failed, and if the files were
-        deleted or replaced meanwhile; the next call succeeds when the queue has moved. A later call raises a loss of
-        records, once. Raises `SpoolClosed` in a forked child.
+        May be called from any event loop; concurrent calls share one sync.
+
+        Raises:
+            SpoolUnavailable: the disk failed before they were synced; or the files were deleted or replaced, and a
+                later call succeeds once the queue has moved. If the move lost records, one call raises an error that
+                names them.
+            SpoolClosed: in a forked child, for records that were not synced before the fork.
         """
         target = self.written if position is None else position
         setbacks, checks = self._setbacks, self._checks
-        if self._synced >= target and not self._closed:  # no sync will compare the files, so do it here
+        if self._synced >= target and not self._closed:  # no sync would notice deleted files
             must_check = self._displaced is not None or self._missing(self._appender.segments) is not None
         else:
             must_check = self._displaced is not None
@@ -197,17 +209,17 @@ class RecorderQueue(QueueFiles):
     # --- the consumer ------------------------------------------------------------------------------------------
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
-        """Return the next synced records in order, at least one, within the limits (a larger record comes alone).
+        """Return the next synced records in order, within the limits; a record above the limits is returned alone.
 
         Waits for the first record, then at most `age_s_max` for more; `bytes_max` counts payloads. Returns an empty
-        list once the queue is closed and drained. For a queue that is not offered. After a cancelled call the next one
-        returns the same records. After a failed sync returns the records synced before, then raises
-        `SpoolUnavailable`; raises it also while another process drains this queue.
+        list only once the queue is closed and all its records were supplied. Must not be called on an offered queue.
+        After a cancelled call the next one returns the same records. After a failed sync returns the records synced
+        before, then raises `SpoolUnavailable`; raises it also while another process drains this queue.
         """
         return await self._source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
 
     async def acknowledge(self, position: int) -> None:
-        """Note that records up to this position are durable in the database, which frees their segments."""
+        """Mark the records up to this position as stored in the database; the sync thread frees their segments."""
         assert position <= self._source.reader.cursor.position, "only supplied records can be acknowledged"
         if self._log_id is None:
             with contextlib.suppress(FilesError):
@@ -217,25 +229,30 @@ class RecorderQueue(QueueFiles):
             self._sync_thread.hurry()
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
-        """Keep refused records as dead letters (`sources/dead_letters.py`), durable on return; return True.
+        """Keep records that the database refused as dead letters (`sources/dead_letters.py`); return True.
 
-        From one thread at a time; blocks. Raises `FilesError` or `SpoolDamaged`; then the records must stay here.
+        They are durable on return. Called by one thread at a time; blocks. Raises `FilesError` or `SpoolDamaged`; then
+        the caller must not acknowledge the records.
         """
         self._source.dead_letter(records)
         return True
 
     def fail(self, reason: str) -> None:
-        """Note that no more records will be acknowledged. From any thread; the first reason stays.
+        """State that no more records will be acknowledged, and why; the first reason is kept.
 
-        Events that fit are still accepted; a call that waits for space, now or later, raises `SpoolStuck`.
+        May be called from any thread. Events that fit are still accepted; waiting for space that does not come raises
+        `SpoolStuck`, now or later.
         """
-        self._appender.stuck = self._appender.stuck or reason
+        appender = None
+        while appender is not self._appender:  # the sync thread may replace it meanwhile
+            appender = self._appender
+            appender.stuck = appender.stuck or reason
         self._room_notifier.notify_all()
 
     # --- the end -----------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Refuse more events and sync the last ones; `get_batch` supplies the rest, then returns an empty list."""
+        """Refuse further events and request the last sync; `get_batch` supplies the rest, then an empty list."""
         if self._closed:
             return
         appender = None
@@ -250,8 +267,9 @@ class RecorderQueue(QueueFiles):
     def release(self) -> None:
         """Close the queue, wait for the last sync, and release files and locks. Idempotent.
 
-        Deletes the folder if all its records are acknowledged and no episode is open; otherwise leaves a dead folder to
-        be recovered. Blocks; raises `SpoolUnavailable` if the last sync takes more than 30 s.
+        Deletes the folder if all its records are stored, no episode is open and no file was lost; otherwise leaves the
+        folder for recovery. Blocks. Raises `SpoolUnavailable` if the last sync takes more than 30 s; then the queue
+        keeps its locks, and the call may be repeated.
         """
         if self._released:
             return
@@ -275,7 +293,7 @@ class RecorderQueue(QueueFiles):
                 lock.release()
 
     def _keep_last_segments(self) -> None:
-        """Move the last segments, whose records are all stored, to the kept ones. No file is mapped any more."""
+        """Keep the last segments, whose records are all stored, for a database that goes back. Needs unmapped files."""
         if self.written:
             *full, last = self._appender.begun
             for segment in full:
@@ -283,7 +301,7 @@ class RecorderQueue(QueueFiles):
             self._stored_segments.keep(last.path, length=self._appender.end)
 
     def _abandon(self) -> None:
-        """Detach in a forked child: the queue belongs to the parent. The copies of the locks close by themselves."""
+        """Detach in a forked child: the queue belongs to the parent. The locks close their own copies there."""
         self._closed = self._released = True
         self._failure = SpoolClosed(f"queue {self.name} belongs to the process that forked this one")
         failure = self._failure
