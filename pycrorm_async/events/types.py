@@ -135,13 +135,15 @@ class RefusalValue(_Value, frozen=True):
 
 
 class SeenValue(_Value, frozen=True):
-    """A perceived object and its visible share, 0 to 1 (None: not measured)."""
+    """A percept; `object` is None if it matches no object, `source` if it has that of its `ObjectDetected`."""
 
     name: str
     object_type: str
     pose: PoseValue
     object: ObjectReference | None = None
     visible: float | None = None
+    confidence: float | None = None
+    source: str | None = None
 
 
 class NodeReference(_Value, frozen=True):
@@ -240,8 +242,7 @@ class DesignatorTypeDeclared(Happening, frozen=True):
 class ObjectAdded(Happening, frozen=True):
     """An object entered the world. The event's sequence identifies the object in this episode.
 
-    `joints` are in rad or m. `node` is the node that added the object; None if no node did, or if the object was in the
-    world before the episode.
+    `joints` are in rad or m. `node` added the object; None if none did, or if it was in the world before the episode.
     """
 
     name: str
@@ -300,8 +301,7 @@ class NodeStarted(Happening, frozen=True):
     Attributes:
         kind: root, action, motion, language.
         parent: the parent's sequence; None for the root.
-        designator: fingerprint of the `DesignatorTypeDeclared`; None for the root, and for a node whose class cannot be
-            declared.
+        designator: fingerprint of the `DesignatorTypeDeclared`; None for the root, and if its class cannot be declared.
         parameters: by `FieldDeclared.name`: scalars; enum members by name; datetimes as RFC 3339 in UTC with µs;
             poses as `PoseValue`; objects as `ObjectReference` or `ObjectValue`; lists and dicts of these; a
             `MissingValue` for a value that cannot be recorded and for a field that the declaration omits.

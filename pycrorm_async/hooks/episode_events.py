@@ -24,6 +24,7 @@ from pycrorm_async.hooks.values.texts import clean
 from pycrorm_async.hooks.values.value_snapshot import References, pose_value
 from pycrorm_async.plan.exceptions import is_plan_failure
 from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
+from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["EpisodeOpening", "episode_started", "location_resolved", "object_detected", "end_statuses"]
@@ -90,17 +91,22 @@ def object_detected(
     node: int | None,
 ) -> ObjectDetected:
     """Build the event of a result of perception; `node` is the sequence of the node that asked for it."""
-    values = tuple(
-        SeenValue(
-            clean(each.thing.name),
-            each.thing.object_type.name,
-            pose_value(each.thing.pose),
-            references.reference(each.thing),
-            each.visible,
-        )
-        for each in seen
-    )
+    values = tuple(_seen_value(each, references) for each in seen)
     return ObjectDetected(source, object_type.name if object_type is not None else None, values, node)
+
+
+def _seen_value(seen: Seen, references: References) -> SeenValue:
+    thing = seen.thing
+    world_object = thing.world_object if isinstance(thing, ObjectDesignator) else thing
+    return SeenValue(
+        clean(thing.name),
+        thing.object_type.name,
+        pose_value(seen.pose if seen.pose is not None else thing.pose),
+        references.reference(world_object) if world_object is not None else None,
+        seen.visible,
+        float(seen.confidence) if seen.confidence is not None else None,  # perception often computes a numpy.float32
+        clean(seen.source) if seen.source is not None else None,
+    )
 
 
 def end_statuses(failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:

@@ -16,13 +16,17 @@ __all__ = ["Detection", "StateSample"]
 
 
 class Detection(Base):
-    """A perceived object. All objects of one detection share their `id`; the best visible has `position` 0.
+    """A percept. All percepts of one detection share their `id`; the best has `position` 0.
 
     Attributes:
-        source: `camera`, or `world_state` where the world's own state was read.
+        source: `camera`, or `world_state` where the world's own state was read; the sensor or method instead, if the
+            robot's perception named one.
         looked_for: the requested type; None for any.
         visible: the visible share of the object, 0 to 1; None without a camera.
-        object: its row at that moment; x to frame is its pose then.
+        confidence: the confidence that the robot's perception computed; None if it computed none.
+        object: the row of the object of the world at that moment; None for a hypothesis or a false positive, which
+            matches none.
+        x, y, z, qx, qy, qz, qw, frame: the perceived pose.
         node: the node that performed the detection.
     """
 
@@ -46,6 +50,7 @@ class Detection(Base):
     qw: Mapped[float]
     frame: Mapped[str]
     visible: Mapped[float | None]
+    confidence: Mapped[float | None]
     time: Mapped[datetime]
 
     node: Mapped[TaskTreeNode | None] = relationship(viewonly=True, lazy="selectin")

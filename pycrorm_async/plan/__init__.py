@@ -46,6 +46,7 @@ from pycrorm_async.plan.actions.manipulation import (
 from pycrorm_async.plan.actions.transport import DetectActionPerformable, TransportActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract, BaseMotion, Designator
 from pycrorm_async.plan.errors import NoRobotChosen, NoRobotHere, PerformNotAsync, ResolutionError
+from pycrorm_async.plan.execution.observer import Seen
 from pycrorm_async.plan.execution.simulation import SimulatedTaskTree
 from pycrorm_async.plan.failures import IKError, PlanFailure, PlanFailures
 from pycrorm_async.plan.language.expressions import Code, Parallel, Repeat, Sequential, TryAll, TryInOrder
@@ -114,6 +115,7 @@ __all__ = [
     "ProcessModules",
     "MovingModules",
     "ChosenRobot",
+    "Seen",
     "collected_tree",
     "CollectedTree",
     "SimulatedTaskTree",

@@ -314,18 +314,18 @@ def test_what_was_seen_is_a_row_each_best_first() -> None:
     root = script.put(NodeStarted("root"))
     seen = (
         SeenValue("milk", "MILK", pose(1, 2, 3), ObjectReference(milk, milk), 0.75),
-        SeenValue("ghost", "MILK", pose(4, 5, 6)),
+        SeenValue("ghost", "MILK", pose(4, 5, 6), confidence=0.25, source="stereo"),
     )
     script.put(ObjectDetected("camera", "MILK", seen, root))
     script.put(ObjectDetected("world_state", None))
     assert rows_of(script)["detection"] == [
         (
             row(3), 0, 1, row(2), "camera", "MILK", row(1), "milk", "MILK",
-            1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, "map", 0.75, time_us(3),
+            1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, "map", 0.75, None, time_us(3),
         ),
         (
-            row(3), 1, 1, row(2), "camera", "MILK", None, "ghost", "MILK",
-            4.0, 5.0, 6.0, 0.0, 0.0, 0.0, 1.0, "map", None, time_us(3),
+            row(3), 1, 1, row(2), "stereo", "MILK", None, "ghost", "MILK",
+            4.0, 5.0, 6.0, 0.0, 0.0, 0.0, 1.0, "map", None, 0.25, time_us(3),
         ),
     ]  # fmt: skip
 

@@ -87,7 +87,11 @@ def _round(script: Script, root: int, robot: int, *, simulated: bool) -> None:
     put(LocationResolved("CostmapLocation", candidates, 0, 10, drive, (RefusalValue(pose(3, 1), "hidden"),)))
     moved = put(ObjectMoved(robot, "pr2", "ROBOT", pose(1, 1), drive))
     put(NodeEnded(drive, "SUCCEEDED", result={"metres": 2}))
-    seen = (SeenValue("milk", "MILK", pose(1), it, 0.5), SeenValue("jug", "JUG", pose(2)))
+    seen = (
+        SeenValue("milk", "MILK", pose(1), it, 0.5),
+        SeenValue("jug", "JUG", pose(2)),
+        SeenValue("jug?", "JUG", pose(3), confidence=0.25, source="stereo"),
+    )
     put(ObjectDetected("camera", "MILK", seen, root))
     given = {"object_designator": it, "arm": "LEFT", "grasp": "TOP"}
     pick = put(NodeStarted("action", root, name_of(PICK_UP), given, state, simulated=simulated))

@@ -171,7 +171,9 @@ async def test_a_memory_of_the_first_version_shows_what_it_held_and_its_spool_is
     assert ask(every_event, "SELECT joint, position FROM joint_change") == [("torso_lift_joint", 1e-9)]
     assert ask(every_event, "SELECT object_id FROM object_removal") == [(id_of(1, 12),)]
     assert ask(every_event, "SELECT channel, value FROM state_sample") == [("base.x", 0.6)]
-    assert ask(every_event, "SELECT name, visible FROM detection") == [("milk", 0.75)]
+    assert ask(every_event, "SELECT name, source, visible, confidence FROM detection") == [
+        ("milk", "camera", 0.75, None)
+    ]
     assert ask(every_event, "SELECT considered, offered, taken FROM location_resolution") == [(17, 2, 0)]
     assert ask(every_event, "SELECT x, arms, grasp FROM location_candidate ORDER BY position") == [
         (0.5, "LEFT,RIGHT", "FRONT"), (0.6, "", None),

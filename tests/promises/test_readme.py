@@ -32,7 +32,7 @@ def python_of(page: str) -> list[str]:
 
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
-[TIDY] = python_of("pycrorm_async/plan/README.md")
+TIDY, STEREO = python_of("pycrorm_async/plan/README.md")
 COURSE, BEGAN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 [BETTER] = python_of("pycrorm_async/learning/README.md")
 
@@ -84,6 +84,18 @@ def test_the_plan_that_says_all_a_plan_can_say_runs_and_the_milk_is_where_it_sha
         question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'milk' ORDER BY object.id"
         *_, resting = plain.execute(question).fetchall()
     assert resting == pytest.approx((1.3, 0.45, 0.95), abs=1e-6)
+
+
+def test_what_a_robot_of_ones_own_perceives_is_in_the_table(tmp_path: Path) -> None:
+    (tmp_path / "stereo.py").write_text(STEREO)
+    done = pycrorm("run", "stereo.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
+        question = "SELECT name, x, confidence, source, object_id IS NULL FROM detection ORDER BY position"
+        assert plain.execute(question).fetchall() == [
+            ("milk", 1.31, 0.92, "stereo", 0),
+            ("milk?", 1.2, 0.31, "stereo", 1),
+        ]
 
 
 async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -121,12 +121,27 @@ def fit_resolution(resolved: LocationResolved, bytes_max: int) -> LocationResolv
 
 
 def fit_detection(detected: ObjectDetected, bytes_max: int) -> ObjectDetected:
-    """Shorten the texts of a detection, then drop the least visible objects until the event fits."""
+    """Fit a detection: shorten its texts and drop non-finite numbers, then drop the last percepts until it fits.
+
+    A percept with a non-finite pose is dropped.
+    """
     shorter = clean_texts(detected)
     assert isinstance(shorter, ObjectDetected)
+    shorter = replace(
+        shorter,
+        seen=tuple(
+            replace(each, visible=_finite(each.visible), confidence=_finite(each.confidence))
+            for each in shorter.seen
+            if _is_finite(each.pose)
+        ),
+    )
     while shorter.seen and not fits(shorter, bytes_max):
         shorter = replace(shorter, seen=shorter.seen[: len(shorter.seen) // 2])
     return shorter
+
+
+def _finite(number: float | None) -> float | None:
+    return number if number is not None and math.isfinite(number) else None
 
 
 def _is_finite(pose: PoseValue, height: float | None = None) -> bool:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
-from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
 if TYPE_CHECKING:
+    from pycrorm_async.plan.object_designators import ObjectLike
     from pycrorm_async.plan.task_tree import TaskTreeNode
     from pycrorm_async.world.bullet import BulletWorld
 
@@ -46,10 +46,25 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """A perceived object and its visible share, 0 to 1 (None if visibility was not computed)."""
+    """A percept: an object that perception reports, whether or not the world has it.
 
-    thing: Object
+    >>> Seen(milk, pose=Pose([1.31, 1, 0.9]), confidence=0.92, source="stereo")
+    >>> Seen(BelieveObject("cup?", ObjectType.JEROEN_CUP, Pose([1.2, 0.4, 0.9])), confidence=0.31, source="stereo")
+
+    Attributes:
+        thing: the object of the world that the percept matches; a `BelieveObject` if it matches none, which may be a
+            hypothesis or a false positive.
+        visible: the visible share of the object, 0 to 1; None if it was not computed.
+        pose: the perceived pose; None means the pose of `thing`.
+        confidence: the confidence as the robot's perception computed it; None if it computed none.
+        source: name of the sensor or method; None means the source of the whole detection.
+    """
+
+    thing: ObjectLike
     visible: float | None = None
+    pose: Pose | None = None
+    confidence: float | None = None
+    source: str | None = None
 
 
 class Simulation:

@@ -33,7 +33,10 @@ SEEN_SHARE_MIN = 0.8
 async def report_perception(
     looking: Awaitable[Sequence[Seen]], *, source: Source, object_type: ObjectType
 ) -> ObjectDesignator:
-    """Report a perception to the observer, also an empty one, and return the best detection.
+    """Report a perception to the observer, also an empty one, and return the designator of the first percept.
+
+    That is the designator of the world object that it matches, with the object's pose in the world, or a
+    `BelieveObject` with the perceived pose.
 
     Raises:
         PerceptionObjectNotFound: no object was perceived.

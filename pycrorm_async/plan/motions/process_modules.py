@@ -68,7 +68,9 @@ class MovingModules(Protocol):
 class ProcessModules(MovingModules, Protocol):
     """All motions, including the optional ones: perceiving, opening and closing.
 
-    Perceiving returns the detections, the most visible first, or raises `PerceptionObjectNotFound` with the reason.
+    Perceiving returns the percepts, the best first, or raises `PerceptionObjectNotFound` with the reason. All are
+    recorded, and the motion returns the first. A percept that matches no object of the world is a `Seen` of a
+    `BelieveObject`.
     """
 
     async def detecting(self, motion: DetectingMotion) -> Sequence[Seen]: ...

@@ -272,18 +272,21 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
 
 def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators: Designators, rows: Rows) -> None:
     own, number = _own(event)
-    request = (number, _node(event, detected.node), detected.source, detected.object_type)
-    time = microseconds(event.wall_ns)
+    node, time = _node(event, detected.node), microseconds(event.wall_ns)
     detections = [  # complete before any row is added, because `row` may raise
         (
             own,
             rank,
-            *request,
+            number,
+            node,
+            each.source if each.source is not None else detected.source,
+            detected.object_type,
             row(number, each.object.row) if each.object is not None else None,
             each.name,
             each.object_type,
             *pose_columns(each.pose),
             each.visible,
+            each.confidence,
             time,
         )
         for rank, each in enumerate(detected.seen)

@@ -188,6 +188,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "obj_type": "text",
         **_POSE,
         "visible": "real",
+        "confidence": "real",
         "time": "time",
     },
     "state_sample": {
