@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from sqlalchemy import BigInteger, Boolean, Double, ForeignKey, Text, inspect
 from sqlalchemy.ext.asyncio import AsyncAttrs
-from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship
+from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship, synonym
 
 from pycrorm_async.orm.types import EnumName, Moment
 from pycrorm_async.task_status import TaskStatus
@@ -60,7 +60,7 @@ class ProcessMetaData(Base):
     created_by: Mapped[str]
     description: Mapped[str]
     version: Mapped[str]
-    """The version of the software that recorded it."""
+    """The version of the software that recorded it; `pycram_version`, the thesis' name, is the same."""
     host: Mapped[str]
     python: Mapped[str]
     plan: Mapped[str | None]
@@ -80,6 +80,8 @@ class ProcessMetaData(Base):
     """UUID of the episode that this one continues, because that one came near its last possible sequence."""
     continued_in: Mapped[str | None]
     """UUID of the episode that continues this one."""
+
+    pycram_version: Mapped[str] = synonym("version")
 
 
 class Position(Base):

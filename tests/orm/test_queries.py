@@ -163,6 +163,12 @@ async def test_the_episode_says_who_did_what_and_how_it_ended(log: EventLog, scr
     )
 
 
+async def test_the_version_of_an_episode_answers_to_the_name_of_the_thesis(log: EventLog, script: Script) -> None:
+    (metadata,) = await every(log, select(ProcessMetaData).where(ProcessMetaData.pycram_version == "1.0"))
+    assert metadata.pycram_version == metadata.version == "1.0"
+    assert await every(log, select(ProcessMetaData.pycram_version)) == ["1.0"]
+
+
 async def test_a_navigation_knows_where_from_and_where_to(log: EventLog, script: Script) -> None:
     (drive,) = await every(log, select(NavigateAction))
     assert (drive.id, drive.dtype, drive.kind) == (row(6), "NavigateAction", "action")
@@ -400,6 +406,21 @@ async def test_a_failure_is_shown_where_it_began_with_path_object_arm_and_messag
     assert (plan.arm, plan.message, plan.recovered) == (None, "no table", False)
     lost = select(RootFailure.path).where(~RootFailure.recovered, RootFailure.object == "handle")
     assert await every(log, lost) == ["root > OpenAction"]
+
+
+async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: EventLog) -> None:
+    script = Script()
+    put = script.put
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    seen = {"object_designator": ObjectReference(milk, milk), "arm": "RIGHT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", None, name_of(PICK_UP), seen))
+    handle = {"object_designator": ObjectValue("ObjectPart", "handle"), "arm": "LEFT"}
+    opening = put(NodeStarted("action", pick, name_of(OPEN), handle))
+    for node in (opening, pick):
+        put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
+    await stored_and_folded(log, [*declarations(PICK_UP, OPEN), *script.records])
+    (failure,) = await every(log, select(RootFailure))
+    assert (failure.path, failure.object, failure.arm) == ("PickUpAction > OpenAction", "handle", Arms.LEFT)
 
 
 async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import builtins
+import contextlib
+import sqlite3
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -31,7 +33,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms
-from tests.databases import in_a_loop_of_its_own
+from tests.databases import ask, in_a_loop_of_its_own
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
@@ -224,6 +226,23 @@ async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Readin
     frame = await reading.dataframe(select(Pose.id, Object.id).join(Object.pose).order_by(Pose.id))
     assert list(frame.columns) == ["id", "id_1"]
     assert frame.id.tolist() == frame.id_1.tolist() == [row(3), row(3, number=2)]
+
+
+async def test_enums_are_the_same_text_in_a_frame_and_in_sql_by_hand(
+    reading: Reading, recorded: DatabaseAddress
+) -> None:
+    columns = PickUpAction.arm, PickUpAction.grasp, Object.obj_type, PickUpAction.status
+    question = select(*columns).join(PickUpAction.object).order_by(PickUpAction.id)
+    frame = await reading.dataframe(question)
+    assert frame.values.tolist() == [["LEFT", "TOP", "MILK", "FAILED"]] * 2
+    by_hand = (
+        "SELECT arm, grasp, obj_type, status FROM pick_up_action JOIN designator USING (id)"
+        " JOIN object ON object.id = object_designator_id ORDER BY pick_up_action.id"
+    )
+    assert ask(str(recorded), by_hand) == [tuple(each) for each in frame.values]
+    if str(recorded).startswith("sqlite"):  # the only one with a driver that pandas can use here
+        with contextlib.closing(sqlite3.connect(str(recorded).removeprefix("sqlite:///"))) as plain:
+            assert pd.read_sql(by_hand, plain).equals(frame)
 
 
 async def test_a_frame_counts_groups_and_takes_aliases(reading: Reading) -> None:
