@@ -6,18 +6,23 @@ object, so that reading an attribute never waits for the database.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from typing import Any, ClassVar
 
 from sqlalchemy import BigInteger, Boolean, Double, ForeignKey, Text, inspect
+from sqlalchemy.exc import MissingGreenlet, StatementError
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship, synonym
+from sqlalchemy.orm.exc import DetachedInstanceError
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.orm.types import EnumName, Moment
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
 
-__all__ = ["Base", "ProcessMetaData", "Position", "Quaternion", "Pose", "RobotState"]
+__all__ = ["Base", "named_if_unloaded", "ProcessMetaData", "Position", "Quaternion", "Pose", "RobotState"]
 
 
 class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
@@ -44,6 +49,21 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
         ]
         shown = ", ".join(f"{name}={state.dict[name]!r}" for name in names if state.dict.get(name) is not None)
         return f"{type(self).__name__}({shown})"
+
+
+@contextmanager
+def named_if_unloaded(row: Base, name: str) -> Iterator[None]:
+    """Raise `CallerError` with the remedy where a relationship that is not loaded is read without awaiting it."""
+    try:
+        yield
+    except (StatementError, MissingGreenlet, DetachedInstanceError) as error:
+        if isinstance(error, StatementError) and not isinstance(error.orig, MissingGreenlet):
+            raise
+        class_, key = type(row).__name__, inspect(row).identity
+        raise CallerError(
+            f"{name} of {class_} {key} is not loaded: in its session use `await row.awaitable_attrs.{name}`,"
+            f" or select with `selectinload({class_}.{name})`"
+        ) from None
 
 
 class ProcessMetaData(Base):

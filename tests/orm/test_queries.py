@@ -11,6 +11,7 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
+from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
@@ -237,6 +238,46 @@ async def test_one_node_alone_has_its_parent_loaded(log: EventLog, script: Scrip
     (node,) = await every(log, select(TaskTreeNode).where(TaskTreeNode.id == row(8)))
     assert node.parent.id == row(6)
     assert node.parent.action.robot_state.pose.position.x == 0.5
+
+
+async def test_a_node_has_children_and_ancestors(log: EventLog, script: Script) -> None:
+    async with AsyncSession(log.engine) as session:
+        move = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.id == row(8)))).one()
+        ancestors = await move.awaitable_attrs.ancestors
+        assert [each.id for each in ancestors] == [row(6), row(2)]
+        children = await ancestors[1].awaitable_attrs.children
+        assert [each.id for each in children] == [row(6), row(11), row(15), row(16)]
+        assert [each.id for each in ancestors[1].children] == [row(6), row(11), row(15), row(16)]
+        assert await move.awaitable_attrs.children == []
+        around = select(TaskTreeNode.id).where(TaskTreeNode.children.any(dtype="MoveMotion"))
+        assert (await session.scalars(around)).all() == [row(6)]
+        milk = (await session.scalars(select(Object).where(Object.id == row(12)))).one()
+        assert (await milk.awaitable_attrs.node).action.dtype == "PickUpAction"
+    drive, root = row(6), row(2)
+    question = select(TaskTreeNode).where(TaskTreeNode.id == root).options(selectinload(TaskTreeNode.children))
+    (node,) = await every(log, question)
+    assert (node.children[0].id, node.children[0].action.dtype) == (drive, "NavigateAction")
+    moved = await every(log, select(Object).options(selectinload(Object.node)).order_by(Object.id))
+    assert [each.node and each.node.id for each in moved if each.name == "milk"] == [None, row(11)]
+
+
+@pytest.mark.parametrize(
+    ("class_", "sequence", "name"),
+    [(TaskTreeNode, 2, "children"), (TaskTreeNode, 8, "ancestors"), (Object, 12, "node")],
+)
+async def test_what_is_not_loaded_says_how_to_load_it(
+    log: EventLog, script: Script, class_: type[Base], sequence: int, name: str
+) -> None:
+    message = rf"^{name} of {class_.__name__} \(\d+,\) is not loaded: .*awaitable_attrs.{name}`"
+    async with AsyncSession(log.engine, expire_on_commit=False) as session:
+        loaded = await session.get_one(class_, row(sequence))
+        with pytest.raises(CallerError, match=message):
+            getattr(loaded, name)
+        assert await getattr(loaded.awaitable_attrs, name)  # the session goes on
+        getattr(loaded, name)
+    (closed,) = await every(log, select(class_).where(class_.id == row(sequence)))  # type: ignore[attr-defined]
+    with pytest.raises(CallerError, match=message):
+        getattr(closed, name)
 
 
 async def test_nodes_join_their_designators(log: EventLog, script: Script) -> None:

@@ -20,7 +20,7 @@ from datetime import datetime
 from typing import assert_type
 
 from sqlalchemy import select
-from sqlalchemy.orm import Mapped
+from sqlalchemy.orm import Mapped, selectinload
 
 from pycrorm_async import Memory, MemoryStatus, Projection, Reading, Settings, UserView
 from pycrorm_async.orm import AccessingMotion, Action, FaceAtAction, GraspingAction, Monitor
@@ -86,6 +86,10 @@ def course(action: Action, pick: PickUpAction, node: TaskTreeNode) -> None:
     assert_type(pick.reason, str | None)
     assert_type(action.episode, ProcessMetaData)
     assert_type(node.duration, float | None)
+    assert_type(node.children, list[TaskTreeNode])
+    assert_type(node.ancestors, list[TaskTreeNode])
+    assert_type(pick.object.node, TaskTreeNode | None)
+    print(select(TaskTreeNode).options(selectinload(TaskTreeNode.children)))
 
 
 def failures(failure: RootFailure) -> None:

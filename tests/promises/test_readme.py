@@ -33,7 +33,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 TIDY, STEREO = python_of("pycrorm_async/plan/README.md")
-COURSE, BEGAN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
+COURSE, AROUND, BEGAN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 [BETTER] = python_of("pycrorm_async/learning/README.md")
 
 
@@ -157,6 +157,19 @@ async def test_actions_say_how_long_they_took(tmp_path: Path, capsys: pytest.Cap
     assert ("TransportAction", "SUCCEEDED") in [(dtype, status) for dtype, status, *_ in lines]
     durations = [float(duration) for _, _, duration, *_ in lines]
     assert durations == sorted(durations, reverse=True)
+
+
+async def test_a_node_shows_the_nodes_around_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tidy.py").write_text(TIDY)
+    done = await asyncio.to_thread(pycrorm, "run", "tidy.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    names: dict[str, Any] = {}
+    exec("from pycrorm_async import Memory", names)
+    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
+    exec(f"async def asked():\n{opened}{textwrap.indent(AROUND, '        ')}        return mover", names)
+    mover = await names["asked"]()
+    assert mover.kind == "motion"
+    assert capsys.readouterr().out.endswith("['TransportAction', None]\n")
 
 
 FAILING = """\
