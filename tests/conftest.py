@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,6 +60,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_BEGAN] = time.monotonic()
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell starts commands in the background so
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # or the commands of the tests would ignore Ctrl-C too
 
 
 @pytest.hookimpl(tryfirst=True)
