@@ -16,9 +16,11 @@ from pycrorm_async.events.types import (
     NodeEnded,
     NodeStarted,
     ObjectAdded,
+    ObjectDetected,
     ObjectReference,
     PoseValue,
     RobotValue,
+    SeenValue,
 )
 
 LINES = (Path(__file__).parent.parent / "golden" / "events_v1.jsonl").read_text().splitlines()
@@ -74,3 +76,13 @@ def test_the_golden_bytes_mean_what_they_say() -> None:
 def test_a_missing_value_is_written_as_its_reason() -> None:
     event = NodeEnded(9, "SUCCEEDED", result=MissingValue("why", "<it>"))
     assert encode(event) == b'{"node":9,"status":"SUCCEEDED","result":{"missing":"why","repr":"<it>"}}'
+
+
+def test_a_percept_without_an_object_is_written_with_its_confidence_and_source() -> None:
+    pose = PoseValue((1.0, 2.0, 0.5), (0.0, 0.0, 0.0, 1.0), "map", 5)
+    payload = (
+        b'{"source":"camera","seen":[{"name":"cup?","object_type":"JEROEN_CUP","pose":{"position":[1.0,2.0,0.5],'
+        b'"orientation":[0.0,0.0,0.0,1.0],"frame":"map","time_ns":5},"confidence":0.25,"source":"stereo"}]}'
+    )
+    event = ObjectDetected("camera", seen=(SeenValue("cup?", "JEROEN_CUP", pose, confidence=0.25, source="stereo"),))
+    assert (encode(event), decode("ObjectDetected", payload)) == (payload, event)
