@@ -88,7 +88,7 @@ class MalformedPose(CallerError, ValueError):
 
 @dataclass(frozen=True, slots=True, init=False, repr=False)
 class Pose:
-    """A position and an orientation in a frame. Equality ignores `time_ns`. A world refuses a pose that holds NaN.
+    """A position and an orientation in a frame. Equality ignores `time_ns`. A world refuses non-finite components.
 
     Args:
         position: x, y, z in metres.
@@ -125,7 +125,7 @@ class Pose:
             length = math.hypot(qx, qy, qz, qw)
         except (TypeError, ValueError, OverflowError):
             raise MalformedPose(f"an orientation needs four numbers x, y, z, w, got {orientation!r}") from None
-        if length in (0, math.inf):
+        if length == 0 or (length == math.inf and all(map(math.isfinite, (qx, qy, qz, qw)))):
             raise MalformedPose(f"an orientation needs a finite length other than zero, got {orientation!r}")
         if abs(length - 1.0) >= 1e-15:  # a unit quaternion keeps its exact bits
             qx, qy, qz, qw = qx / length, qy / length, qz / length, qw / length
