@@ -113,7 +113,7 @@ def folder(tmp_path: Path) -> Path:
     [
         (["run", "plans.py", "--url", "mongodb://lab/memory"], 2, "mongodb:// is not a supported database"),
         (["episodes", "--url", "sqlite"], 2, "this is not a database URL"),
-        (["run", "plans.py", "--url", "sqlite:////no/such/folder/x.db"], 3, "/no/such/folder"),
+        (["run", "plans.py", "--url", "sqlite:////proc/none/x.db"], 3, "/proc/none"),
         (["episodes", "--url", "sqlite:///none.db"], 3, "none.db does not exist"),
         (["show", "1", "--url", "sqlite:///none.db"], 3, "none.db does not exist"),
         (["run", "none.py"], 2, "the plan file 'none.py' does not exist"),

@@ -117,9 +117,9 @@ def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: P
     [
         (("--url", "mysql://there/memory"), 2, "mysql"),
         (("--url", "postgresql://nobody@127.0.0.1:9/memory"), 3, "cannot be reached"),
-        (("--url", "sqlite:////nowhere/memory.db"), 3, "/nowhere"),
+        (("--url", "sqlite:////proc/none/memory.db"), 3, "/proc/none"),
         (("--figure", "policies.doc"), 2, "--figure policies.doc must end in one of .png, .svg, .pdf"),
-        (("--policy", "/nowhere/policy.json"), 2, "--policy /nowhere/policy.json cannot be written"),
+        (("--policy", "/proc/none/policy.json"), 2, "--policy /proc/none/policy.json cannot be written"),
         (("--figure", "folder.png"), 2, "--figure folder.png cannot be written"),
         (("--policy", "x" * 300), 2, "cannot be written"),
         (("--policy", "\udcff.json"), 2, "cannot be written"),

@@ -75,7 +75,7 @@ def two_joints(first: str, second: str) -> str:
 HINGE = '<joint name="j" type="revolute"><parent link="r"/><child link="m"/></joint>'
 BOX = "<link name='r'><collision><geometry><box/></geometry></collision></link>"
 FAULTS = {
-    "no such file": ("/nowhere/crane.urdf", "cannot be read"),
+    "no such file": ("/proc/none/crane.urdf", "cannot be read"),
     "not XML": ('<robot name="a"><link', "unclosed token"),
     "another element": ("<foo/>", "its root element is <foo>"),
     "no link": ('<robot name="a"/>', "it has no link"),
