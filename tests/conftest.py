@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import gc
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.databases import Server, server_in_memory
-from tests.soak_turns import TURN_S_MAX, current_commit, place_of, turn_of
-
-_BEGAN = pytest.StashKey[float]()
+from tests.soak_turns import current_commit, place_of, turn_of
 
 
 @pytest.fixture(scope="session")
@@ -54,12 +51,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         const="",
         metavar="COMMIT",
         help="of the tests marked soak, run the tenth whose turn COMMIT is (without one: the commit checked out), with "
-        "loops shortened, and start none after ten minutes; use with -m soak",
+        "loops shortened; use with -m soak",
     )
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    config.stash[_BEGAN] = time.monotonic()
+def pytest_configure() -> None:
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell starts commands in the background so
         signal.signal(signal.SIGINT, signal.default_int_handler)  # or the commands of the tests would ignore Ctrl-C too
 
@@ -87,14 +83,6 @@ def pytest_collection_finish() -> None:
     """Leave the tests out of garbage collections: each looked at 300,000 objects that stay, for a third of a second."""
     gc.collect()
     gc.freeze()
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Start no test of a turn after its time is up."""
-    is_in_turn = item.config.getoption("--soak-turn") is not None and item.get_closest_marker("soak")
-    if is_in_turn and time.monotonic() - item.config.stash[_BEGAN] > TURN_S_MAX:
-        pytest.skip("the time of this turn is up")
 
 
 @pytest.fixture
