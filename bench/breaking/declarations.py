@@ -16,14 +16,8 @@ from pycrorm_async.events.codec import declaration_of, encode, fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.fields import column_name, table_name
 from pycrorm_async.events.ids import episode_text
-from pycrorm_async.events.types import (
-    DesignatorTypeDeclared,
-    EpisodeEnded,
-    EpisodeStarted,
-    FieldDeclared,
-    NodeEnded,
-    NodeStarted,
-)
+from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
+from pycrorm_async.events.values import FieldDeclared
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify.verify import verify

@@ -18,15 +18,12 @@ from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     Happening,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
-    ObjectReference,
-    PoseValue,
-    RobotValue,
 )
+from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue
 from pycrorm_async.hooks.declaration import DeclaredType, declared_type
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.plan.actions.basic import (

@@ -26,7 +26,8 @@ from collections.abc import Iterable, Sequence
 import msgspec
 
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD, SLOT_MAX
-from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
+from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.events.values import FieldDeclared, FieldType
 
 __all__ = [
     "RESERVED_COLUMNS",

@@ -6,28 +6,27 @@ fields. The sequence of `ObjectAdded` identifies an object, that of `NodeStarted
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from pycrorm_async.events.values import (
+    CandidateValue,
+    EpisodeStatus,
+    FailureValue,
+    FieldDeclared,
+    NodeKind,
+    NodeReference,
+    NodeStatus,
+    ObjectReference,
+    PoseValue,
+    RefusalValue,
+    RobotValue,
+    SeenValue,
+)
+
 __all__ = [
     "Happening",
-    "PoseValue",
-    "ObjectReference",
-    "ObjectValue",
-    "RobotValue",
-    "FailureValue",
-    "MissingValue",
-    "CandidateValue",
-    "RefusalValue",
-    "SeenValue",
-    "NodeReference",
-    "FieldType",
-    "ItemType",
-    "FieldDeclared",
-    "NodeKind",
-    "NodeStatus",
-    "EpisodeStatus",
     "EpisodeStarted",
     "EpisodeEnded",
     "DesignatorTypeDeclared",
@@ -45,137 +44,8 @@ __all__ = [
     "EVENT_TYPES",
 ]
 
-NodeKind: TypeAlias = Literal["root", "action", "motion", "language"]
-NodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST"]
-EpisodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "INTERRUPTED", "LOST"]
 
-FieldType: TypeAlias = Literal[
-    "integer", "real", "text", "boolean", "datetime", "enum", "pose", "object", "list", "dict"
-]
-ItemType: TypeAlias = Literal["integer", "real", "text", "boolean", "datetime", "enum", "pose", "object"]
-
-
-class _Value(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The base of all parts of a payload."""
-
-
-class PoseValue(_Value, frozen=True):
-    """A copy of a pose: metres, unit quaternion xyzw, frame name, and the time it was created (UTC, ns)."""
-
-    position: tuple[float, float, float]
-    orientation: tuple[float, float, float, float]
-    frame: str
-    time_ns: int
-
-
-class ObjectReference(_Value, frozen=True):
-    """A world object at one moment.
-
-    `object` is the sequence of its ObjectAdded; `row` is the sequence of its latest ObjectAdded or ObjectMoved.
-    """
-
-    object: int
-    row: int
-
-
-class ObjectValue(_Value, frozen=True):
-    """An object without a row of its own: a part of an object, a believed object, or one outside the recorded world.
-
-    `part_of` is the object that an ObjectPart belongs to, or the reference object of a LocatedObject's place.
-    """
-
-    dtype: Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
-    name: str
-    object_type: str | None = None
-    pose: PoseValue | None = None
-    part_of: ObjectReference | None = None
-
-
-class RobotValue(_Value, frozen=True):
-    """The robot at the start of a node: base pose, torso joint position in metres (None without a torso)."""
-
-    pose: PoseValue
-    object_type: str
-    torso_height: float | None = None
-    object: ObjectReference | None = None
-
-
-class FailureValue(_Value, frozen=True):
-    """The exception behind a failure: qualified class, message, and those arguments that JSON can hold."""
-
-    type: str
-    message: str
-    arguments: list[Any] = []
-
-
-class MissingValue(_Value, frozen=True):
-    """The substitute for a value that could not be recorded: the reason, and a shortened repr of the value."""
-
-    missing: str
-    repr: str = ""
-
-
-class CandidateValue(_Value, frozen=True):
-    """A pose that a location designator offered, with the names of the arms that reach the target from there.
-
-    A place taken from experience also holds the grasp and the torso height (m) that succeeded there.
-    """
-
-    pose: PoseValue
-    arms: tuple[str, ...] = ()
-    grasp: str | None = None
-    torso_height: float | None = None
-
-
-class RefusalValue(_Value, frozen=True):
-    """A pose that a location designator tried and did not offer, with the reason."""
-
-    pose: PoseValue
-    reason: str
-
-
-class SeenValue(_Value, frozen=True):
-    """A percept; `object` is None if it matches no object, `source` if it has that of its `ObjectDetected`."""
-
-    name: str
-    object_type: str
-    pose: PoseValue
-    object: ObjectReference | None = None
-    visible: float | None = None
-    confidence: float | None = None
-    source: str | None = None
-
-
-class NodeReference(_Value, frozen=True):
-    """A node of another episode: the episode's UUID as text, and the sequence of the node's NodeStarted."""
-
-    episode: str
-    node: int
-
-
-class FieldDeclared(_Value, frozen=True):
-    """One field of a designator type.
-
-    Attributes:
-        name: key in `NodeStarted.parameters`; the field of a nested dataclass is `outer_inner`.
-        column: column in the leaf table (`<name>_id` for poses and objects; unused for list and dict).
-        type: see `FieldType`.
-        slot: 2 to 31, constant within one declaration.
-        optional: whether null is a legal value.
-        enum: for an enum, the qualified name of its class (documentation only; members are stored by name).
-        item: for list and dict, the type of the values.
-    """
-
-    name: str
-    column: str
-    type: FieldType
-    slot: int
-    optional: bool = False
-    enum: str | None = None
-    item: ItemType | None = None
-
-
-class Happening(_Value, frozen=True):
+class Happening(msgspec.Struct, frozen=True, omit_defaults=True):
     """The base class of all events."""
 
     version: ClassVar[int] = 1

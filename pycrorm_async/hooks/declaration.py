@@ -27,7 +27,8 @@ from pycrorm_async.events.fields import (
     table_name,
 )
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
-from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared
+from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.events.values import FieldDeclared
 from pycrorm_async.hooks.values.parameter_types import (
     OUR_PACKAGE,
     Parameter,

@@ -36,16 +36,8 @@ from typing import Any, Final, Literal, NamedTuple
 from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    FailureValue,
-    NodeEnded,
-    NodeReference,
-    NodeStarted,
-    NodeStatus,
-    ObjectReference,
-    RobotValue,
-)
+from pycrorm_async.events.types import EpisodeEnded, NodeEnded, NodeStarted
+from pycrorm_async.events.values import FailureValue, NodeReference, NodeStatus, ObjectReference, RobotValue
 from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.emitter import UNAWAITED_MAX, Emitter
 from pycrorm_async.hooks.episode_events import (

@@ -9,14 +9,12 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.events.types import (
+from pycrorm_async.events.types import EpisodeStarted, LocationResolved, ObjectDetected
+from pycrorm_async.events.values import (
     CandidateValue,
-    EpisodeStarted,
     EpisodeStatus,
-    LocationResolved,
     NodeReference,
     NodeStatus,
-    ObjectDetected,
     RefusalValue,
     SeenValue,
 )

@@ -32,7 +32,7 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError, DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
-from pycrorm_async.events.types import NodeReference
+from pycrorm_async.events.values import NodeReference
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode, NodeRecord, current_task

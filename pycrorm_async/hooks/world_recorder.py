@@ -29,11 +29,9 @@ from pycrorm_async.events.types import (
     ObjectAttached,
     ObjectDetached,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
-    PoseValue,
-    RobotValue,
 )
+from pycrorm_async.events.values import ObjectReference, PoseValue, RobotValue
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.values.event_fitting import clean_texts
 from pycrorm_async.hooks.values.texts import clean

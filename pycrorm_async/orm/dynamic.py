@@ -24,7 +24,8 @@ from sqlalchemy.orm import registry, relationship, synonym
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
+from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.events.values import FieldDeclared, FieldType
 from pycrorm_async.orm.base import Base, Pose
 from pycrorm_async.orm.designators import Action, Designator, Language, Motion
 from pycrorm_async.orm.known_classes import known_classes

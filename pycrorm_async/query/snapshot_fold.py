@@ -16,7 +16,6 @@ from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     Happening,
     JointsMoved,
     NodeEnded,
@@ -26,8 +25,8 @@ from pycrorm_async.events.types import (
     ObjectDetached,
     ObjectMoved,
     ObjectRemoved,
-    PoseValue,
 )
+from pycrorm_async.events.values import FailureValue, PoseValue
 from pycrorm_async.projections.fold.fold import CannotFold, happening_of
 from pycrorm_async.query.snapshot import Moment, NodeThen, ObjectThen, RobotThen, WorldThen
 from pycrorm_async.store.stored import StoredEvent

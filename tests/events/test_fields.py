@@ -3,7 +3,7 @@
 import pytest
 
 from pycrorm_async.events.fields import column_name, fault_in_fields, fault_in_table, table_name
-from pycrorm_async.events.types import FieldDeclared, FieldType
+from pycrorm_async.events.values import FieldDeclared, FieldType
 
 
 @pytest.mark.parametrize(

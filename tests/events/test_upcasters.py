@@ -9,15 +9,9 @@ import msgspec
 import pytest
 
 from pycrorm_async.events.codec import Decoder, UnknownShape, encode, fingerprint
-from pycrorm_async.events.types import (
-    EVENT_TYPES,
-    DesignatorTypeDeclared,
-    FieldDeclared,
-    Happening,
-    ObjectAdded,
-    PoseValue,
-)
+from pycrorm_async.events.types import EVENT_TYPES, DesignatorTypeDeclared, Happening, ObjectAdded
 from pycrorm_async.events.upcasters import UPCASTERS
+from pycrorm_async.events.values import FieldDeclared, PoseValue
 from pycrorm_async.projections.schema.layout import Layout, unite
 
 LINES = (Path(__file__).parent.parent / "golden" / "events_v1.jsonl").read_text().splitlines()

@@ -13,9 +13,7 @@ from pycrorm_async.events.codec import decode
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.order import OrderCheck
-from pycrorm_async.events.types import (
-    Happening,
-)
+from pycrorm_async.events.types import Happening
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import DeclarationRefused
-from pycrorm_async.events.types import FieldDeclared
+from pycrorm_async.events.values import FieldDeclared
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType, declared_type
 from pycrorm_async.plan.actions.basic import PickUpActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract

@@ -20,15 +20,14 @@ from pycrorm_async.events.types import (
     EpisodeStarted,
     Happening,
     NodeEnded,
-    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
     StateSampled,
 )
+from pycrorm_async.events.values import NodeReference, ObjectReference
 from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import ChosenRobot, MoveMotion, SimulatedTaskTree
 from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable

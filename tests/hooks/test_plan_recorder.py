@@ -18,10 +18,9 @@ from pycrorm_async.events.types import (
     ObjectAttached,
     ObjectDetached,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
-    PoseValue,
 )
+from pycrorm_async.events.values import ObjectReference, PoseValue
 from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract

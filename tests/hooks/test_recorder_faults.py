@@ -9,11 +9,7 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import EpisodeRefused, SpoolFull, Unrecordable
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    NodeEnded,
-    NodeStarted,
-)
+from pycrorm_async.events.types import EpisodeEnded, NodeEnded, NodeStarted
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import PlanFailure

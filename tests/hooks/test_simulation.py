@@ -15,13 +15,12 @@ from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     Happening,
-    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
-    ObjectReference,
 )
+from pycrorm_async.events.values import NodeReference, ObjectReference
 from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import (
     ActionAbstract,

@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pycrorm_async.events.types import (
-    FieldDeclared,
-    FieldType,
-    MissingValue,
-    ObjectReference,
-    ObjectValue,
-    PoseValue,
-)
+from pycrorm_async.events.values import FieldDeclared, FieldType, MissingValue, ObjectReference, ObjectValue, PoseValue
 from pycrorm_async.hooks.values.texts import clean_repr
 from pycrorm_async.hooks.values.value_snapshot import (
     UnrecordableValue,

@@ -10,7 +10,8 @@ from pycrorm_async import Memory, recover
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.types import EpisodeStarted, ObjectAdded, PoseValue
+from pycrorm_async.events.types import EpisodeStarted, ObjectAdded
+from pycrorm_async.events.values import PoseValue
 from pycrorm_async.operations.daemon import _Folders
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.maintenance.repair import repair_folder

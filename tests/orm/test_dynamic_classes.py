@@ -17,13 +17,8 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from sqlalchemy.orm import Mapped, mapped_column
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import (
-    DesignatorTypeDeclared,
-    NodeStarted,
-    ObjectAdded,
-    ObjectReference,
-    RobotValue,
-)
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded
+from pycrorm_async.events.values import ObjectReference, RobotValue
 from pycrorm_async.orm import Action, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.plan.task_tree import TaskStatus

@@ -13,10 +13,8 @@ from sqlalchemy.orm import Mapped, selectinload, undefer
 import pycrorm_async.orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
-    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
@@ -24,11 +22,9 @@ from pycrorm_async.events.types import (
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
-    ObjectValue,
-    RobotValue,
 )
+from pycrorm_async.events.values import CandidateValue, FailureValue, ObjectReference, ObjectValue, RobotValue
 from pycrorm_async.orm import (
     Action,
     Attachment,

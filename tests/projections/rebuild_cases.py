@@ -7,17 +7,8 @@ from pathlib import Path
 
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    NodeEnded,
-    NodeReference,
-    NodeStarted,
-    ObjectAdded,
-    ObjectReference,
-    RobotValue,
-)
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
+from pycrorm_async.events.values import FailureValue, NodeReference, ObjectReference, RobotValue
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

@@ -7,30 +7,32 @@ from typing import Any
 import pytest
 
 from pycrorm_async.events.types import (
-    CandidateValue,
     DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     JointsMoved,
     LocationResolved,
-    MissingValue,
     NodeEnded,
-    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
+    StateSampled,
+)
+from pycrorm_async.events.values import (
+    CandidateValue,
+    FailureValue,
+    MissingValue,
+    NodeReference,
+    ObjectReference,
     ObjectValue,
     PoseValue,
     RefusalValue,
     RobotValue,
     SeenValue,
-    StateSampled,
 )
 from pycrorm_async.projections.fold.fold import CannotFold, fold
 from pycrorm_async.projections.fold.parameters import Designators

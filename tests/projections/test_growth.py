@@ -16,13 +16,8 @@ from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.fields import column_name, table_name
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
-from pycrorm_async.events.types import (
-    DesignatorTypeDeclared,
-    EpisodeStarted,
-    FieldDeclared,
-    FieldType,
-    NodeStarted,
-)
+from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeStarted, NodeStarted
+from pycrorm_async.events.values import FieldDeclared, FieldType
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema import growth, layout

@@ -10,14 +10,8 @@ import pytest
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FieldDeclared,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-)
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, LocationResolved, NodeEnded, NodeStarted
+from pycrorm_async.events.values import FieldDeclared
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.run import pipeline
 from pycrorm_async.projections.run.batch_fold import BatchPreview

@@ -9,10 +9,8 @@ import pytest
 
 from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.events.types import (
-    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
@@ -20,8 +18,12 @@ from pycrorm_async.events.types import (
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
+)
+from pycrorm_async.events.values import (
+    CandidateValue,
+    FailureValue,
+    ObjectReference,
     PoseValue,
     RefusalValue,
     RobotValue,

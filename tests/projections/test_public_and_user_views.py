@@ -16,15 +16,12 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeStarted,
-    FailureValue,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
-    ObjectReference,
-    PoseValue,
-    RobotValue,
 )
+from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue
 from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextView, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector

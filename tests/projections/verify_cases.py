@@ -13,27 +13,29 @@ import pytest
 
 from pycrorm_async.events.envelope import LOST
 from pycrorm_async.events.types import (
-    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
-    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
+    StateSampled,
+)
+from pycrorm_async.events.values import (
+    CandidateValue,
+    FailureValue,
+    NodeReference,
+    ObjectReference,
     ObjectValue,
     RefusalValue,
     RobotValue,
     SeenValue,
-    StateSampled,
 )
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed

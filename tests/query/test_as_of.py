@@ -15,26 +15,28 @@ import pytest
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, UnknownEpisode
 from pycrorm_async.events.types import (
-    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     Happening,
     JointsMoved,
     LocationResolved,
     NodeEnded,
-    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
+    StateSampled,
+)
+from pycrorm_async.events.values import (
+    CandidateValue,
+    FailureValue,
+    NodeReference,
+    ObjectReference,
     RobotValue,
     SeenValue,
-    StateSampled,
 )
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import NodeSummary

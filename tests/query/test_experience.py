@@ -9,17 +9,8 @@ import pytest
 from sqlalchemy import Connection, event
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import (
-    EpisodeStarted,
-    FailureValue,
-    NodeEnded,
-    NodeStarted,
-    NodeStatus,
-    ObjectAdded,
-    ObjectReference,
-    PoseValue,
-    RobotValue,
-)
+from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
+from pycrorm_async.events.values import FailureValue, NodeStatus, ObjectReference, PoseValue, RobotValue
 from pycrorm_async.plan.experience import PastSuccess
 from pycrorm_async.query.experience import ATTEMPTS_MAX, Attempt, PickUpExperience, best_first
 from pycrorm_async.query.reading import Reading

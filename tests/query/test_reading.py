@@ -16,16 +16,8 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, MissingExtra, UnknownEpisode
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    FailureValue,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectReference,
-    RobotValue,
-)
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
+from pycrorm_async.events.values import FailureValue, ObjectReference, RobotValue
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, PickUpWithContextView, Pose, TaskTreeNode
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary

@@ -11,26 +11,28 @@ from sqlalchemy.exc import DBAPIError
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.events.types import (
-    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
-    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
-    ObjectReference,
     ObjectRemoved,
+    StateSampled,
+)
+from pycrorm_async.events.values import (
+    CandidateValue,
+    FailureValue,
+    NodeReference,
+    ObjectReference,
     RefusalValue,
     RobotValue,
     SeenValue,
-    StateSampled,
 )
 from pycrorm_async.orm import Action, Motion, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm import Pose as PoseRow

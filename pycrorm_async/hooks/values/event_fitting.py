@@ -13,14 +13,12 @@ from pycrorm_async.events.codec import NotEncodable, encode
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
-    FailureValue,
     Happening,
     LocationResolved,
-    MissingValue,
     NodeEnded,
     ObjectDetected,
-    PoseValue,
 )
+from pycrorm_async.events.values import FailureValue, MissingValue, PoseValue
 from pycrorm_async.hooks.values.texts import clean, cut
 
 __all__ = [

@@ -17,7 +17,7 @@ from datetime import datetime
 from enum import Enum
 from typing import Any, NamedTuple
 
-from pycrorm_async.events.types import FieldType, ItemType
+from pycrorm_async.events.values import FieldType, ItemType
 from pycrorm_async.hooks.values.value_snapshot import OBJECT_TYPES
 from pycrorm_async.plan.constructor_arguments import ARGUMENTS
 from pycrorm_async.plan.designator import Designator

@@ -10,7 +10,8 @@ from typing import Any
 from msgspec.structs import replace
 
 from pycrorm_async.events.codec import NotEncodable, encoded_bytes
-from pycrorm_async.events.types import MissingValue, NodeStarted
+from pycrorm_async.events.types import NodeStarted
+from pycrorm_async.events.values import MissingValue
 from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.values.event_fitting import fits
 from pycrorm_async.hooks.values.texts import reading_fault

@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 import numpy as np
 
 from pycrorm_async.events.codec import unwritable
-from pycrorm_async.events.types import (
+from pycrorm_async.events.values import (
     FailureValue,
     FieldDeclared,
     MissingValue,

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_id, row_key
-from pycrorm_async.events.types import FieldDeclared, ObjectReference, ObjectValue, PoseValue
+from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectValue, PoseValue
 from pycrorm_async.projections.fold.row_batch import Row
 
 __all__ = [

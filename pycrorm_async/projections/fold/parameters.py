@@ -5,13 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeAlias
 
-from pycrorm_async.events.types import (
-    DesignatorTypeDeclared,
-    FieldDeclared,
-    NodeStarted,
-    ObjectReference,
-    ObjectValue,
-)
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
+from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectValue
 from pycrorm_async.projections.fold.column_values import (
     AS_IT_IS,
     CannotFold,
