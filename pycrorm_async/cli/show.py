@@ -24,8 +24,14 @@ def show(
     episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
     at: Annotated[
         str | None,
-        typer.Option(help="Show this moment: seconds since the start, or an event such as '#300'.", metavar="WHEN"),
+        typer.Option(
+            help="Show this moment: seconds since the start (12.5), or after an event (e300, also '#300').",
+            metavar="WHEN",
+        ),
     ] = None,
+    events: Annotated[
+        bool, typer.Option("--events", help="Print the events of each node's start and end, as in e6-e11.")
+    ] = False,
     full: Annotated[
         bool, typer.Option("--full", help="Print texts, lists and joints in full; --json always does.")
     ] = False,
@@ -35,12 +41,12 @@ def show(
 ) -> None:
     """Show an episode's task tree with statuses and durations; with --at, tree and world at one moment."""
     if at is None:
-        _show(episode, url, spool, full=full, as_json=as_json)
+        _show(episode, url, spool, events=events, full=full, as_json=as_json)
     else:
-        _show_moment(episode, at, url, spool, full=full, as_json=as_json)
+        _show_moment(episode, at, url, spool, events=events, full=full, as_json=as_json)
 
 
-def _show(episode: str, url: str, spool: Path | None, *, full: bool, as_json: bool) -> None:
+def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool) -> None:
     async def query() -> tuple[EpisodeSummary, list[NodeSummary]]:
         async with Reading.open(url) as reading:
             summary = await reading.episode(episode)
@@ -58,16 +64,19 @@ def _show(episode: str, url: str, spool: Path | None, *, full: bool, as_json: bo
             "started": f"{moment(summary.started_at)} UTC",
             "by": summary.created_by,
             "took": duration(summary.duration_ns),
+            "events": summary.end_sequence,
             "status": summary.status,
             "continues": f"episode {summary.continues}" if summary.continues else None,
             "continued": f"in episode {summary.continued_in}" if summary.continued_in else None,
             "simulated": simulated_by(summary) if summary.simulated else None,
         },
     )
-    print_tree(tree, full=full)
+    print_tree(tree, events=events, full=full)
 
 
-def _show_moment(episode: str, at: str, url: str, spool: Path | None, *, full: bool, as_json: bool) -> None:
+def _show_moment(
+    episode: str, at: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool
+) -> None:
     time, sequence = parse_moment(at)
 
     async def query() -> Moment:
@@ -79,4 +88,4 @@ def _show_moment(episode: str, at: str, url: str, spool: Path | None, *, full: b
     if as_json:
         print_json(snapshot)
     else:
-        print_snapshot(snapshot, at if sequence is not None else f"{time:g} s", full=full)
+        print_snapshot(snapshot, at if sequence is not None else f"{time:g} s", events=events, full=full)

@@ -19,18 +19,18 @@ _JOINTS_MAX = 3
 def parse_moment(text: str) -> tuple[float | None, int | None]:
     """Parse the value of `--at` as seconds or as the sequence of an event. Raises `CallerError`.
 
-    >>> parse_moment("12.5"), parse_moment("#300")
-    ((12.5, None), (None, 300))
+    >>> parse_moment("12.5"), parse_moment("e300"), parse_moment("#300")
+    ((12.5, None), (None, 300), (None, 300))
     """
     try:
-        return (None, int(text[1:])) if text.startswith("#") else (float(text), None)
+        return (None, int(text[1:])) if text[:1] in ("e", "#") else (float(text), None)
     except ValueError:
         raise CallerError(
-            f"--at takes seconds since the episode's start, or an event such as '#300', got {text!r}"
+            f"--at takes seconds since the episode's start, or an event such as e300, got {text!r}"
         ) from None
 
 
-def print_snapshot(snapshot: Moment, requested: str, *, full: bool = False) -> None:
+def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, full: bool = False) -> None:
     """Print the episode's facts, its task tree, and a table of the objects in the world; with `full`, uncut."""
     robot = snapshot.world.robot
     print_facts(
@@ -48,7 +48,7 @@ def print_snapshot(snapshot: Moment, requested: str, *, full: bool = False) -> N
             "robot": _robot_text(robot) if robot is not None else None,
         },
     )
-    print_tree(snapshot.tree, full=full)
+    print_tree(snapshot.tree, events=events, full=full)
     if snapshot.world.objects:
         columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
         print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])

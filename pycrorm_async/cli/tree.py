@@ -25,15 +25,16 @@ _SIMULATIONS_MAX = 10
 _STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED": "yellow", "INTERRUPTED": "yellow"}
 
 
-def print_tree(nodes: Sequence[NodeSummary], *, full: bool = False) -> None:
+def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool = False) -> None:
     """Print the nodes of one episode as a tree; `nodes` lists each parent before its children.
 
-    An ellipsis marks each text that is cut; with `full` none is.
+    With `events` each line has the events of the node's start and end. An ellipsis marks each text that is cut; with
+    `full` none is.
     """
     drawn: dict[int, Tree] = {}
     root: Tree | None = None
     for node in nodes:
-        line = _line(node, full=full)
+        line = _line(node, events=events, full=full)
         parent = drawn.get(node.parent_id) if node.parent_id is not None else None
         if parent is not None:
             drawn[node.id] = parent.add(line)
@@ -43,12 +44,15 @@ def print_tree(nodes: Sequence[NodeSummary], *, full: bool = False) -> None:
         stdout.print(root)
 
 
-def _line(node: NodeSummary, *, full: bool) -> Text:
+def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
     line = Text.from_markup(escape(node.dtype or "root"))
     if node.parameters:
         line.append(f"  {parameters_text(node.parameters, full=full)}", style="dim")
     line.append(f"  {node.status}", style=_STYLES.get(node.status, "red"))
     line.append(f"  {duration(node.duration_ns)}", style="dim")
+    if events:
+        end = f"e{node.end_sequence}" if node.end_sequence is not None else ""
+        line.append(f"  e{node.sequence}-{end}", style="dim")
     if node.reason:
         message = _text(node.failure_message or "", None if full else _MESSAGE_MAX)
         line.append(f"  {node.reason}{': ' if message else ''}{message}", style="red")

@@ -11,18 +11,29 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import Any, ClassVar
 
-from sqlalchemy import BigInteger, Boolean, Double, ForeignKey, Text, inspect
+from sqlalchemy import BigInteger, Boolean, ColumnElement, Double, ForeignKey, Text, inspect, literal_column
 from sqlalchemy.exc import MissingGreenlet, StatementError
 from sqlalchemy.ext.asyncio import AsyncAttrs
+from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship, synonym
 from sqlalchemy.orm.exc import DetachedInstanceError
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_key
 from pycrorm_async.orm.types import EnumName, Moment
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
 
-__all__ = ["Base", "named_if_unloaded", "ProcessMetaData", "Position", "Quaternion", "Pose", "RobotState"]
+__all__ = [
+    "Base",
+    "RowOfEvent",
+    "named_if_unloaded",
+    "ProcessMetaData",
+    "Position",
+    "Quaternion",
+    "Pose",
+    "RobotState",
+]
 
 
 class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
@@ -49,6 +60,24 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
         ]
         shown = ", ".join(f"{name}={state.dict[name]!r}" for name in names if state.dict.get(name) is not None)
         return f"{type(self).__name__}({shown})"
+
+
+class RowOfEvent:
+    """A row whose `id` contains the sequence of its event."""
+
+    id: Any
+
+    @hybrid_property
+    def sequence(self) -> int:
+        """The event that made the row: 1, 2, 3 … inside the episode."""
+        return row_key(self.id).sequence
+
+    @sequence.inplace.expression
+    @classmethod
+    def _sequence_of_class(cls) -> ColumnElement[int]:
+        # Literals, because PostgreSQL shifts by a 4-byte integer only and a parameter would be of 8 bytes.
+        shifted = cls.id.bitwise_rshift(literal_column(str(SLOT_MAX.bit_length())))
+        return shifted.bitwise_and(literal_column(str(SEQUENCE_MAX)))  # type: ignore[no-any-return]
 
 
 @contextmanager
@@ -88,6 +117,8 @@ class ProcessMetaData(Base):
     seed: Mapped[int | None]
     status: Mapped[str]
     ended_at: Mapped[datetime | None]
+    end_sequence: Mapped[int | None]
+    """The sequence of its last event; None while it runs."""
     failure_type: Mapped[str | None]
     failure_message: Mapped[str | None]
     simulated: Mapped[bool]
@@ -129,7 +160,7 @@ class Quaternion(Base):
     w: Mapped[float]
 
 
-class Pose(Base):
+class Pose(RowOfEvent, Base):
     """A position (m) and an orientation (unit quaternion), also as columns, so that queries need no join for them."""
 
     __tablename__ = "pose"
@@ -153,7 +184,7 @@ class Pose(Base):
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
-class RobotState(Base):
+class RobotState(RowOfEvent, Base):
     """The robot's base pose and torso position (m) when a node started. Nodes without a robot have no row."""
 
     __tablename__ = "robot_state"

@@ -26,7 +26,7 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RobotState
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RobotState, RowOfEvent
 from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import JsonText
@@ -130,7 +130,7 @@ class ClassOfRow(TypeDecorator[str]):
         return None if value is None else known_classes(dialect).identity(value, Designator.__mapper__.polymorphic_map)
 
 
-class Designator(Base):
+class Designator(RowOfEvent, Base):
     """A performed designator; it has the id of its task tree node.
 
     Attributes:
@@ -142,6 +142,7 @@ class Designator(Base):
             `await action.awaitable_attrs.parameters`.
         status, start_time, end_time, reason: of its node. A type with a field of such a name has the field instead.
         duration: of its node, in s; None while it runs, and if it is LOST.
+        sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode.
         episode: the same as `process_metadata`.
         node: its node of the task tree, mainly for joins: `select(...).join(PickUpAction.node)`. Not loaded by default:
             use `selectinload(Action.node)` or `await action.awaitable_attrs.node`.
@@ -177,6 +178,7 @@ class Designator(Base):
     _end_time: Mapped[datetime | None] = mapped_column("end_time")
     _duration: Mapped[float | None] = mapped_column("duration")
     _reason: Mapped[str | None] = mapped_column("reason")
+    _end_sequence: Mapped[int | None] = mapped_column("end_sequence")
 
     robot_state: Mapped[RobotState | None] = relationship(viewonly=True, lazy="selectin")
     items: Mapped[list[ParameterItem]] = relationship(
@@ -213,6 +215,11 @@ class Designator(Base):
     def reason(self) -> str | None:
         """The class of the failure that its node ended with."""
         return self._reason
+
+    @hybrid_property
+    def end_sequence(self) -> int | None:
+        """The event of its node's end; None while it runs, and if it is LOST."""
+        return self._end_sequence
 
     @hybrid_property
     def episode(self) -> ProcessMetaData:

@@ -14,7 +14,7 @@ from sqlalchemy import ForeignKey
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, named_if_unloaded
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, named_if_unloaded
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
 
@@ -27,7 +27,7 @@ _STEPS_MAX = 6
 """Bounds the relationships between a query's class and an `ObjectPart` with a loaded `part_of`; no class needs more."""
 
 
-class Object(Base):
+class Object(RowOfEvent, Base):
     """An object of the world at a moment.
 
     Attributes:
@@ -99,7 +99,7 @@ class BelieveObject(Object):
     __mapper_args__ = {"polymorphic_identity": "BelieveObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
 
-class ObjectRemoval(Base):
+class ObjectRemoval(RowOfEvent, Base):
     """The removal of an object from the world."""
 
     __tablename__ = "object_removal"
@@ -115,7 +115,7 @@ class ObjectRemoval(Base):
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
-class Attachment(Base):
+class Attachment(RowOfEvent, Base):
     """A change at `time`: `child` begins to move with `link` of `parent` (`kind` attached), or stops (detached)."""
 
     __tablename__ = "attachment"
@@ -134,7 +134,7 @@ class Attachment(Base):
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
-class JointChange(Base):
+class JointChange(RowOfEvent, Base):
     """A new position (rad or m) of an object's joint. Rows of one motion share their `id`."""
 
     __tablename__ = "joint_change"

@@ -7,7 +7,7 @@ from datetime import datetime
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from pycrorm_async.orm.base import Base, ProcessMetaData
+from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.world.enums import ObjectType
@@ -15,7 +15,7 @@ from pycrorm_async.world.enums import ObjectType
 __all__ = ["Detection", "StateSample"]
 
 
-class Detection(Base):
+class Detection(RowOfEvent, Base):
     """A percept. All percepts of one detection share their `id`; the best has `position` 0.
 
     Attributes:
@@ -58,7 +58,7 @@ class Detection(Base):
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
-class StateSample(Base):
+class StateSample(RowOfEvent, Base):
     """One channel of the robot's state at one moment of a motion, recorded if it had changed.
 
     Attributes:

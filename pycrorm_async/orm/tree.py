@@ -9,7 +9,7 @@ from sqlalchemy import ForeignKey
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, named_if_unloaded
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, named_if_unloaded
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.task_status import TaskStatus
@@ -18,7 +18,7 @@ from pycrorm_async.world.enums import Arms, Grasp
 __all__ = ["TaskTreeNode", "LocationResolution", "LocationCandidate", "LocationRefusal"]
 
 
-class TaskTreeNode(Base):
+class TaskTreeNode(RowOfEvent, Base):
     """One perform, from its start to its end.
 
     Attributes:
@@ -30,6 +30,8 @@ class TaskTreeNode(Base):
         ancestors: the parent, its parent and so on to the root: `await node.awaitable_attrs.ancestors`.
         end_time: None while it runs, and if it is LOST.
         start_ns, end_ns: monotonic time, for exact durations.
+        sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode. `end_sequence` is
+            None while it runs, and if it is LOST.
         duration: in s; None while it runs, and if it is LOST.
         reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
         result: the return value of perform, as JSON.
@@ -49,6 +51,7 @@ class TaskTreeNode(Base):
     end_time: Mapped[datetime | None]
     start_ns: Mapped[int]
     end_ns: Mapped[int | None]
+    end_sequence: Mapped[int | None]
     reason: Mapped[str | None]
     failure_message: Mapped[str | None]
     failure_arguments: Mapped[list[Any] | None] = mapped_column(JsonText())
@@ -140,7 +143,7 @@ class LocationRefusal(Base):
     reason: Mapped[str]
 
 
-class LocationResolution(Base):
+class LocationResolution(RowOfEvent, Base):
     """A location designator's answer to one request for a place.
 
     Attributes:

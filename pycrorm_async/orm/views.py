@@ -7,7 +7,7 @@ from datetime import datetime
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from pycrorm_async.orm.base import Base, ProcessMetaData
+from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
@@ -61,7 +61,7 @@ class PickUpWithContextView(Base):
     height_over_torso: Mapped[float | None] = mapped_column(deferred=True)
 
 
-class RootFailure(Base):
+class RootFailure(RowOfEvent, Base):
     """A node that ended as FAILED or ERROR and has no child that did: the place where a failure began.
 
     Attributes:

@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sqlalchemy import BigInteger, Boolean, ColumnElement, Float, Integer, Select, String, inspect, type_coerce
+from sqlalchemy import BigInteger, Boolean, Float, Integer, Select, String, inspect, type_coerce
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.ext.hybrid import HybridExtensionType
 from sqlalchemy.orm import Mapper
+from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.orm.types import EnumName, Moment
@@ -68,18 +69,20 @@ def _columns(statement: Select[*tuple[Any, ...]]) -> Iterator[_FrameColumn]:
         for attribute in entity.mapper.column_attrs:
             if not attribute.deferred and not attribute.key.startswith("_"):
                 yield _column(attribute.key, getattr(each["expr"], attribute.key), attribute.columns[0].type)
-        for name, column in _hybrids(entity.mapper).items():
-            yield _column(name, getattr(each["expr"], name), column.type)
+        for name, kind in _hybrids(entity.mapper):
+            yield _column(name, getattr(each["expr"], name), kind)
 
 
-def _hybrids(mapper: Mapper[Any]) -> dict[str, ColumnElement[Any]]:
-    """Return the columns that hybrid attributes of a class show, by the attribute's name."""
-    hybrids = (
-        name
-        for name, each in mapper.all_orm_descriptors.items()
-        if each.extension_type is HybridExtensionType.HYBRID_PROPERTY and f"_{name}" in mapper.column_attrs
-    )
-    return {name: mapper.column_attrs[f"_{name}"].columns[0] for name in hybrids}
+def _hybrids(mapper: Mapper[Any]) -> Iterator[tuple[str, TypeEngine[Any]]]:
+    """Yield name and type of the hybrid attributes that are columns, without deferred ones."""
+    for name, each in mapper.all_orm_descriptors.items():
+        if each.extension_type is not HybridExtensionType.HYBRID_PROPERTY:
+            continue
+        shown = mapper.column_attrs.get(f"_{name}")
+        if shown is not None and not shown.deferred:
+            yield name, shown.columns[0].type
+        elif name == "sequence":  # computed from the id
+            yield name, BigInteger()
 
 
 def _column(name: str, expression: Any, kind: Any) -> _FrameColumn:

@@ -11,7 +11,7 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
-from pycrorm_async.events.ids import SLOT_NODE, row_id
+from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
 from pycrorm_async.orm import Designator, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
@@ -42,6 +42,7 @@ class EpisodeSummary:
     Attributes:
         number, id: its number in this database, its UUID.
         duration_ns: from its first to its last event; None while it runs.
+        end_sequence: the sequence of its last event; None while it runs.
         nodes, failed: number of nodes in its task tree, the root included, and of those that FAILED, ended in ERROR or
             are LOST.
         simulated: whether it is a simulation, performed in a copy of the world.
@@ -64,6 +65,7 @@ class EpisodeSummary:
     thought_by: SimulatingNode | None = None
     continues: str | None = None
     continued_in: str | None = None
+    end_sequence: int | None = None
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,8 @@ class NodeSummary:
         depth: 0 at the root.
         dtype: its designator type; None at the root.
         duration_ns: None while it runs, and if it is LOST.
+        sequence, end_sequence: the events of its start and its end; `end_sequence` is None while it runs, and if it is
+            LOST.
         parameters: as recorded, empty at the root; a reference to an object of the world also has the object's name.
         reason, failure_message: the class and the text of the failure it ended with.
         thoughts: numbers of the simulations that it performed.
@@ -91,6 +95,8 @@ class NodeSummary:
     reason: str | None
     failure_message: str | None
     simulated: bool
+    sequence: int
+    end_sequence: int | None
     thoughts: tuple[int, ...] = ()
 
 
@@ -117,6 +123,7 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             else None,
             continues=row.continues,
             continued_in=row.continued_in,
+            end_sequence=row.end_sequence,
         )
         for row in await connection.execute(query)
     ]
@@ -188,6 +195,8 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 failure_message=row.failure_message,
                 simulated=row.simulated,
                 thoughts=tuple(simulations.get(row.id, ())),
+                sequence=row_key(row.id).sequence,
+                end_sequence=row.end_sequence,
             )
         )
     return list(_depth_first(children))

@@ -28,11 +28,9 @@ class NodeThen(NodeSummary):
     """A node at that moment: RUNNING and without an end if it ended later. `thoughts` is empty.
 
     Attributes:
-        sequence: of its NodeStarted.
         start_s, end_s: since the episode's start; `end_s` is None while it runs, and if it is LOST.
     """
 
-    sequence: int
     start_s: float
     end_s: float | None
 

@@ -52,6 +52,7 @@ class _Node:
     monotonic_ns: int
     status: str = "RUNNING"
     ended_ns: int | None = None
+    end_sequence: int | None = None
     failure: FailureValue | None = None
 
 
@@ -113,7 +114,8 @@ class MomentFold:
                 if (node := self._nodes.get(happening.node)) is None:
                     raise CannotFold(f"node {happening.node} ends and never started")
                 node.status, node.failure = happening.status, happening.failure
-                node.ended_ns = None if happening.status == "LOST" else event.monotonic_ns
+                if happening.status != "LOST":
+                    node.ended_ns, node.end_sequence = event.monotonic_ns, event.sequence
             case EpisodeStarted():
                 if self._started is not None:
                     raise CannotFold("the episode starts a second time")
@@ -208,6 +210,7 @@ class MomentFold:
             failure_message=node.failure.message if node.failure is not None else None,
             simulated=node.simulated,
             sequence=sequence,
+            end_sequence=node.end_sequence,
             start_s=(node.monotonic_ns - start_ns) / 1e9,
             end_s=(node.ended_ns - start_ns) / 1e9 if node.ended_ns is not None else None,
         )

@@ -42,6 +42,9 @@ async def dies():
 # 10 and 11 their ends, 12 HoldAction, 13 MoveTorsoAction, 14 MoveJointsMotion, 15 joints, 16 milk (its hand rose),
 # 17 and 18 ends, 19 HoldAction's.
 
+EVENTS = ["e2-e22", "e6-e11", "e7-e10", "e12-e19", "e13-e18", "e14-e17"]
+"""The start and the end of each node."""
+
 
 @pytest.fixture(scope="module")
 def ridden(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -104,11 +107,22 @@ def test_a_moment_is_one_document(ridden: Path) -> None:
     assert milk["attached_to"] == ["pr2", "l_gripper_tool_frame"]
     assert milk["pose"]["position"] == pytest.approx([2, 4, 1.1])
     assert then["world"]["robot"]["torso_height"] == 0.2
-    by_time = answer("show", "1", "--at", repr(then["time_s"]), cwd=ridden)
-    assert by_time == then
+    for same in (repr(then["time_s"]), "e16"):
+        assert answer("show", "1", "--at", same, cwd=ridden) == then
     end = answer("show", "1", "--at", "1e6", cwd=ridden)
     assert (end["status"], end["world"]["objects"]) == ("SUCCEEDED", [])
     assert [each["status"] for each in end["tree"]] == ["SUCCEEDED"] * 6
+
+
+def test_nodes_are_shown_with_the_events_of_their_start_and_end(ridden: Path) -> None:
+    lines = [line.split() for line in pycrorm("show", "1", "--events", cwd=ridden).stdout.splitlines() if " e" in line]
+    assert [line[-1] for line in lines if line[-1].startswith("e")] == EVENTS
+    document = answer("show", "1", cwd=ridden)
+    assert [f"e{each['sequence']}-e{each['end_sequence']}" for each in document["tree"]] == EVENTS
+    (episode,) = answer("episodes", cwd=ridden)
+    assert document["episode"]["end_sequence"] == episode["end_sequence"] == 23
+    shown = pycrorm("show", "1", "--events", "--at", "e9", cwd=ridden).stdout
+    assert [line.split()[-1] for line in shown.splitlines() if line.endswith("-")] == ["e2-", "e6-", "e7-"]
 
 
 def test_what_a_killed_robot_was_doing_is_shown(tmp_path: Path) -> None:
@@ -127,8 +141,8 @@ def test_what_a_killed_robot_was_doing_is_shown(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["1", "--at", "noon"], "--at takes seconds since the episode's start, or an event such as '#300', got 'noon'"),
-        (["1", "--at", "#3.5"], "--at takes seconds since the episode's start, or an event such as '#300', got '#3.5'"),
+        (["1", "--at", "noon"], "--at takes seconds since the episode's start, or an event such as e300, got 'noon'"),
+        (["1", "--at", "#3.5"], "--at takes seconds since the episode's start, or an event such as e300, got '#3.5'"),
         (["1", "--at=-1"], "-1 s is before episode 1 began"),
         (["1", "--at", "#0"], "event 0 is before episode 1 began"),
         (["7", "--at", "1"], "there is no episode '7' (`pycrorm episodes` lists the 1 there are)"),

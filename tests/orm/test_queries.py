@@ -6,12 +6,13 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncSession
 from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
@@ -156,7 +157,7 @@ async def test_the_episode_says_who_did_what_and_how_it_ended(log: EventLog, scr
         "ProcessMetaData(id=1, uuid='00000000-0000-7000-8000-000000000001',"
         f" created_at={moment(1)!r}, created_by='me', description='Tutorial', version='1.0', host='host',"
         f" python='3.11', plan='breakfast', status='LOST', ended_at={moment(19)!r},"
-        " simulated=False)"
+        " end_sequence=19, simulated=False)"
     )
 
 
@@ -522,3 +523,28 @@ async def test_moments_can_be_compared_and_a_naive_one_is_refused(log: EventLog,
     with pytest.raises(ValueError, match="has no time zone"):
         Moment().process_bind_param(datetime(2026, 1, 1), None)  # type: ignore[arg-type]  # noqa: DTZ001  the point
     assert int(moment(0).timestamp()) * 10**9 == T0_NS
+
+
+async def test_a_row_knows_its_event_and_queries_filter_and_order_by_it(log: EventLog, script: Script) -> None:
+    nodes = await every(log, select(TaskTreeNode).order_by(TaskTreeNode.sequence.desc()))
+    assert [each.sequence for each in nodes] == sorted((each.sequence for each in nodes), reverse=True)
+    assert all(each.id == row(each.sequence) for each in nodes)
+    assert await every(log, select(Action.id).where(Action.sequence == 6)) == [row(6)]
+    ends = {each.sequence: each.end_sequence for each in nodes}
+    assert await every(log, select(Action.end_sequence).where(Action.sequence == 6)) == [ends[6]]
+    for class_ in (Object, Pose, Attachment, JointChange, ObjectRemoval, RootFailure, PickUpAction):
+        (sequences,) = (await every(log, select(func.sum(class_.sequence)))) or [None]
+        assert sequences == sum(each.sequence for each in await every(log, select(class_))) > 0, class_
+
+
+async def test_sql_by_hand_has_the_events_of_a_row(log: EventLog, script: Script) -> None:
+    nodes = await every(log, select(TaskTreeNode).order_by(TaskTreeNode.id))
+    expected = [(each.sequence, each.end_sequence) for each in nodes]
+    async with log.engine.connect() as connection:
+        for view in ("task_tree_node", "designator"):
+            rows = await connection.exec_driver_sql(f"SELECT id, sequence, end_sequence FROM {view} ORDER BY id")
+            by_id = {row.id: (row.sequence, row.end_sequence) for row in rows}
+            assert by_id.items() <= {each.id: pair for each, pair in zip(nodes, expected, strict=True)}.items()
+        for view in ("action", "motion", "object", "pose", "robot_state", "attachment", "object_removal"):
+            for row_ in await connection.exec_driver_sql(f"SELECT id, sequence FROM {view}"):
+                assert row_.sequence == row_key(row_.id).sequence

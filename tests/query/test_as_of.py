@@ -263,13 +263,13 @@ async def test_a_node_says_what_it_was_then(reading: Reading) -> None:
     running = NodeThen(
         id=row(INNER), parent_id=row(OUTER), depth=2, dtype="PickUpAction", kind="action", parameters=parameters,
         status="RUNNING", started_at=at(INNER), duration_ns=None, reason=None, failure_message=None, simulated=False,
-        sequence=INNER, start_s=8.0, end_s=None,
+        sequence=INNER, end_sequence=None, start_s=8.0, end_s=None,
     )  # fmt: skip
     assert (await reading.as_of(1, sequence=11)).tree[2] == running
     failed = (await reading.as_of(1, sequence=12)).tree[2]
-    assert (failed.status, failed.duration_ns, failed.end_s) == ("FAILED", 3_000_000_000, 11.0)
+    assert (failed.status, failed.duration_ns, failed.end_s, failed.end_sequence) == ("FAILED", 3_000_000_000, 11.0, 12)
     lost = (await reading.as_of(1, sequence=22)).tree[3]
-    assert (lost.status, lost.duration_ns, lost.end_s) == ("LOST", None, None)
+    assert (lost.status, lost.duration_ns, lost.end_s, lost.end_sequence) == ("LOST", None, None, None)
     assert [each.dtype for each in (await reading.as_of(1, sequence=9)).running] == [
         None,
         "NavigateAction",

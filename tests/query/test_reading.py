@@ -85,6 +85,7 @@ async def test_the_overview_has_a_line_for_every_episode(reading: Reading) -> No
     second = EpisodeSummary(
         number=2, id="00000000-0000-7000-8000-000000000002", started_at=moment(1), ended_at=moment(11),
         duration_ns=10_000_000_000, status="SUCCEEDED", description="episode 2", created_by="me", nodes=4, failed=1,
+        end_sequence=11,
     )  # fmt: skip
     assert await reading.episodes() == [first, second]
 
@@ -132,6 +133,7 @@ async def test_a_task_tree_is_told_parents_first_with_depths_and_durations(readi
         id=row(6), parent_id=row(4), depth=2, dtype="PickUpAction", kind="action", status="FAILED",
         parameters={"object_designator": {"object": 3, "row": 3, "name": "milk"}, "arm": "LEFT", "grasp": "TOP"},
         started_at=moment(6), duration_ns=1_000_000_000, reason="IKError", failure_message="too far", simulated=False,
+        sequence=6, end_sequence=7,
     )  # fmt: skip
     assert await reading.tree(9) == []
 
@@ -211,8 +213,9 @@ async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Readin
     frame = await reading.dataframe(select(NavigateAction))
     assert list(frame.columns) == [
         "id", "process_metadata_id", "dtype", "kind", "robot_state_id", "pose_id",
-        "status", "start_time", "end_time", "duration", "reason",
+        "status", "start_time", "end_time", "duration", "reason", "end_sequence", "sequence",
     ]  # fmt: skip
+    assert [*frame.sequence, *frame.end_sequence] == [4, 4, 8, 8]
     assert [*frame.status, *frame.duration, *frame.reason] == ["SUCCEEDED"] * 2 + [4.0] * 2 + [None] * 2
     assert list(frame.start_time) == [pd.Timestamp(moment(4))] * 2
     frame = await reading.dataframe(select(Pose.id, Object.id).join(Object.pose).order_by(Pose.id))

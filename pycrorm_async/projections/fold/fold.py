@@ -110,6 +110,7 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
         "seed": started.seed,
         "status": "RUNNING",
         "ended_at": None,
+        "end_sequence": None,
         "failure_type": None,
         "failure_message": None,
         "simulated": started.simulated,
@@ -129,6 +130,7 @@ def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Design
             event.number,
             ended.status,
             microseconds(event.wall_ns),
+            event.sequence,
             failure.type if failure else None,
             failure.message if failure else None,
             ended.continued_in,
@@ -172,13 +174,13 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
 
 
 def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:
-    number, _, _, _, wall_ns, monotonic_ns, _ = event
+    number, sequence, _, _, wall_ns, monotonic_ns, _ = event
     node, status = row(number, ended.node), ended.status
     outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else _NO_OUTCOME
     if status == "LOST":  # recovery computed this end; the true end time was never recorded
-        rows.end_node(node, status, None, None, outcome)
+        rows.end_node(node, status, None, None, None, outcome)
     else:
-        rows.end_node(node, status, wall_ns // 1000, monotonic_ns, outcome)
+        rows.end_node(node, status, wall_ns // 1000, monotonic_ns, sequence, outcome)
 
 
 def _outcome(ended: NodeEnded) -> Row:

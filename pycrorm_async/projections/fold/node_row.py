@@ -21,6 +21,7 @@ from pycrorm_async.projections.schema import tables
     END_TIME,
     START_NS,
     END_NS,
+    END_SEQUENCE,
     REASON,
     FAILURE_MESSAGE,
     FAILURE_ARGUMENTS,
@@ -30,7 +31,7 @@ from pycrorm_async.projections.schema import tables
     ROBOT_TYPE,
     ROBOT_OBJECT_ID,
     SIMULATED,
-) = range(19)
+) = range(20)
 assert [each.lower() for each in globals() if each.isupper()] == [*tables.CORE["task_tree_node"]], "the order differs"
 
 OUTCOME: Final = slice(REASON, RESULT + 1)

@@ -10,7 +10,14 @@ from operator import itemgetter
 from typing import Any, NamedTuple, TypeAlias
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.projections.fold.node_row import END_NS, END_TIME, OUTCOME, PROCESS_METADATA_ID, STATUS
+from pycrorm_async.projections.fold.node_row import (
+    END_NS,
+    END_SEQUENCE,
+    END_TIME,
+    OUTCOME,
+    PROCESS_METADATA_ID,
+    STATUS,
+)
 from pycrorm_async.projections.schema.tables import COLUMNS
 
 __all__ = ["Rows", "Row", "NodeEnd", "EpisodeEnd"]
@@ -27,6 +34,7 @@ class NodeEnd(NamedTuple):
     status: str
     end_time: int | None
     end_ns: int | None
+    end_sequence: int | None
     reason: str | None
     failure_message: str | None
     failure_arguments: str | None
@@ -39,12 +47,13 @@ class EpisodeEnd(NamedTuple):
     id: int
     status: str
     ended_at: int
+    end_sequence: int
     failure_type: str | None
     failure_message: str | None
     continued_in: str | None
 
 
-assert NodeEnd._fields == ("id", "status", "end_time", "end_ns", *COLUMNS["task_tree_node"][OUTCOME])
+assert NodeEnd._fields == ("id", "status", "end_time", "end_ns", "end_sequence", *COLUMNS["task_tree_node"][OUTCOME])
 
 
 class Rows:
@@ -67,15 +76,24 @@ class Rows:
         self.episode_ends: list[EpisodeEnd] = []
         self.lost: list[int] = []
 
-    def end_node(self, node: int, status: str, end_time: int | None, end_ns: int | None, outcome: Row) -> None:
+    def end_node(
+        self,
+        node: int,
+        status: str,
+        end_time: int | None,
+        end_ns: int | None,
+        end_sequence: int | None,
+        outcome: Row,
+    ) -> None:
         """Set the end of a node's row, in this batch or in the tables. `outcome`: the columns reason to result."""
         row = self.nodes.get(node)
         if row is None:
-            self.node_ends.append(make(NodeEnd, (node, status, end_time, end_ns, *outcome)))
+            self.node_ends.append(make(NodeEnd, (node, status, end_time, end_ns, end_sequence, *outcome)))
             return
         row[STATUS] = status
         row[END_TIME] = end_time
         row[END_NS] = end_ns
+        row[END_SEQUENCE] = end_sequence
         row[OUTCOME] = outcome
 
     def end_episode(self, end: EpisodeEnd) -> None:

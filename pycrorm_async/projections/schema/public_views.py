@@ -128,7 +128,7 @@ def public_views(
     def shown(view: Select[Any], rows: Table) -> Select[Any]:
         return view if simulated else view.where(_happened(rows, simulations))
 
-    views: dict[str, View] = {name: shown(select(each), each) for name, each in core.items()}
+    views: dict[str, View] = {name: shown(select(*each.c, *_sequence(each)), each) for name, each in core.items()}
     views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
     leaves = {
         name: make_table(name, {"id": "key", **columns}, generation, stored) for name, columns in layout.leaves.items()
@@ -199,7 +199,16 @@ def _designator_type(layout: Layout) -> View:
 def _task_tree_node(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     nodes = core["task_tree_node"]
     action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
-    return select(*nodes.c, action_id.label("action_id"), _duration(nodes))
+    return select(*nodes.c, *_sequence(nodes), action_id.label("action_id"), _duration(nodes))
+
+
+def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
+    """Return the column `sequence` of rows that have an id: the sequence of their event."""
+    return (_event_of(rows).label("sequence"),) if "id" in rows.c else ()
+
+
+def _event_of(rows: Table) -> ColumnElement[int]:
+    return rows.c.id.bitwise_rshift(SLOT_MAX.bit_length()).bitwise_and(SEQUENCE_MAX)
 
 
 def _duration(nodes: Table) -> ColumnElement[Any]:
@@ -208,8 +217,9 @@ def _duration(nodes: Table) -> ColumnElement[Any]:
 
 
 def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
-    """Return the columns that say when a node was performed and how it ended."""
-    return nodes.c.status, nodes.c.start_time, nodes.c.end_time, _duration(nodes), nodes.c.reason
+    """Return the columns that say when a node was performed, by time and by event, and how it ended."""
+    times = nodes.c.start_time, nodes.c.end_time, _duration(nodes)
+    return nodes.c.status, *times, nodes.c.reason, *_sequence(nodes), nodes.c.end_sequence
 
 
 def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
@@ -217,7 +227,7 @@ def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
     started = (
         select(_member(_event.c.payload, "parameters"))
         .where(_event.c.episode == nodes.c.process_metadata_id)
-        .where(_event.c.sequence == nodes.c.id.bitwise_rshift(5).bitwise_and(SEQUENCE_MAX))
+        .where(_event.c.sequence == _event_of(nodes))
         .scalar_subquery()
     )
     robot_state_id = case((nodes.c.robot_pose_id.is_not(None), nodes.c.id), else_=null())
@@ -262,6 +272,7 @@ def _robot_state(core: dict[str, Table], _layout: Layout) -> Select[Any]:
         nodes.c.torso_height,
         nodes.c.robot_type.label("type"),
         nodes.c.robot_pose_id.label("pose_id"),
+        *_sequence(nodes),
     ).where(nodes.c.robot_pose_id.is_not(None))
 
 
@@ -271,7 +282,7 @@ def _root_failure(core: dict[str, Table], _layout: Layout) -> Select[Any]:
 
 def _pose(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     poses = core["pose"]
-    return select(*poses.c, poses.c.id.label("position_id"), poses.c.id.label("orientation_id"))
+    return select(*poses.c, *_sequence(poses), poses.c.id.label("position_id"), poses.c.id.label("orientation_id"))
 
 
 def _position(core: dict[str, Table], _layout: Layout) -> Select[Any]:
