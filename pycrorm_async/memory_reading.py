@@ -10,6 +10,7 @@ from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.blobs import Blob
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import Parts
 from pycrorm_async.query.as_of import AnyEpisode
@@ -58,6 +59,10 @@ class ReadableMemory:
     ) -> Moment:
         """Return the task tree and the world at any moment of an episode, up to the last flush; see `Reading.as_of`."""
         return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence)
+
+    async def blob(self, name: str) -> Blob | None:
+        """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""
+        return await self._open_parts.reading.blob(name)
 
     async def number_of(self, episode: Episode) -> int:
         """Return the number that this database gave to the episode, after `flush`."""

@@ -48,6 +48,8 @@ class Settings:
         keep_stored_bytes: these kept segments of a spool take at most this much, in addition to `spool_bytes_max`. The
             default is about a million events, a day of one busy robot, and a sixteenth of `spool_bytes_max`. They are
             deleted first when the disk is full.
+        blob_bytes_max: size of the largest blob (an image, a large array); a larger one is recorded as missing. Blobs
+            that are not stored yet count as part of `spool_bytes_max`, kept ones as part of `keep_stored_bytes`.
         record_bytes_max: size of the largest event; a larger one is refused.
         episode_events_max: an episode that reaches this many events is ended and continued in a follow-up episode.
         batch_events_max, batch_bytes_max, batch_age_ms: a batch closes at the limit it reaches first.
@@ -80,6 +82,7 @@ class Settings:
     spool_reserve_bytes: int = 16 * 2**20
     keep_stored_s: float = 86_400.0
     keep_stored_bytes: int = 256 * 2**20
+    blob_bytes_max: int = 64 * 2**20
     record_bytes_max: int = 2**20
     episode_events_max: int = 2**26 - 1
     batch_events_max: int = 10_000

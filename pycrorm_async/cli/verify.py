@@ -114,6 +114,7 @@ def _document(result: VerifyResult, ids: dict[int, str]) -> dict[str, Any]:
 
     return {
         **vars(result),
+        "blobs": len(result.blobs),
         "damages": [{"episode": id_of(each.number), **each._asdict()} for each in result.damages],
         "stopped": [{"episode": id_of(each.number), **each._asdict()} for each in result.stopped],
         "differences": [{"episode": id_of(each.number), **each._asdict()} for each in result.differences],

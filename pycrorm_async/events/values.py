@@ -16,6 +16,7 @@ __all__ = [
     "RobotValue",
     "FailureValue",
     "MissingValue",
+    "BlobReference",
     "CandidateValue",
     "RefusalValue",
     "SeenValue",
@@ -96,6 +97,19 @@ class MissingValue(_Value, frozen=True):
 
     missing: str
     repr: str = ""
+
+
+class BlobReference(_Value, frozen=True):
+    """A reference to a blob, a content that is stored beside the log: its SHA-256, media type and size in bytes.
+
+    An array also has its `dtype` and `shape`.
+    """
+
+    hash: str = msgspec.field(name="$blob")
+    media_type: str
+    size: int
+    dtype: str | None = None
+    shape: tuple[int, ...] | None = None
 
 
 class CandidateValue(_Value, frozen=True):

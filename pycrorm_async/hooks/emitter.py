@@ -6,18 +6,19 @@ import logging
 import threading
 from typing import NamedTuple
 
-from pycrorm_async.errors import SpoolFull
+from pycrorm_async.errors import FilesError, SpoolFull
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import Happening
+from pycrorm_async.events.values import BlobReference
 from pycrorm_async.hooks.event_feed import EventFeed
 from pycrorm_async.hooks.event_sink import EventSink
 from pycrorm_async.hooks.values.missing_values import MissingValues
 from pycrorm_async.hooks.values.texts import clean, cut, message_of
 from pycrorm_async.settings import Settings
 
-__all__ = ["Emitter", "Faults"]
+__all__ = ["BlobRefused", "Emitter", "Faults"]
 
 _log = logging.getLogger("pycrorm_async")
 _BLOCK_S = 1.0
@@ -30,6 +31,10 @@ _HEADINGS_MAX = 1_000
 """Bounds the headings kept for reuse: an episode has one for each event type. When it is reached all are dropped."""
 UNAWAITED_MAX = 100
 """Bounds the designator types listed with a perform that was never awaited; the latest are kept."""
+
+
+class BlobRefused(ValueError):
+    """The queue does not take a blob; the message is the reason."""
 
 
 class Faults(NamedTuple):
@@ -95,6 +100,25 @@ class Emitter:
         if self.feed.observers:
             self.feed.publish(episode, sequence, event)
         return sequence
+
+    def put_blob(self, content: bytes, media_type: str) -> BlobReference:
+        """Write a blob; return the reference for events put afterwards. Never waits.
+
+        The blob is kept beside the queue as long as these events, until `release_blob`, and for the life of the queue
+        without it, as a declaration needs. Raises `BlobRefused` with the reason for a blob that is too large or finds
+        no space; the caller records it as missing.
+        """
+        limit = self.settings.blob_bytes_max
+        if len(content) > limit:
+            raise BlobRefused(f"the blob takes {len(content):,} bytes, {limit:,} are allowed (blob_bytes_max)")
+        try:
+            return BlobReference(self.sink.put_blob(content), media_type, len(content))
+        except FilesError as error:
+            raise BlobRefused(str(error)) from error
+
+    def release_blob(self, reference: BlobReference) -> None:
+        """State that no event put from now on refers to this blob because of one of its puts."""
+        self.sink.release_blob(reference.hash)
 
     def _heading(self, episode: EpisodeId, kind: type[Happening]) -> Heading:
         """Return the heading of an event; kept for the next one, because making it takes three times as long."""

@@ -22,6 +22,17 @@ class EventSink(Protocol):
         """
         ...
 
+    def put_blob(self, content: bytes) -> str:
+        """Write a blob and return its name, the SHA-256 of the content, for events put afterwards to refer to.
+
+        Any thread may call it. Raises `SpoolFull` without waiting if there is no room, and other errors of the spool.
+        """
+        ...
+
+    def release_blob(self, name: str) -> None:
+        """State that no event put from now on refers to this blob because of one of its puts."""
+        ...
+
     @property
     def full(self) -> bool:
         """Whether the queue would refuse an event without `reserved` now."""

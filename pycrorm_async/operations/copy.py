@@ -1,9 +1,9 @@
 """`pycrorm copy`: append the episodes of one memory to another memory of any kind, and fold them there.
 
 An event's key is part of the event, so a copy may be interrupted and repeated, in any order: events that the target has
-are compared, and those after them are appended. An episode that is being recorded is copied up to its present head;
-repeating the copy appends the rest. Nothing is written to the source. Episode numbers and row ids belong to a database,
-so the target assigns its own.
+are compared, and those after them are appended, with the blobs that they refer to. An episode that is being recorded is
+copied up to its present head; repeating the copy appends the rest. Nothing is written to the source. Episode numbers
+and row ids belong to a database, so the target assigns its own.
 """
 
 from __future__ import annotations
@@ -103,6 +103,7 @@ async def _open_target(address: DatabaseAddress, source: EventLog) -> AsyncItera
             raise CallerError(
                 f"{source.address} and {address} are the same memory, or file copies of one memory: copy to a new URL"
             )
+        log.blobs.source = source.blobs
         projector = Projector(log)
         await retry(projector.open, backoff=BRIEF)  # another copy may be creating the tables
         yield log, LogAndTables(log, projector)

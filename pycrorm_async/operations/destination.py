@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
+from pathlib import Path
 from shlex import quote
 
 from pycrorm_async.clock import Clock
@@ -17,6 +18,8 @@ from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.queue.blobs.blob_files import read_blob
+from pycrorm_async.queue.files.recorder_folder import wrap_os_errors
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.retention.stored_segments import stored_in
 from pycrorm_async.settings import Settings
@@ -60,6 +63,7 @@ class LogAndTables:
             _log.warning("%s; events are stored in the log but not folded until then", error)
 
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        await self.log.store_blobs(records)  # before this process' turn, so that others need not wait for large blobs
         async with self._appending:
             if self._healed is None:
                 return await self.log.append(records)
@@ -144,6 +148,7 @@ async def open_destination(
     watching = asyncio.create_task(_watch_file(log), name="pycrorm watch file")
     try:
         spool.bind(log.log_id)
+        log.blobs.source = _SpoolBlobs(spool.path)
         projector = Projector(log, views=views, projections=projections, installed=installed_projections(projections))
         healed: HealedLog | None = None
         if settings is not None and settings.keep_stored_s and settings.keep_stored_bytes:
@@ -155,6 +160,17 @@ async def open_destination(
     finally:
         watching.cancel()
         await log.close()
+
+
+class _SpoolBlobs:
+    """The blobs in the folders of a spool. Implements `BlobSource`."""
+
+    def __init__(self, spool: Path) -> None:
+        self._spool = spool
+
+    async def read_blob(self, name: str) -> bytes | None:
+        with wrap_os_errors(self._spool):
+            return await asyncio.to_thread(read_blob, self._spool, name)
 
 
 def expected_log(address: DatabaseAddress, spool: Spool) -> str | None:

@@ -18,6 +18,7 @@ from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession, async_sessionmaker
 
 from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.events.blobs import Blob
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.dynamic import DynamicClasses
@@ -174,6 +175,12 @@ class Reading:
         """
         await self._ready()
         return await as_of(self._log, episode, time=time, sequence=sequence)
+
+    async def blob(self, name: str) -> Blob | None:
+        """Return the blob with this SHA-256, as hexadecimal digits; None if it is not stored."""
+        await self._ready()
+        with self._log.translated():
+            return await self._log.blobs.read(name)
 
     async def number_of(self, episode: str) -> int:
         """Return the number that this database gave to the episode with this UUID. Raises `UnknownEpisode`."""

@@ -10,6 +10,7 @@
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
         00000002.segment       the last one may be allocated ahead: all zero
         00000001.segment.tail  the torn bytes cut off the end of a segment
+        blobs/<sha256>         a content too large for an event (`blobs/blob_files.py`)
       <recorder>.<episode>.refused/   dead letters of this episode (`sources/dead_letters.py`), in the same format
       <recorder>.damaged/      a damaged folder, unchanged, after `repair` replaced it
 
@@ -53,6 +54,8 @@ the frame existed: a missing one is *damage*. Records that no commit frame cover
 because pages reach a disk in any order: their first hole is a *torn* tail, and recovery truncates it. If one fdatasync
 covered records and commit frame together, an ordinary power cut could look like damage. Records may lie between the
 last record that a commit frame covers and the commit frame.
+
+The blobs that the records refer to are written to the disk before the commit frame too.
 
 **Reading.** Positions run 1, 2, 3 … through all segments. A segment ends where no frame decodes; the next continues it
 if its base is the next position. The oldest segment's header lists the open episodes, so that recovery can end them

@@ -77,6 +77,8 @@ class Dialect(Protocol):
     # --- finding and creating a log -------------------------------------------------------------------------
 
     migrations: Migrations
+    blob_table: Sequence[str]
+    """Statements that create the table of the blobs unless it exists."""
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
         """Prepare a database, outside a transaction, for creating or migrating a log. Refuses foreign databases."""

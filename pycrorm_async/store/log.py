@@ -26,6 +26,7 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.settings import FileAccess
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import Appending
+from pycrorm_async.store.blobs import Blobs
 from pycrorm_async.store.dialect import Dialect, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.limits import EVENTS_MANY, events_warning, number_warning
@@ -73,6 +74,7 @@ class EventLog:
         self._file = _identity(address.path) if address.is_sqlite and writable else None
         self._write_turn = asyncio.Lock() if address.is_sqlite else None
         self._warned: set[str] = set()
+        self.blobs = Blobs(self._dialect, self.reading, self.writing)
 
     @classmethod
     async def open(
@@ -140,6 +142,7 @@ class EventLog:
         if not records:
             return Stored({}, {})
         with self.translated():
+            await self.blobs.store_for(records)  # again, because the log may have lost them since
             appending = Appending(self._dialect, records, basis)
             if self._write_turn is not None and len(records) >= _MANY_EVENTS:
                 async with self.reading() as connection:
@@ -151,6 +154,11 @@ class EventLog:
                 self._warned.add(what)
                 _log.warning("%s: %s", self.address, warning)
         return stored
+
+    async def store_blobs(self, records: Sequence[Record]) -> None:
+        """Store the blobs that these records refer to, durable on return. `store` does so as well."""
+        with self.translated():
+            await self.blobs.store_for(records)
 
     async def heads(self, episodes: Sequence[EpisodeId]) -> dict[EpisodeId, EpisodeRow]:
         """Read the rows of these episodes, without those that have no stored event."""

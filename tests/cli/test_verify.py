@@ -49,7 +49,7 @@ def test_a_memory_that_is_as_it_should_be(folder: Path) -> None:
     assert answer("verify", cwd=folder) == {
         "episodes": 3, "events": 60, "rows": rows, "behind": 0, "damage": 0, "drift": 0, "remarks": 0,
         "damages": [], "differences": [], "not_compared": {}, "stopped": [], "unmade": {}, "outdated": None,
-        "failed_views": {},
+        "failed_views": {}, "blobs": 0,
     }  # fmt: skip
 
 

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 from pycrorm_async.clock import SYSTEM_CLOCK
@@ -30,6 +31,8 @@ class ListSink:
     def __init__(self) -> None:
         self.records: list[tuple[EpisodeId | None, int, Happening]] = []
         self.sequences: dict[EpisodeId, int] = {}
+        self.blobs: dict[str, bytes] = {}
+        self.released: list[str] = []
         self.full = False
         self.broken = False
         self.broken_starts = 0
@@ -62,6 +65,16 @@ class ListSink:
             sequence = self.sequences[heading.episode] = self.sequences.get(heading.episode, 0) + 1
         self.records.append((heading.episode, sequence, decode(heading.type, payload)))
         return sequence
+
+    def put_blob(self, content: bytes) -> str:
+        if self.full:
+            raise SpoolFull("full")
+        name = sha256(content).hexdigest()
+        self.blobs[name] = content
+        return name
+
+    def release_blob(self, name: str) -> None:
+        self.released.append(name)
 
     async def room(self) -> None:
         await self.space.wait()

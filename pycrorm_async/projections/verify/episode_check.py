@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from pycrorm_async.events.blobs import references_in
 from pycrorm_async.events.ids import row_id, row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.projections.fold.fold import CannotFold, UndecodablePayload, fold_happening, happening_of
@@ -97,6 +98,8 @@ class EpisodeCheck:
         shown = event.sequence <= folded
         self._result.events += 1
         self._result.behind += not shown
+        for reference in references_in(event.type, event.payload):
+            self._result.blobs.setdefault(reference.hash, (self.number, event.sequence))
         try:
             happening = happening_of(event)
             if self._order is not None:

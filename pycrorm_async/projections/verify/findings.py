@@ -49,6 +49,7 @@ class VerifyResult:
         stopped: the parked and refused episodes; the rows of their earlier events were compared.
         unmade: by dtype, the reason why a designator type has no tables.
         failed_views: by name, the reason why a user's view is left out.
+        blobs: by hash, the first event that refers to this blob; the content of each is compared with its hash.
         outdated: the reason why no table was compared: an older fold made them. None for tables of this version.
     """
 
@@ -65,6 +66,7 @@ class VerifyResult:
     stopped: list[StoppedEpisode] = field(default_factory=list)
     unmade: Mapping[str, str] = field(default_factory=dict)
     failed_views: Mapping[str, str] = field(default_factory=dict)
+    blobs: dict[str, tuple[int | None, int | None]] = field(default_factory=dict)
     outdated: str | None = None
 
     def add_damage(self, number: int | None, sequence: int | None, reason: str) -> None:

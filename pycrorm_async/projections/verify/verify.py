@@ -13,6 +13,7 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, TablesOutdated
+from pycrorm_async.events.blobs import references_in
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.fold.parameters import Designators
@@ -77,6 +78,7 @@ async def verify(
             await within.check(log, _TablesCheck(log, result, total, report_progress))
         except TablesOutdated as fault:
             result.outdated = str(fault)
+        await _check_blobs(log, result)
         result.not_compared = await uncompared_projections(log, projections)
         for each in projections:
             if each.name not in result.not_compared:
@@ -96,12 +98,23 @@ async def _check_database(log: EventLog, result: VerifyResult) -> None:
                 result.add_damage(None, None, reason)
             names = (await connection.execute(_FINGERPRINTS)).scalars()
             for name, payload in zip(names, await dialect.declarations(connection), strict=True):
+                for reference in references_in("DescriptionDeclared", payload):
+                    result.blobs.setdefault(reference.hash, (None, None))
                 if fingerprint(payload) != name:
                     result.add_damage(None, None, f"the declaration {name} does not match its fingerprint")
             for (number,) in await connection.execute(_NUMBERS_WITHOUT_EPISODE):
                 result.add_damage(None, None, f"there are events of an episode {number}, which is not in the log")
     except DamageError as fault:
         result.add_damage(None, None, str(fault))
+
+
+async def _check_blobs(log: EventLog, result: VerifyResult) -> None:
+    """Compare the content of each blob that an event refers to with its hash."""
+    for name, (number, sequence) in result.blobs.items():
+        fault = await log.blobs.fault(name)
+        if fault is not None:
+            subject = "a declaration " if number is None else ""
+            result.add_damage(number, sequence, f"{subject}refers to blob {name}, which {fault}")
 
 
 async def _stopped(log: EventLog, episode: EpisodeRow | None) -> list[StoppedEpisode]:

@@ -7,8 +7,9 @@ being created. It loses `alive` last, so that an interrupted deletion is recover
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from pycrorm_async.events.ids import EpisodeId, parse_episode_id
 from pycrorm_async.queue.files.file_access import create_folder, create_spool, rewrite
 from pycrorm_async.queue.files.file_system import check_file_system
 from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, PROGRESS, REFUSED, TAIL
+from pycrorm_async.queue.files.names import ALIVE, BLOBS, DRAIN, MAKING, PROGRESS, REFUSED, TAIL
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path, sync_folder
 from pycrorm_async.settings import FileAccess
 
@@ -115,6 +116,8 @@ def remove_folder(folder: Path) -> None:
     remove_made_ahead(folder)
     for number in segment_numbers(folder):  # the oldest first
         segment_path(folder, number).unlink()
+    with suppress(FileNotFoundError):
+        shutil.rmtree(folder / BLOBS)
     for path in list(folder.iterdir()):
         if path.suffix in {MAKING, TAIL}:
             path.unlink()

@@ -66,11 +66,12 @@ from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.declarations import AppendState, Declarations
 from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
 
-__all__ = ["NOTHING_OPEN", "OUT_OF_RESOURCES", "Appender", "SegmentStart"]
+__all__ = ["FULL", "NOTHING_OPEN", "OUT_OF_RESOURCES", "Appender", "SegmentStart"]
 
 NOTHING_OPEN: Final[Mapping[EpisodeId, LastRecord]] = MappingProxyType({})
-_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-OUT_OF_RESOURCES: Final = _FULL | frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
+FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
+"""Errors of a full disk."""
+OUT_OF_RESOURCES: Final = FULL | frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
 """Errors that may pass: a put that meets one is refused as if the spool were full, and the sync thread retries."""
 
 
@@ -125,6 +126,8 @@ class Appender:
         self._span_checksum = 0
         self._quiet = True
         self._refused_bytes = 0
+        self.blob_bytes = 0
+        """Bytes of the blobs beside the segments, which share their limit."""
         self._disk_refused: str | None = None
         self._sealed: list[Segment] = []
         self._prepared: Segment | None = None
@@ -312,7 +315,25 @@ class Appender:
     def _spare(self) -> int:
         if self._disk_refused is not None:
             return int(self._prepared is not None)
-        return self._capacity.segments_max - len(self.begun)
+        return self._segments_left()
+
+    def _segments_left(self) -> int:
+        blobs = -(-self.blob_bytes // self._capacity.segment_bytes)
+        return max(0, self._capacity.segments_max - len(self.begun) - blobs)
+
+    def reserve_blob(self, size: int) -> bool:
+        """Take this many bytes for a blob, or return them if negative; False if records would find no space then."""
+        return self._gc_lock.run(partial(self._reserve_blob, size))
+
+    def _reserve_blob(self, size: int) -> bool:
+        if size > 0 and self._refusal is not None:
+            raise self._refusal()
+        before, self.blob_bytes = self.blob_bytes, max(0, self.blob_bytes + size)
+        if size > 0 and not self._admits(HEADER_BYTES, reserved=False):
+            self.blob_bytes = before
+            return False
+        self._set_limits()
+        return True
 
     def _set_limits(self) -> None:
         self._ordinary_end = self._capacity.ordinary_end(
@@ -324,7 +345,7 @@ class Appender:
             try:
                 return Segment.allocate(self._folder, number=number, size=self._capacity.segment_bytes)
             except OSError as error:
-                if error.errno not in _FULL or not self._make_room(self._capacity.segment_bytes):
+                if error.errno not in FULL or not self._make_room(self._capacity.segment_bytes):
                     raise
 
     def _allocation_refused(self, error: OSError) -> PycrormError:

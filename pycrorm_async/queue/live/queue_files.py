@@ -7,7 +7,8 @@ written by one thread, except those a producer or the consumer only sets to requ
 `_stored`), and each is replaced in one step, so the readers need no lock: they test their condition again after every
 notification.
 
-A turn does the following, in this order. It syncs the records put so far, appends a commit frame and syncs that. Then
+A turn does the following, in this order. It syncs the blobs and records put so far, appends a commit frame and syncs
+that. Then
 it compares the files it holds with those in the folder, because syncing a deleted file succeeds, and only then advances
 `_synced`. It exchanges positions with the drainer of another process. It deletes the segments whose records are all
 stored, and prepares the next segment.
@@ -31,6 +32,7 @@ from pathlib import Path
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import DamageError, FilesError, InternalError, PycrormError, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.queue.blobs.live_blobs import LiveBlobs
 from pycrorm_async.queue.files.drain_status import DrainStatus, DrainStatusReader
 from pycrorm_async.queue.files.locks import FileIdentity, FileLock
 from pycrorm_async.queue.files.names import ALIVE
@@ -87,6 +89,11 @@ class QueueFiles:
         self._safe_number = 0
         self._sync_interval_s = settings.sync_interval_ms / 1000
         self._stored_segments = StoredSegments(folder.parent, settings, wall_ns=clock.wall_ns)
+        self._blobs = LiveBlobs(
+            folder,
+            reserve=self._reserve_blob,
+            make_room=self._stored_segments.make_room,
+        )
         self._sync_thread = SyncThread(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
         with wrap_os_errors(folder):
             self._appender = self._appender_in(folder, recorder)
@@ -218,6 +225,7 @@ class QueueFiles:
             return
         for segment in span.segments:
             segment.sync()
+        self._note_lost_blobs(self._blobs.sync())
         # Append the commit frame only now: if it were synced together with its records, a power cut could keep the
         # frame and lose a record, and an ordinary torn tail would look like damage.
         committed = self._appender.append_commit(span)
@@ -230,6 +238,14 @@ class QueueFiles:
         if self._drain_status is not None:
             self._publish(self._drain_status)  # before waiters of this process run
         self._notifier.notify_all()
+
+    def _reserve_blob(self, size: int) -> bool:
+        return self._appender.reserve_blob(size)  # of the current appender, which a move replaces
+
+    def _note_lost_blobs(self, names: Sequence[str]) -> None:
+        if names:
+            self._lost += tuple(f"blob {name}" for name in names)
+            _log.error("%s: these blobs were deleted before they were stored: %s", self.folder, ", ".join(names))
 
     # --- moving ------------------------------------------------------------------------------------------------
 
@@ -296,6 +312,8 @@ class QueueFiles:
 
         Notes the lost records here, because the rest of the move may fail and be retried from the new folder.
         """
+        self._blobs.move_to(home.place.folder)
+        home.appender.blob_bytes = self._blobs.size
         self._lost += lost
         if home.alive is not self._home.alive:
             self._former_locks.append(self._home.alive)
@@ -326,7 +344,8 @@ class QueueFiles:
     def _trim(self) -> None:
         segments = self._appender.trimmable(stored=self._stored, safe_number=self._safe_number)
         for segment in segments:
-            self._stored_segments.keep(segment.path)
+            following = self._appender.begun[self._appender.begun.index(segment) + 1]
+            self._stored_segments.keep(segment.path, blobs=self._blobs.take(before=following.base))
         if segments:
             self._appender.trimmed(segments)
             self._room_notifier.notify_all()

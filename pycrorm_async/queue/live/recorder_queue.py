@@ -102,6 +102,22 @@ class RecorderQueue(QueueFiles):
         except Relocated:  # the queue moved while this thread waited for the lock
             return self.put_nowait(heading, payload, reserved=reserved)
 
+    def put_blob(self, content: bytes) -> str:
+        """Write a blob and return its name, the SHA-256 of the content, for events put afterwards to refer to.
+
+        Any thread may call it. On return the blob survives `kill -9`, and it is synced and stored before any event put
+        afterwards. It is kept as long as the events put until `release_blob`, which the caller calls once for each put.
+
+        Raises `SpoolFull` without waiting if it does not fit, `SpoolClosed` as `put_nowait` does, and
+        `SpoolUnavailable` if the disk refuses it.
+        """
+        with wrap_os_errors(self.folder):
+            return self._blobs.put(content)
+
+    def release_blob(self, name: str) -> None:
+        """State that no event put from now on refers to this blob because of one of its puts."""
+        self._blobs.release(name, self.written)
+
     @property
     def full(self) -> bool:
         """True if an event that is not reserved, as large as the largest one refused so far, would be refused now."""
@@ -168,8 +184,8 @@ class RecorderQueue(QueueFiles):
 
     @property
     def bytes_spooled(self) -> int:
-        """Bytes of all segments not deleted yet; the current one counts up to the end of its last frame."""
-        return self._appender.bytes_held
+        """Bytes of all blobs and segments not deleted yet; the current segment counts up to its last frame's end."""
+        return self._appender.bytes_held + self._blobs.size
 
     async def synced_to(self, position: int | None = None) -> None:
         """Wait until the records up to this position, by default all written ones, are synced.
@@ -298,7 +314,7 @@ class RecorderQueue(QueueFiles):
             *full, last = self._appender.begun
             for segment in full:
                 self._stored_segments.keep(segment.path)
-            self._stored_segments.keep(last.path, length=self._appender.end)
+            self._stored_segments.keep(last.path, length=self._appender.end, blobs=self._blobs.take_all())
 
     def _abandon(self) -> None:
         """Detach in a forked child: the queue belongs to the parent. The locks close their own copies there."""
@@ -306,5 +322,6 @@ class RecorderQueue(QueueFiles):
         self._failure = SpoolClosed(f"queue {self.name} belongs to the process that forked this one")
         failure = self._failure
         self._appender.abandon(lambda: failure)
+        self._blobs.abandon()
         self._source.reader.close()
         self._notifier, self._room_notifier = Notifier(), Notifier()

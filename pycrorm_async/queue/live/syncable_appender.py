@@ -69,7 +69,7 @@ class SyncableAppender(Appender):
 
     def prepare(self) -> bool:
         """Allocate the next segment ahead if there is none; True if the disk has no space. Raises `OSError`."""
-        if self._prepared is not None or len(self.begun) >= self._capacity.segments_max:
+        if self._prepared is not None or not self._segments_left():
             return False
         try:
             # Holding `_gc_lock` during the allocation would block producers. Without it a finalizer could record in

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 from pycrorm_async.errors import SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
+from pycrorm_async.queue.blobs.blob_files import blob_bytes, blob_files
 from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame
 from pycrorm_async.queue.files.locks import is_locked
-from pycrorm_async.queue.files.names import ALIVE, DRAIN, MAKING, MENDED, PROGRESS, TAIL
+from pycrorm_async.queue.files.names import ALIVE, BLOBS, DRAIN, MAKING, MENDED, PROGRESS, TAIL
 from pycrorm_async.queue.files.recorder_folder import folder_error, is_folder_name, parse_folder_name, wrap_os_errors
 from pycrorm_async.queue.files.scan import Survey, survey, tails
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
@@ -79,7 +80,8 @@ class FolderReport:
         path: the folder.
         alive: the recorder's process lives; for dead letters, a drainer may add more.
         being_drained: a process holds `drain`.
-        bytes_spooled: size of the segments; a living recorder allocates them in advance.
+        bytes_spooled: size of the segments and blobs; a living recorder allocates segments in advance.
+        blobs: number of blobs that are not deleted yet.
         recorded, drained: the two parts of `progress`; None for a dead recorder and for one that drains itself.
         refused: why the folder could not be examined: another recorder's file, a newer format, an OS error.
     """
@@ -92,6 +94,7 @@ class FolderReport:
     recorded: RecorderStatus | None = None
     drained: DrainStatus | None = None
     refused: str | None = None
+    blobs: int = 0
 
 
 @dataclass(frozen=True)
@@ -216,13 +219,20 @@ def inspect_recorder(recorder: RecorderFolder) -> RecorderReport:
 
 
 def _look(recorder: RecorderFolder) -> FolderReport:
-    name, path, alive = recorder.name, str(recorder.path), recorder.alive
-    being_drained, spooled = is_locked(recorder.path / DRAIN), _bytes(recorder.path)
-    progress = Progress.open(recorder.path, writing=False) if alive else None
+    blobs = blob_files(recorder.path)
+    state = FolderReport(
+        recorder.name,
+        str(recorder.path),
+        recorder.alive,
+        being_drained=is_locked(recorder.path / DRAIN),
+        bytes_spooled=_bytes(recorder.path) + blob_bytes(blobs),
+        blobs=len(blobs),
+    )
+    progress = Progress.open(recorder.path, writing=False) if recorder.alive else None
     if progress is None:
-        return FolderReport(name, path, alive, being_drained, spooled)
+        return state
     try:
-        return FolderReport(name, path, alive, being_drained, spooled, progress.recorded(), progress.drained())
+        return replace(state, recorded=progress.recorded(), drained=progress.drained())
     finally:
         progress.close()
 
@@ -266,7 +276,7 @@ def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
     count, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or state.being_drained)
     entries = [each.name for each in folder.iterdir()]
     numbers = {*prefix.numbers, *segment_numbers(folder)}  # also those begun or deleted since the scan
-    ours = {ALIVE, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in numbers)}
+    ours = {ALIVE, BLOBS, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in numbers)}
     others = sorted(_text(each) for each in entries if each not in ours)
     return RecorderReport(
         **vars(state),

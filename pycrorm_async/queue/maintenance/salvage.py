@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.blobs.blob_files import carry_blobs
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Frame, encode_span
 from pycrorm_async.queue.files.recorder_folder import parse_folder_name, write_durably
 from pycrorm_async.queue.files.scan import Survey, check_record, whole_frames
@@ -56,8 +57,9 @@ class Salvage:
         self._dropped: dict[EpisodeId, list[Frame]] = {}
 
     def run(self) -> None:
-        """Write the new folder's segments. Raises `OSError`."""
+        """Write the new folder's blobs and segments. Raises `OSError`."""
         prefix = self._survey.prefix
+        carry_blobs(self._damaged, self._repaired)
         if self.headless:
             self._begin_without_header()
         for number in sorted(prefix.bases):

@@ -1,9 +1,10 @@
 """Keep segments after all their records are stored, to refill a log that went back.
 
     spool/stored/<log id>/<recorder>/00000001.segment
+    spool/stored/<log id>/<recorder>/00000001.segment.blobs/<sha256>
 
-One rename moves a segment here instead of deleting it; it is not written again. Segments stored in another log, before
-an empty spool was bound to this one, are in that log's folder.
+One rename moves a segment here instead of deleting it; it is not written again. Its blobs are deleted with it. Segments
+stored in another log, before an empty spool was bound to this one, are in that log's folder.
 
 Kept segments duplicate records of the database, so they must not compete with records still to be stored. They are
 deleted, oldest first, after `keep_stored_s`, above `keep_stored_bytes`, above `FILES_MAX`, and when the disk is full.
@@ -13,12 +14,14 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.queue.blobs.blob_files import blob_bytes, keep_blobs, kept_with
 from pycrorm_async.queue.files.file_access import create_folders
 from pycrorm_async.queue.files.names import STORED
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
@@ -39,7 +42,7 @@ _log = logging.getLogger("pycrorm_async")
 
 
 class KeptSegment(NamedTuple):
-    """A kept segment. `stored_ns` is the wall time at which its records were all stored, or later."""
+    """A kept segment with its blobs. `stored_ns` is the wall time at which its records were all stored, or later."""
 
     stored_ns: int
     bytes: int
@@ -78,7 +81,16 @@ def _segments(folder: Path) -> Iterator[KeptSegment]:
             with suppress(FileNotFoundError):
                 status = path.stat()
                 after_ns = max(after_ns, status.st_mtime_ns)  # keeps the order by number if the clock was set back
-                yield KeptSegment(after_ns, -(-status.st_size // _BLOCK_BYTES) * _BLOCK_BYTES, path)
+                yield KeptSegment(after_ns, _rounded(status.st_size) + _blob_bytes(path), path)
+
+
+def _blob_bytes(segment: Path) -> int:
+    blobs = kept_with(segment)
+    return sum(_rounded(blob_bytes([each])) for each in blobs.iterdir()) if blobs.is_dir() else 0
+
+
+def _rounded(size: int) -> int:
+    return -(-size // _BLOCK_BYTES) * _BLOCK_BYTES
 
 
 class StoredSegments:
@@ -92,14 +104,16 @@ class StoredSegments:
         self._pruned_ns: int | None = None
         self._bytes = 0
 
-    def keep(self, segment: Path, *, length: int | None = None) -> None:
-        """Move a segment here, truncated to `length`; delete it if it cannot be kept. Raises `OSError`.
+    def keep(self, segment: Path, *, length: int | None = None, blobs: Sequence[Path] = ()) -> None:
+        """Move a segment and these blobs here; delete them if they cannot be kept. Raises `OSError`.
 
-        No process may have the truncated part mapped, because reading it would raise SIGBUS.
+        Truncates the segment to `length`. No process may have the truncated part mapped, because reading it would raise
+        SIGBUS.
         """
-        kept_bytes = self._move(segment, length) if self._keep_ns and self._keep_bytes else 0
+        kept_bytes = self._move(segment, length, blobs) if self._keep_ns and self._keep_bytes else 0
         if not kept_bytes:
-            segment.unlink(missing_ok=True)
+            for path in (*blobs, segment):
+                path.unlink(missing_ok=True)
             return
         self._bytes += kept_bytes
         now_ns = self._wall_ns()
@@ -139,8 +153,8 @@ class StoredSegments:
                 freed += each.bytes
         return freed > 0
 
-    def _move(self, segment: Path, length: int | None) -> int:
-        """Move a segment; return its size in bytes, or 0 if it cannot be kept."""
+    def _move(self, segment: Path, length: int | None, blobs: Sequence[Path]) -> int:
+        """Move a segment and its blobs; return their size in bytes, or 0 if they cannot be kept."""
         try:
             folder = stored_in(self._spool, Spool(self._spool).log_id())
             if folder is None:
@@ -153,8 +167,9 @@ class StoredSegments:
             for _ in range(_ATTEMPTS):
                 create_folders(self._spool, target.parent)
                 with suppress(FileNotFoundError):  # another process deleted the folder, which was empty
+                    keep_blobs(self._spool, blobs, target)
                     segment.rename(target)
-                    return target.stat().st_size
+                    return target.stat().st_size + _blob_bytes(target)
         except FileNotFoundError:  # a process that was then killed has moved it already
             return 0
         except (OSError, SpoolUnavailable) as error:
@@ -167,6 +182,7 @@ class StoredSegments:
 
 
 def _delete(segment: Path) -> None:
+    shutil.rmtree(kept_with(segment), ignore_errors=True)
     segment.unlink(missing_ok=True)
     with suppress(OSError):  # it contains more segments
         segment.parent.rmdir()

@@ -31,6 +31,8 @@ from typing import NamedTuple
 from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.queue.blobs.blob_files import blob_files
+from pycrorm_async.queue.blobs.lost_blobs import truncate_at_lost_blob
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.names import ALIVE, DRAIN, MENDED
 from pycrorm_async.queue.files.recorder_folder import (
@@ -66,6 +68,7 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool
                 return None
             locks.callback(lock.release)
         recorder = parse_folder_name(folder.name).recorder
+        truncate_at_lost_blob(folder, recorder)
         if check:
             scan(folder, recorder)
         return DeadSource(folder, recorder, locks, stored)
@@ -188,19 +191,23 @@ class DeadSource:
         count = len(self.lost)
         return f"is recovered ({count} episode{'s' * (count != 1)} LOST)" if count else "is recovered"
 
-    def _delete_segment(self, segment: Path, *, length: int | None = None) -> None:
+    def _delete_segment(self, segment: Path, *, length: int | None = None, blobs: Sequence[Path] = ()) -> None:
         if self._stored_segments is None:
             segment.unlink(missing_ok=True)
         else:
-            self._stored_segments.keep(segment, length=length)
+            self._stored_segments.keep(segment, length=length, blobs=blobs)
 
     def _keep_last_segments(self) -> None:
-        """Move the remaining segments to the stored ones, truncated at the cut; one without a record is not kept."""
+        """Move the remaining segments to the stored ones, truncated at the cut; one without a record is not kept.
+
+        All blobs are kept with the last segment.
+        """
         cut = self._scanner.prefix.cut
-        for number, base in sorted(self._scanner.prefix.bases.items()):
-            if base <= cut.position:
-                length = cut.offset if number == cut.number else None
-                self._delete_segment(segment_path(self.folder, number), length=length)
+        numbers = [number for number, base in sorted(self._scanner.prefix.bases.items()) if base <= cut.position]
+        for number in numbers:
+            length = cut.offset if number == cut.number else None
+            blobs = blob_files(self.folder) if number == numbers[-1] else []
+            self._delete_segment(segment_path(self.folder, number), length=length, blobs=blobs)
 
     def _scan_further(self) -> bool:
         """Scan and sync the next segment; False if there is none."""

@@ -12,6 +12,7 @@ __all__ = [
     "MIGRATIONS",
     "INCARNATION",
     "HAS_INCARNATION",
+    "BLOB",
     "TABLE_NAMES",
     "HAS_TABLE",
     "READ_LOG",
@@ -177,6 +178,23 @@ CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_incarnation (
 )"""
 """Created when a log is first found to have gone back. Not part of the format: older programs still use the log."""
 HAS_INCARNATION = f"SELECT pg_catalog.to_regclass('{LOG}.pycrorm_incarnation') IS NOT NULL"
+
+BLOB = (
+    f"""
+CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_blob (
+    hash text NOT NULL,
+    part bigint NOT NULL,
+    parts bigint NOT NULL,
+    media_type text NOT NULL,
+    size bigint NOT NULL,
+    content bytea NOT NULL,
+    PRIMARY KEY (hash, part)
+)""",
+    f"""
+CREATE OR REPLACE TRIGGER blob_is_not_changed BEFORE UPDATE OR DELETE OR TRUNCATE ON {LOG}.pycrorm_blob
+FOR EACH STATEMENT EXECUTE FUNCTION {LOG}.refuse_change()""",
+)
+"""Created with the first blob. Not part of the format: older programs still use the log."""
 
 TABLE_NAMES = f"""
 SELECT relname FROM pg_catalog.pg_class WHERE relnamespace = pg_catalog.to_regnamespace('{LOG}')::oid"""  # noqa: S608

@@ -41,6 +41,7 @@ class SQLite:
     """Implements `Dialect`. A batch takes few statements: `executemany` releases the interpreter lock at every row."""
 
     migrations: Migrations = tables.MIGRATIONS
+    blob_table: Sequence[str] = tables.BLOB
     faults: tuple[type[Exception], ...] = (
         DBAPIError,
         sqlite3.Error,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 
-__all__ = ["MIGRATIONS", "INCARNATION", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
+__all__ = ["MIGRATIONS", "INCARNATION", "BLOB", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
 
 
 def _refuse(name: str, change: str, table: str) -> str:
@@ -85,6 +85,22 @@ CREATE TABLE IF NOT EXISTS pycrorm_incarnation (
     reason TEXT NOT NULL
 ) STRICT"""
 """Created when a log is first found to have gone back. Not part of the format: older programs still use the log."""
+
+BLOB = (
+    """
+CREATE TABLE IF NOT EXISTS pycrorm_blob (
+    hash TEXT NOT NULL,
+    part INTEGER NOT NULL,
+    parts INTEGER NOT NULL,
+    media_type TEXT NOT NULL,
+    size INTEGER NOT NULL,
+    content BLOB NOT NULL,
+    PRIMARY KEY (hash, part)
+) STRICT""",
+    _refuse("IF NOT EXISTS blob_is_not_updated", "UPDATE", "pycrorm_blob"),
+    _refuse("IF NOT EXISTS blob_is_not_deleted", "DELETE", "pycrorm_blob"),
+)
+"""Created with the first blob. Not part of the format: older programs still use the log."""
 
 TABLE_NAMES = (
     "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"

@@ -1,0 +1,1 @@
+"""Keep the blobs of a recorder beside its segments until the database has them."""
