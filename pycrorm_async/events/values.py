@@ -76,12 +76,16 @@ class ObjectValue(_Value, frozen=True):
 
 
 class RobotValue(_Value, frozen=True):
-    """The robot at the start of a node: base pose, torso joint position in metres (None without a torso)."""
+    """The robot that acted at the start of a node: base pose, torso joint position in metres (None without a torso).
+
+    `name` is that of its object in the world; None in events of version 0.1.0.
+    """
 
     pose: PoseValue
     object_type: str
     torso_height: float | None = None
     object: ObjectReference | None = None
+    name: str | None = None
 
 
 class FailureValue(_Value, frozen=True):

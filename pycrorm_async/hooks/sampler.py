@@ -28,22 +28,23 @@ from pycrorm_async.events.types import StateSampled
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.world.objects import Object
+from pycrorm_async.world.robots.acting_robot import acting_robot
 
 __all__ = ["Sampler"]
 
 
 class _Motion:
-    """A running motion: its node, and the values last written of its robot's channels.
+    """A running motion: its node, the robot that acts, and the values last written of its channels.
 
     `is_full` is set once a sample reached the episode's `continue_at`; then only the last sample of the motion is
     still taken, to save sequences until the episode continues in a follow-up.
     """
 
-    def __init__(self, episode: Episode, node: int) -> None:
+    def __init__(self, episode: Episode, node: int, robot: Object) -> None:
         self.episode = episode
         self.node = node
-        self.robot: Object | None = None
-        self.written: dict[str, float] = {}
+        self.robot = robot
+        self.written: dict[str, float] | None = None
         self.is_full = False
         self.is_over = False
 
@@ -68,13 +69,14 @@ class Sampler:
         self.omitted = 0
 
     def begin(self, episode: Episode, node: int) -> None:
-        """Start sampling the motion of this node; do nothing without a robot."""
-        if episode.world is None or episode.world.world.robot is None:
+        """Start sampling the robot that acts in this context until the motion of this node ends, if there is one."""
+        robot = acting_robot(episode.world.world) if episode.world is not None else None
+        if robot is None:
             return
         with self._changed:
             if self._closed:
                 return
-            motion = self._running[episode, node] = _Motion(episode, node)
+            motion = self._running[episode, node] = _Motion(episode, node, robot)
             self._sample(motion, margin=0.0)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="pycrorm sampler", daemon=True)
@@ -113,7 +115,7 @@ class Sampler:
             if node is None:
                 motion.is_over = True
                 continue
-            motion.node, motion.robot, motion.is_full = node, None, False
+            motion.node, motion.written, motion.is_full = node, None, False
             self._running[episode, node] = motion
 
     def close(self) -> None:
@@ -147,12 +149,17 @@ class Sampler:
 
     def _sample(self, motion: _Motion, *, margin: float) -> None:
         recorded_world = motion.episode.world
-        robot = recorded_world.world.robot if recorded_world is not None else None
-        reference = recorded_world.reference(robot) if recorded_world is not None and robot is not None else None
-        if recorded_world is None or robot is None or reference is None:
+        if recorded_world is None:
+            return
+        world = recorded_world.world
+        robot = motion.robot if world.has(motion.robot) else world.robot  # another may have taken its place
+        reference = recorded_world.reference(robot) if robot is not None else None
+        if robot is None or reference is None:
             return
         if robot is not motion.robot:
-            motion.robot, motion.written = robot, dict(recorded_world.sampled.get(robot, {}))
+            motion.robot, motion.written = robot, None
+        if motion.written is None:
+            motion.written = dict(recorded_world.sampled.get(robot, {}))
         written = motion.written
         changed = {
             channel: value

@@ -40,6 +40,7 @@ from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.robots.acting_robot import acting_robot
 from pycrorm_async.world.world_copy import counterpart, related
 
 __all__ = ["WorldRecorder"]
@@ -67,7 +68,7 @@ class WorldRecorder:
         self._emitter = emitter
         self._episode = episode
         self._references: dict[Object, ObjectReference] = {}
-        self._robot_pose: tuple[Pose, PoseValue] | None = None
+        self._robots: dict[Object, tuple[Pose, PoseValue, str]] = {}
         for each in world.objects:
             self.object_added(each)
         for each in world.objects:
@@ -94,20 +95,22 @@ class WorldRecorder:
         return row
 
     def robot(self) -> RobotValue | None:
-        """Return the robot's current base pose and torso height; None without a robot."""
-        robot = self.world.robot
+        """Return base pose and torso height of the robot that acts in this context; None without a robot."""
+        robot = acting_robot(self.world)
         if robot is None:
             return None
         pose = robot.pose
-        if self._robot_pose is None or self._robot_pose[0] is not pose:
-            self._robot_pose = (pose, pose_value(pose))
+        recorded = self._robots.get(robot)
+        if recorded is None or recorded[0] is not pose:
+            self._robots[robot] = recorded = (pose, pose_value(pose), clean(robot.name))
         description = robot.robot_description
         torso = description.torso_joint if description is not None else None
         return RobotValue(
-            self._robot_pose[1],
+            recorded[1],
             robot.object_type.name,
             robot.joint_position(torso) if torso is not None else None,
             self._references.get(robot),
+            recorded[2],
         )
 
     # --- the world's observer ---------------------------------------------------------------------------------
@@ -126,6 +129,7 @@ class WorldRecorder:
 
     def object_removed(self, removed: Object) -> None:
         reference = self._references.pop(removed, None)
+        self._robots.pop(removed, None)
         if reference is not None:
             self._put(lambda: ObjectRemoved(reference, self._causing_node()))
 

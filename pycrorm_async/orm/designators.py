@@ -141,6 +141,7 @@ class Designator(RowOfEvent, Base):
         parameters: its fields as recorded. Deferred: load them with `undefer(Action.parameters)` or
             `await action.awaitable_attrs.parameters`.
         status, start_time, end_time, reason: of its node. A type with a field of such a name has the field instead.
+        robot: the name of the robot that acted; None without one. Likewise.
         duration: of its node, in s; None while it runs, and if it is LOST.
         sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode.
         episode: the same as `process_metadata`.
@@ -179,6 +180,7 @@ class Designator(RowOfEvent, Base):
     _duration: Mapped[float | None] = mapped_column("duration")
     _reason: Mapped[str | None] = mapped_column("reason")
     _end_sequence: Mapped[int | None] = mapped_column("end_sequence")
+    _robot: Mapped[str | None] = mapped_column("robot")
 
     robot_state: Mapped[RobotState | None] = relationship(viewonly=True, lazy="selectin")
     items: Mapped[list[ParameterItem]] = relationship(
@@ -220,6 +222,11 @@ class Designator(RowOfEvent, Base):
     def end_sequence(self) -> int | None:
         """The event of its node's end; None while it runs, and if it is LOST."""
         return self._end_sequence
+
+    @hybrid_property
+    def robot(self) -> str | None:
+        """The name of the robot that acted; None without one."""
+        return self._robot
 
     @hybrid_property
     def episode(self) -> ProcessMetaData:

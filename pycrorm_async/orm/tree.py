@@ -35,6 +35,7 @@ class TaskTreeNode(RowOfEvent, Base):
         duration: in s; None while it runs, and if it is LOST.
         reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
         result: the return value of perform, as JSON.
+        robot: the name of the robot that acted; None without one.
         simulated: whether it belongs to a simulation, performed in a copy of the world.
     """
 
@@ -59,6 +60,7 @@ class TaskTreeNode(RowOfEvent, Base):
     robot_pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
     torso_height: Mapped[float | None]
     robot_object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    robot: Mapped[str | None]
     simulated: Mapped[bool]
     duration: Mapped[float | None]
 

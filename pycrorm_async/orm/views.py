@@ -33,6 +33,7 @@ class PickUpWithContextView(Base):
             are deferred: select them by name, as in `select(PickUpWithContextView.object_z)`.
         height_over_torso: height of the object above the robot's torso, m: its z minus that of the robot's base minus
             `torso_height`. The reach of an arm depends on it. Deferred.
+        robot: the name of the robot; None if a memory of version 0.1.0 recorded it. Deferred.
     """
 
     __tablename__ = "PickUpWithContextView"
@@ -59,6 +60,7 @@ class PickUpWithContextView(Base):
     object_qz: Mapped[float] = mapped_column(deferred=True)
     object_qw: Mapped[float] = mapped_column(deferred=True)
     height_over_torso: Mapped[float | None] = mapped_column(deferred=True)
+    robot: Mapped[str | None] = mapped_column(deferred=True)
 
 
 class RootFailure(RowOfEvent, Base):

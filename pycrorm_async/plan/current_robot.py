@@ -12,6 +12,7 @@ from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import NoWorld
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.robots.acting_robot import acting_robot
 from pycrorm_async.world.robots.robot_description import ArmDescription, RobotDescription
 
 if TYPE_CHECKING:
@@ -59,9 +60,12 @@ def require_world() -> BulletWorld:
 
 
 def require_robot() -> CurrentRobot:
-    """Return the robot of the current world. Raises `NoWorld`, `NoRobotHere`."""
-    body = require_world().robot
+    """Return the robot that acts in the current world (`robot_acting`). Raises `NoWorld`, `NoRobotHere`."""
+    world = require_world()
+    body = acting_robot(world)
     if body is None:
+        if world.robot is not None:
+            raise NoRobotHere("the robot that acts here (robot_acting) is not in the current world")
         raise NoRobotHere('no robot in the world: add one, e.g. Object("pr2", ObjectType.ROBOT)')
     description = body.robot_description
     if description is None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         SemanticCostmap,
         VisibilityCostmap,
     )
+    from pycrorm_async.world.robots.acting_robot import acting_robot, robot_acting
     from pycrorm_async.world.robots.robot_description import Limits, RobotDescription, robot_description
     from pycrorm_async.world.state import WorldState
     from pycrorm_async.world.world_copy import copied
@@ -50,6 +51,8 @@ __all__ = [
     "Limits",
     "RobotDescription",
     "robot_description",
+    "robot_acting",
+    "acting_robot",
     "Costmap",
     "OccupancyCostmap",
     "GaussianCostmap",
@@ -70,6 +73,7 @@ _NAMES_BY_MODULE = {
     "objects": ("Object",),
     "pose": ("Pose", "Quaternion", "Vector"),
     "robots.robot_description": ("Limits", "RobotDescription", "robot_description"),
+    "robots.acting_robot": ("acting_robot", "robot_acting"),
     "state": ("WorldState",),
     "observers": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),
 }

@@ -51,6 +51,8 @@ class Object:
         pose: pose of the root link's frame, in "map"; None means the origin. `reset` restores it.
         world: the world to add it to; None means the current world of this context.
         color: red, green, blue, opacity, 0 to 1.
+        robot: the description of a robot; None means the one with the object's name. It has the built-in shape of its
+            name too.
 
     Raises:
         ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused.
@@ -76,6 +78,7 @@ class Object:
         *,
         world: BulletWorld | None = None,
         color: Color | None = None,
+        robot: RobotDescription | None = None,
     ) -> None:
         _check_identity(name, object_type)
         world = world if world is not None else current_world.get()
@@ -89,10 +92,12 @@ class Object:
         self.world = world
         self.copy_of = None
         self.original_pose = _check_pose(name, pose if pose is not None else Pose())
-        self.description_text = urdf_text(
-            name, built_in_urdf(name, object_type) if description is None else description
-        )
-        self.robot_description = robot_description(name) if object_type is ObjectType.ROBOT else None
+        if description is None:
+            description = built_in_urdf(name if robot is None else robot.name, object_type)
+        self.description_text = urdf_text(name, description)
+        if robot is None and object_type is ObjectType.ROBOT:
+            robot = robot_description(name)
+        self.robot_description = robot
         self.body = Body(name, self.description_text, client, self.original_pose, color)
         world.add(self)
 

@@ -112,7 +112,7 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
     script = Script()
     robot_row = script.put(ObjectAdded("pr2", "ROBOT", pose(), {"torso_lift_joint": 0.25, "wheel": -1.5}))
     root = script.put(NodeStarted("root"))
-    robot = RobotValue(pose(1.5, -2.0, 0.0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot_row, robot_row))
+    robot = RobotValue(pose(1.5, -2.0, 0.0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot_row, robot_row), "pr2")
     node = script.put(
         NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(3, 4, 5)}, robot, simulated=True)
     )
@@ -133,11 +133,11 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
         "task_tree_node": [
             (
                 row(2), 1, None, "root", None, "RUNNING", time_us(2), None, 2_000_000_005, None, None,
-                None, None, None, None, None, None, None, None, False,
+                None, None, None, None, None, None, None, None, None, None, False,
             ),
             (
                 row(3), 1, row(2), "action", "NavigateAction", "RUNNING", time_us(3), None, 3_000_000_005, None, None,
-                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), True,
+                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), "pr2", True,
             ),
         ],
     }  # fmt: skip
@@ -153,7 +153,7 @@ def test_a_node_that_ends_in_the_batch_it_started_in_is_one_insert() -> None:
     assert list(rows.nodes.values()) == [
         [
             row(1), 1, None, "action", "SayingAction", "FAILED", time_us(1), time_us(2), 1_000_000_005, 2_000_000_005,
-            2, "IKError", "no way", '["left",1]', '{"said":[1,null]}', None, None, None, None, False,
+            2, "IKError", "no way", '["left",1]', '{"said":[1,null]}', None, None, None, None, None, False,
         ]
     ]  # fmt: skip
 

@@ -4,9 +4,10 @@ Theory of operation
 -------------------
 
 The outermost parallel expression creates an `Arbiter`; every node inside it that declares `resources` makes a `Claim`
-before it starts. A part is a pair of world and resource, so branches in different worlds do not compete. A claim is in
-one of three states: waiting, holding, or released. It gets all its parts together or none, and holds them until its
-node ends. Claims form a tree through `parent`, which is the claim of the nearest ancestor node.
+before it starts. A part is a pair of the acting robot (without a robot, the world) and resource, so branches in
+different worlds, or of different robots, do not compete. A claim is in one of three states: waiting, holding, or
+released. It gets all its parts together or none, and holds them until its node ends. Claims form a tree through
+`parent`, which is the claim of the nearest ancestor node.
 
 A claim can be granted if no claim other than its ancestors holds one of its parts: a node may use the parts of its
 ancestors, but two nodes that run in parallel inside one holder exclude each other. Grants follow the order of
@@ -35,6 +36,7 @@ from pycrorm_async.plan.execution.execution_context import ExecutionContext, exe
 from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.plan.language.resources import Resource
 from pycrorm_async.world.observers import current_world
+from pycrorm_async.world.robots.acting_robot import acting_robot
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import Designator
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["Arbiter", "Claim"]
 
 Part: TypeAlias = tuple[Any, Resource]
-"""A part of the robot of one world."""
+"""A part of one robot."""
 
 
 class Claim:
@@ -98,7 +100,8 @@ class Arbiter:
         if not resources or asyncio.get_running_loop() is not self.loop:
             return None
         world = current_world.get()
-        claim = Claim(self, designator, frozenset((world, resource) for resource in resources), context.claim)
+        robot = (acting_robot(world) or world) if world is not None else None
+        claim = Claim(self, designator, frozenset((robot, resource) for resource in resources), context.claim)
         self._check_deadlock(claim)
         self._waiting.append(claim)
         self._grant()

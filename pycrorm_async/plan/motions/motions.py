@@ -22,6 +22,7 @@ from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.robots.acting_robot import acting_robot
 
 __all__ = [
     "MoveMotion",
@@ -152,7 +153,7 @@ class MoveJointsMotion(BaseMotion):
 
     def resources(self) -> frozenset[Resource]:
         world = current_world.get()
-        robot = world.robot if world is not None else None
+        robot = acting_robot(world) if world is not None else None
         description = robot.robot_description if robot is not None else None
         return moving(self.names, description) if description is not None else NOTHING
 

@@ -43,6 +43,7 @@ from pycrorm_async.projections.fold.node_row import (
     KIND,
     PARENT_ID,
     PROCESS_METADATA_ID,
+    ROBOT,
     ROBOT_OBJECT_ID,
     ROBOT_POSE_ID,
     ROBOT_TYPE,
@@ -166,6 +167,7 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
         columns[TORSO_HEIGHT] = robot.torso_height
         columns[ROBOT_TYPE] = robot.object_type
         columns[ROBOT_OBJECT_ID] = robot_object
+        columns[ROBOT] = robot.name
     if designator is not None:
         columns[DTYPE] = designator.dtype
         rows.leaves.setdefault(designator.leaf, []).append(leaf)

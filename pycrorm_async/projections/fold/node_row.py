@@ -30,8 +30,9 @@ from pycrorm_async.projections.schema import tables
     TORSO_HEIGHT,
     ROBOT_TYPE,
     ROBOT_OBJECT_ID,
+    ROBOT,
     SIMULATED,
-) = range(20)
+) = range(21)
 assert [each.lower() for each in globals() if each.isupper()] == [*tables.CORE["task_tree_node"]], "the order differs"
 
 OUTCOME: Final = slice(REASON, RESULT + 1)

@@ -69,6 +69,7 @@ def pick_ups_with_context(
             node.c.id.label("node_id"),
             *_seen_from(place.c, robot.c),
             (place.c.z - robot.c.z - node.c.torso_height).label("height_over_torso"),
+            node.c.robot,
         )
         .select_from(picked)
         .join(node, node.c.id == picked.c.id)

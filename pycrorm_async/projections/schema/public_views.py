@@ -217,9 +217,9 @@ def _duration(nodes: Table) -> ColumnElement[Any]:
 
 
 def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
-    """Return the columns that say when a node was performed, by time and by event, and how it ended."""
+    """Return the columns that say when a node was performed, by time and by event, by which robot, and how it ended."""
     times = nodes.c.start_time, nodes.c.end_time, _duration(nodes)
-    return nodes.c.status, *times, nodes.c.reason, *_sequence(nodes), nodes.c.end_sequence
+    return nodes.c.status, *times, nodes.c.reason, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot
 
 
 def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:

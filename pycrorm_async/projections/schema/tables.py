@@ -91,6 +91,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "torso_height": "real",
         "robot_type": "text",
         "robot_object_id": "object",
+        "robot": "text",
         "simulated": "boolean",
     },
     "pose": {"id": "key", "process_metadata_id": "row", **_POSE, "time": "time"},
@@ -232,7 +233,7 @@ _INDEXED = {
 _SECOND_COLUMNS = {("task_tree_node", "dtype"): ("status",)}
 """Further key columns of an index, after its first: learning queries filter the nodes of a type by status."""
 
-_INCLUDES = {("task_tree_node", "dtype"): ("id", "robot_pose_id", "torso_height", "simulated")}
+_INCLUDES = {("task_tree_node", "dtype"): ("id", "robot_pose_id", "torso_height", "robot", "simulated")}
 """Columns stored in PostgreSQL's index without being part of its key. An index-only scan saves reading a page for each
 node, so the learning query over 50,000 pick-ups takes some 70 ms instead of 100."""
 

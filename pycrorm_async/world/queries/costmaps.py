@@ -24,6 +24,7 @@ from pycrorm_async.world.errors import CostmapMismatch
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Vector
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+from pycrorm_async.world.robots.acting_robot import acting_robot
 
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
@@ -209,7 +210,7 @@ def _is_obstacle(box: BoundingBox) -> bool:
 def _ignored_objects(world: BulletWorld, ignore: Iterable[Object] | None) -> set[Object]:
     if ignore is not None:
         return set(ignore)
-    robot = world.robot
+    robot = acting_robot(world)
     return set() if robot is None else {robot, *world.attachments.below(robot)}
 
 

@@ -1,0 +1,131 @@
+"""Two robots of one world act in two tasks of one plan: their motions, parts, recorded states and names."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select, text
+
+from pycrorm_async import Memory
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm import Action, NavigateAction, PickUpWithContextView, TaskTreeNode
+from pycrorm_async.plan import (
+    Code,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    NoRobotHere,
+    PickUpActionPerformable,
+    SimulatedTaskTree,
+    simulated_robot,
+)
+from pycrorm_async.plan.current_robot import require_robot
+from pycrorm_async.settings import Settings
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, robot_acting
+from pycrorm_async.world.robots.robot_description import PR2
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture
+def robots() -> Iterator[tuple[Object, Object]]:
+    with BulletWorld(), simulated_robot:
+        ada = Object("ada", ObjectType.ROBOT, robot=PR2)
+        yield ada, Object("bob", ObjectType.ROBOT, robot=PR2, pose=Pose([5, 0, 0]))
+
+
+async def rounds(robot: Object, y: float) -> None:
+    with robot_acting(robot):
+        for number in range(3):
+            await NavigateActionPerformable(Pose([robot.original_pose.position.x + number, y, 0])).perform()
+            await asyncio.sleep(0)
+            await MoveTorsoActionPerformable(0.1 * number).perform()
+
+
+async def test_two_tasks_move_their_own_robots_and_each_node_has_the_state_of_its_robot(
+    database_url: str, robots: tuple[Object, Object], tmp_path: Path
+) -> None:
+    ada, bob = robots
+    settings = Settings(sample_interval_ms=5)
+    async with Memory.open(database_url, spool=tmp_path / "spool", settings=settings) as memory:
+        async with memory.episode(description="together"):
+            await asyncio.gather(rounds(ada, 1.0), rounds(bob, -1.0))
+            await NavigateActionPerformable(Pose([9, 9, 0])).perform()
+        await memory.flush()
+        assert (ada.pose.position, bob.pose.position) == ((9, 9, 0), (7, -1, 0))
+        async with memory.session() as session:
+            navigations = (await session.scalars(select(NavigateAction).order_by(NavigateAction.id))).all()
+            by_robot = {
+                name: [each.robot_state.pose.x for each in navigations if each.robot == name and each.robot_state]
+                for name in ("ada", "bob")
+            }
+            assert by_robot == {"ada": [0, 0, 1, 2], "bob": [5, 5, 6]}
+            nodes = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.robot == "bob"))).all()
+            assert {each.torso_height for each in nodes} == {0, 0.1}
+            assert (await session.scalars(select(Action).where(Action.robot.is_(None)))).all() == []
+            sampled = "SELECT DISTINCT name FROM state_sample JOIN object ON object.id = state_sample.object_id"
+            assert sorted(await session.scalars(text(sampled))) == ["ada", "bob"]
+
+
+async def test_a_pick_up_names_its_robot_in_the_view_for_learning(
+    database_url: str, robots: tuple[Object, Object], tmp_path: Path
+) -> None:
+    ada, bob = robots
+    bob.set_pose(Pose([0, 2, 0]))
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        for robot, y in ((ada, 0.2), (bob, 2.2)):
+            milk = Object(f"milk of {robot.name}", ObjectType.MILK, pose=Pose([0.8, y, 0.9]))
+            with robot_acting(robot):
+                await PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).perform()
+                assert milk.attached_to is robot
+        await memory.flush()
+        async with memory.session() as session:
+            rows = (await session.execute(select(PickUpWithContextView.robot, PickUpWithContextView.relative_y))).all()
+    assert sorted((name, round(y, 6)) for name, y in rows) == [("ada", -0.2), ("bob", -0.2)]
+
+
+async def test_parallel_branches_of_two_robots_do_not_wait_for_each_others_parts(
+    robots: tuple[Object, Object],
+) -> None:
+    driving: list[str] = []
+    both = asyncio.Event()
+
+    @dataclass
+    class MeetPerformable(NavigateActionPerformable):
+        async def perform(self) -> None:
+            driving.append(require_robot().body.name)
+            if len(driving) == 2:
+                both.set()
+            async with asyncio.timeout(30):
+                await both.wait()  # for ever, if one of the two waited for the other's base
+
+    async def meet(robot: Object) -> None:
+        with robot_acting(robot):
+            await MeetPerformable(Pose([1, 0, 0])).perform()
+
+    await (Code(meet, robot=robots[0]) | Code(meet, robot=robots[1])).perform()
+    assert sorted(driving) == ["ada", "bob"]
+
+
+async def test_in_a_simulation_the_copy_of_the_acting_robot_acts(robots: tuple[Object, Object]) -> None:
+    ada, bob = robots
+    with robot_acting(bob):
+        with SimulatedTaskTree():
+            await NavigateActionPerformable(Pose([1, 1, 0])).perform()
+            assert require_robot().body.copy_of is bob
+        assert bob.pose == bob.original_pose
+        assert require_robot().body is bob
+    assert require_robot().body is ada
+
+
+async def test_a_robot_that_is_not_in_the_world_is_refused_by_name(robots: tuple[Object, Object]) -> None:
+    _, bob = robots
+    with robot_acting(bob):
+        bob.remove()
+        with pytest.raises(NoRobotHere, match="robot_acting"):
+            await NavigateActionPerformable(Pose([1, 1, 0])).perform()
+    with pytest.raises(CallerError, match="type ROBOT"):
+        robot_acting(Object("milk", ObjectType.MILK))
