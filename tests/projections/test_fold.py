@@ -133,7 +133,7 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
         "task_tree_node": [
             (
                 row(2), 1, None, "root", None, "RUNNING", time_us(2), None, 2_000_000_005, None, None,
-                None, None, None, None, None, None, None, None, None, None, False,
+                None, None, None, None, None, None, None, None, None, False,
             ),
             (
                 row(3), 1, row(2), "action", "NavigateAction", "RUNNING", time_us(3), None, 3_000_000_005, None, None,
