@@ -20,7 +20,7 @@ from sqlalchemy import func, select
 from pycrorm_async import Memory, Reading
 from pycrorm_async.orm import Action, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.settings import Settings
-from tests.crash.forked_processes import Forked
+from tests.crash.forked_processes import ForkedProcess
 from tests.memory.note_actions import NoteActionPerformable
 
 __all__ = ["ConcurrentProcesses"]
@@ -34,13 +34,13 @@ class ConcurrentProcesses:
     """Start the processes; leaving the exit stack kills those that still run."""
 
     def __init__(self, stack: ExitStack, url: str, spool: Path, *, recorders: int, readers: int) -> None:
-        self._recorders = [Forked(_record_until_stopped, url, spool) for _ in range(recorders)]
-        self._readers = [Forked(_query_until_stopped, url) for _ in range(readers)]
+        self._recorders = [ForkedProcess(_record_until_stopped, url, spool) for _ in range(recorders)]
+        self._readers = [ForkedProcess(_query_until_stopped, url) for _ in range(readers)]
         self._all = [*self._recorders, *self._readers]
         for each in self._all:
             stack.callback(each.process.kill)
         for each in self._all:
-            each.wait_for_its_first_words()
+            each.wait_for_first_output()
 
     def rebuild_begins(self) -> None:
         """Count operations from now on as concurrent with the rebuild."""
@@ -50,11 +50,11 @@ class ConcurrentProcesses:
     def stop(self) -> dict[str, list[dict[str, object]]]:
         """Stop all processes and return their lines. Raise `AssertionError` if one of them failed."""
         for each in self._all:
-            each.tell_to_stop()
+            each.request_stop()
         codes = [each.wait() for each in self._all]
-        assert codes == [0] * len(codes), [each.said[-3:] for each in self._all]
+        assert codes == [0] * len(codes), [each.lines[-3:] for each in self._all]
         processes = {"recorders": self._recorders, "readers": self._readers}
-        return {name: [json.loads(each.said[-1]) for each in some] for name, some in processes.items()}
+        return {name: [json.loads(each.lines[-1]) for each in some] for name, some in processes.items()}
 
 
 class _Commands:

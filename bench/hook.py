@@ -42,7 +42,7 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import FlushTimeout
 from pycrorm_async.settings import Writer
 from pycrorm_async.world import BulletWorld
-from tests.crash.step_robot import say
+from tests.crash.step_robot import report
 from tests.databases import Server, server_in
 
 _LATE_S = 0.02
@@ -160,7 +160,7 @@ def _run_proxy(server_socket: str, late_s: float) -> None:
 
     async def serve() -> None:
         proxy = await asyncio.start_server(accept, "127.0.0.1", 0)
-        say("port", proxy.sockets[0].getsockname()[1])
+        report("port", proxy.sockets[0].getsockname()[1])
         await proxy.serve_forever()
 
     asyncio.run(serve())

@@ -17,7 +17,7 @@ from pycrorm_async.queue import Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_spool
 from pycrorm_async.queue.maintenance.repair import repair_folder
 from tests.databases import ask
-from tests.queue.factories import Author, ended, episode, node, started
+from tests.queue.factories import FolderWriter, ended, episode, node, started
 from tests.queue.forged_segments import change_a_frame, change_the_header
 
 __all__ = ["crafted_folders"]
@@ -70,8 +70,8 @@ def _recover_spool(url: str, spool: Path) -> int:
     return len(asyncio.run(recover(url, spool=spool)).failed)
 
 
-def _author(spool: Path, number: int, rng: random.Random) -> Author:
-    author = Author(spool, settings=ROOMY, recorder=episode(90 + number))
+def _author(spool: Path, number: int, rng: random.Random) -> FolderWriter:
+    author = FolderWriter(spool, settings=ROOMY, recorder=episode(90 + number))
     author.put(started(number))
     for _ in range(rng.randrange(12, 30)):
         author.put(node(number), b'{"n":"%s"}' % (b"n" * rng.randrange(900)))

@@ -21,9 +21,9 @@ from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, open_dead
 from pycrorm_async.queue.maintenance.repair import RepairReport, repair_folder
-from tests.crash.test_queue_disk import ON_A_SMALL_DISK, SLOW, break_syncing
-from tests.crash.test_queue_power import live_through, machine_on
-from tests.queue.factories import RECORDER, SMALL, Author, drain, ended, make, node, recover, started
+from tests.crash.test_queue_disk import ON_A_SMALL_DISK, SLOW, break_next_sync
+from tests.crash.test_queue_power import live_through_cuts, machine_on
+from tests.queue.factories import RECORDER, SMALL, FolderWriter, drain, ended, make, node, recover, started
 
 __all__ = [
     "torn_writes",
@@ -53,7 +53,7 @@ def events_of(records: Iterable[Record]) -> list[Event]:
 def torn_writes(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
     """Cut the unsynced bytes at every byte, and replace the rest with zeros, ones or noise."""
     outcome = Outcome(note="cut at every byte of three unsynced records; zeros, ones or noise behind the cut")
-    author = Author(folder / "spool")
+    author = FolderWriter(folder / "spool")
     author.put(started())
     for size in (6, 0, 33):
         author.put(node(), b"s" * size)
@@ -110,8 +110,8 @@ def flipped_bits(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
     return outcome
 
 
-def _journal(spool: Path, rng: random.Random) -> Author:
-    author = Author(spool, settings=ROOMY)
+def _journal(spool: Path, rng: random.Random) -> FolderWriter:
+    author = FolderWriter(spool, settings=ROOMY)
     for number in (1, 2, 3):
         author.put(started(number))
     for _ in range(14):
@@ -124,7 +124,7 @@ def _journal(spool: Path, rng: random.Random) -> Author:
     return author
 
 
-def _from_byte_on(author: Author, path: Path, byte: int) -> list[Record]:
+def _from_byte_on(author: FolderWriter, path: Path, byte: int) -> list[Record]:
     """Return the record that contains this byte and the later ones of its episode; only these may be missing."""
     for index, (file, offset, size) in enumerate(author.places):
         if file == path and offset <= byte < offset + size:
@@ -144,7 +144,7 @@ def power_cuts(rounds: int, rng: random.Random, folder: Path, step: Step) -> Out
     while outcome.rounds < rounds:
         place = Path(tempfile.mkdtemp(dir=folder))
         with machine_on(place, random.Random(rng.random())) as machine:
-            asyncio.run(live_through(machine, random.Random(rng.random())))
+            asyncio.run(live_through_cuts(machine, random.Random(rng.random())))
             for cut, synced, stored, count in machine.cuts[: rounds - outcome.rounds]:
                 put_records = machine.put_so_far[:count]
                 try:
@@ -177,7 +177,7 @@ async def _failed_sync(outcome: Outcome, place: Path, rng: random.Random) -> Non
     await queue.synced_to()
     synced = len(expected)
     expected += [put(queue, "NodeStarted", b"not synced") for _ in range(rng.randrange(1, 5))]
-    break_syncing(queue)
+    break_next_sync(queue)
     with contextlib.suppress(SpoolUnavailable):
         await queue.synced_to()
     batch = await queue.get_batch(events_max=100, bytes_max=2**20, age_s_max=0.0)

@@ -187,9 +187,9 @@ def _fill_and_exit(spool: str, exit_by: str) -> None:
         kind = "EpisodeStarted"
         while True:
             _, sequence, payload = put(queue, kind, b"f" * 200)
-            recorder_process.say("put", sequence, payload)
+            recorder_process.report("put", sequence, payload)
             kind = "NodeStarted"
-    recorder_process.say("full", 0, "-")
+    recorder_process.report("full", 0, "-")
     if exit_by == "exit":
         raise SystemExit(3)
     if exit_by == "raise":
@@ -220,11 +220,11 @@ def _drain_if_unlocked(folder: str, barrier: object) -> None:
     barrier.wait()  # type: ignore[attr-defined]
     recovered = open_dead(Path(folder))
     if recovered is None:
-        recorder_process.say("locked")
+        recorder_process.report("locked")
         return
     records = asyncio.run(recovered.get_batch(events_max=10_000, bytes_max=2**24, age_s_max=0.0))
     for name, sequence, payload in events_of(records):
-        recorder_process.say("drained", name, sequence, payload)
+        recorder_process.report("drained", name, sequence, payload)
     asyncio.run(recovered.acknowledge(records[-1].position))
     recovered.release()
 

@@ -22,7 +22,7 @@ from pycrorm_async import Memory
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.settings import Writer
-from tests.crash.step_robot import SETTINGS, StepActionPerformable, say
+from tests.crash.step_robot import SETTINGS, StepActionPerformable, report
 from tests.databases import Server, ask
 
 __all__ = ["killed_plans", "killed_daemons", "walk", "RecordedSteps", "compare_steps"]
@@ -52,13 +52,13 @@ async def _walk(url: str, spool: Path, writer: Writer, name: str, rng: random.Ra
             async with memory.episode(description=place):
                 for step in range(1, rng.randrange(2, 60)):
                     await StepActionPerformable(place, step).perform()
-                    say("did", place, step)
+                    report("did", place, step)
                     chance = rng.random()
                     if chance < 0.5:
                         await asyncio.sleep(rng.random() * 0.005)
                     elif chance < 0.55:
                         await memory.synced()
-                        say("synced")
+                        report("synced")
 
 
 class RecordedSteps:
@@ -107,7 +107,7 @@ def killed_plans(rounds: int, rng: random.Random, folder: Path, step: Step) -> O
 
 
 def _serve(url: str, spool: str) -> None:
-    asyncio.run(serve(url, spool=Path(spool), stop=asyncio.Event(), report=say))
+    asyncio.run(serve(url, spool=Path(spool), stop=asyncio.Event(), report=report))
 
 
 def killed_daemons(server: Server | None) -> Callable[[int, random.Random, Path, Step], Outcome]:

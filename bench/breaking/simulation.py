@@ -29,7 +29,7 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.crash.test_queue_power import Machine, machine_on
 from tests.databases import ask
-from tests.writer.fakes import CountingFold, Passing
+from tests.writer.fakes import CountingFold, ForwardingDestination
 
 __all__ = ["simulated"]
 
@@ -37,7 +37,7 @@ _NO_BACKOFF = Backoff(first_s=1e-6, longest_s=1e-6)
 _STORED = "SELECT id, sequence, payload FROM event JOIN episode ON number = event.episode ORDER BY number, sequence"
 
 
-class _FaultyLog(Passing):
+class _FaultyLog(ForwardingDestination):
     """A log that at random is unavailable, or commits and loses the reply."""
 
     def __init__(self, log: EventLog, rng: random.Random) -> None:

@@ -25,7 +25,7 @@ from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.crash.step_robot import SETTINGS, say
+from tests.crash.step_robot import SETTINGS, report
 from tests.databases import Server
 
 __all__ = ["faulty_workers"]
@@ -44,7 +44,7 @@ _LONGEST_LIFE_S = 0.2
 def _serve(url: str, spool: str) -> None:
     """Run a daemon with one fold worker, so that the daemon must use the worker that is stopped."""
     leave = asyncio.Event()
-    asyncio.run(serve(url, spool=Path(spool), stop=leave, report=say, settings=_SETTINGS, fold_workers=1))
+    asyncio.run(serve(url, spool=Path(spool), stop=leave, report=report, settings=_SETTINGS, fold_workers=1))
 
 
 def faulty_workers(

@@ -14,7 +14,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask, ask_to_change
-from tests.projections.verify_cases import fold_in_batches, full, opened, shown
+from tests.projections.verify_cases import fold_in_batches, full, opened, visible_tables
 from tests.store.factories import declaration
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
@@ -37,7 +37,7 @@ async def folder(tmp_path: Path) -> Path:
 
 
 def number_of_rows(url: str) -> int:
-    counts: list[int] = [ask(url, f"SELECT count(*) FROM {each.physical}")[0][0] for each in shown(url)]
+    counts: list[int] = [ask(url, f"SELECT count(*) FROM {each.physical}")[0][0] for each in visible_tables(url)]
     return sum(counts)
 
 

@@ -27,7 +27,7 @@ from tests.copying.memories import (
     notes,
     random_plans,
 )
-from tests.crash.forked_processes import Forked
+from tests.crash.forked_processes import ForkedProcess
 from tests.databases import Server, ask, ask_to_change
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.projections.event_script import Script, declarations, declared, field, name_of
@@ -206,7 +206,7 @@ async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(
 # --- killed -----------------------------------------------------------------------------------------------------------
 
 
-def copy_and_tell(source: str, target: str) -> None:
+def copy_and_print(source: str, target: str) -> None:
     asyncio.run(copy_episodes(source, target, settings=SMALL, watch=lambda done, _: print(done)))
 
 
@@ -223,10 +223,10 @@ async def test_a_copy_that_is_killed_and_repeated_is_whole(new_url: New, new_fil
     there: Logs = {}
     kills = 0
     for _ in range(rounds):
-        copying = Forked(copy_and_tell, source, target)
-        copying.wait_for_its_first_words()
+        copying = ForkedProcess(copy_and_print, source, target)
+        copying.wait_for_first_output()
         until = sum(map(len, there.values())) + dice.randrange(2 * count // rounds)
-        while copying.process.is_alive() and int(copying.said[-1] if copying.said else 0) < until:  # noqa: ASYNC110
+        while copying.process.is_alive() and int(copying.lines[-1] if copying.lines else 0) < until:  # noqa: ASYNC110
             await asyncio.sleep(0.001)
         await asyncio.sleep(dice.random() * 0.02)
         kills += copying.process.is_alive()

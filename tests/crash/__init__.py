@@ -1,6 +1,6 @@
-"""What is done to this system to make it lose, double or mix up something, and in which tests.
+"""Faults that could make the system lose, double or reorder an event, and the tests that inject them.
 
-More rounds, longer, and some on disks of their own: `python -m bench.faults`.
+`python -m bench.faults` runs more and longer rounds, some on disks of their own.
 
  1  SIGKILL at any moment
         test_queue_kill (100 rounds, 10,000 in the soak), test_killed_plan, test_daemon_kill, test_many_machines,
@@ -12,11 +12,11 @@ More rounds, longer, and some on disks of their own: `python -m bench.faults`.
  4  torn write at every byte
         queue/test_dead_source, queue/test_frame, queue/test_segment, queue/test_drain_status
  5  every bit flipped
-        queue/test_dead_source, queue/test_frame, queue/test_segment; queue/test_repair (whatever is spoilt)
- 6  a record that was once on the same blocks; segments are never used again
+        queue/test_dead_source, queue/test_frame, queue/test_segment; queue/test_repair (any byte changed)
+ 6  an older record on the same blocks; segments are never reused
         queue/test_dead_source
  7  a sync that fails
-        test_queue_disk, queue/test_dead_source (a disk that does not keep what is left)
+        test_queue_disk, queue/test_dead_source (a disk that fails while a dead recorder's records are made durable)
  8  a full disk, below the queue and below the database
         test_queue_disk, store/test_full_disk, cli/test_bad_spool
  9  a COMMIT whose reply is lost
@@ -25,17 +25,17 @@ More rounds, longer, and some on disks of their own: `python -m bench.faults`.
         test_many_machines, test_daemon_kill, store/test_postgresql_faults
 11  commits out of order, gaps
         store/test_postgresql_schema (an earlier number is committed later), store/test_append
-12  a writer that stands still and wakes up again, a second opener
+12  a writer that is suspended and resumes, a second writer
         test_stopped_daemon, queue/test_locks, queue/test_live_source, cli/test_writer
 13  a projection killed, several at once, an event that cannot be folded
-        test_daemon_kill, test_cancelled, projections/test_projector (parks once, shown once),
+        test_daemon_kill, test_cancelled, projections/test_projector (parked once, visible once),
         memory/test_delegated_writer
-14  cancelled at every await, fork, leaving with a full queue, told to leave
+14  cancelled at every await, fork, exit with a full queue, a requested stop
         test_cancelled, store/test_crash, store/test_postgresql_faults, queue/test_fork, test_exit_and_clock,
         test_stopped_daemon
 15  a plan faster than its writer, clocks set back
         queue/test_full_spool, memory/test_delegated_writer (a full spool), test_exit_and_clock
 
-Where a machine gives no right to mount a disk a simulated one is used; no test skips itself. What was acknowledged is
-noted outside the system, in a pipe that outlives the process, and random choices are made again from a printed seed.
+A simulated disk replaces a mounted one where the machine permits no mount; no test is skipped. A pipe that outlives the
+process keeps what was acknowledged, and random choices follow from a printed seed.
 """

@@ -1,8 +1,8 @@
-"""A robot in a process of its own that does chores, several at once, and says on its output what it has performed.
+"""Run a robot in a process of its own that performs chores concurrently and reports each on its output.
 
-Each line is a JSON object and is written when it is true: `began` inside of `perform`, so the hook before it has
-returned; `ended` when `perform` has come back, with how it ended; `opened` and `closed` around an episode. A chore may
-fail. It goes on until its input is closed.
+Each line is a JSON object that the robot writes when it is true: `began` inside `perform`, after the hook before it has
+returned; `ended` when `perform` has returned, with the outcome; `opened` and `closed` around an episode. A chore may
+fail. The robot works until its input is closed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pycrorm_async.world import Pose
 __all__ = ["do_chores"]
 
 LANES = 2
-"""Plans that run at once in one process, each in episodes of its own."""
+"""Plans that run concurrently in one process, each in episodes of its own; two are enough to interleave."""
 
 SETTINGS = Settings(
     sync_interval_ms=10,
@@ -47,7 +47,7 @@ class StepActionPerformable(ActionAbstract):
     number: int
 
     async def perform(self) -> None:
-        say(began=self.number, episode=self.episode, what="step")
+        report(began=self.number, episode=self.episode, what="step")
 
 
 @dataclass
@@ -61,21 +61,21 @@ class CarryActionPerformable(ActionAbstract):
     slips: bool
 
     async def perform(self) -> None:
-        told = {"weight": self.weight, "hand": self.hand.name, "there": self.there.position, "words": self.words}
-        say(began=self.number, episode=self.episode, what="carry", told=told)
+        values = {"weight": self.weight, "hand": self.hand.name, "there": self.there.position, "words": self.words}
+        report(began=self.number, episode=self.episode, what="carry", values=values)
         for number in range(self.number + 1, self.number + 1 + len(self.words)):
             await StepActionPerformable(self.episode, number).perform()
-            say(ended=number, episode=self.episode, how="SUCCEEDED")
+            report(ended=number, episode=self.episode, how="SUCCEEDED")
             await asyncio.sleep(0)
         if self.slips:
             raise PlanFailure(f"slipped at {self.number}")
 
 
-def say(**words: object) -> None:
+def report(**words: object) -> None:
     os.write(1, json.dumps(words).encode() + b"\n")
 
 
-def told_to_stop() -> bool:
+def stop_requested() -> bool:
     return bool(select.select([0], [], [], 0)[0])
 
 
@@ -83,7 +83,7 @@ async def chores(memory: Memory, lane: str, rng: random.Random, pause_s: float) 
     for round_ in itertools.count():
         episode = f"{lane}.{round_}"
         async with memory.episode(description=episode):
-            say(opened=episode)
+            report(opened=episode)
             numbers = itertools.count(1)
             for _ in range(rng.randrange(1, 12)):
                 words = ["".join(rng.choices("aé\n'\\\"\t☃ ", k=3)) for _ in range(rng.randrange(4))]
@@ -97,25 +97,25 @@ async def chores(memory: Memory, lane: str, rng: random.Random, pause_s: float) 
                 try:
                     await carry.perform()
                 except PlanFailure:
-                    say(ended=carry.number, episode=episode, how="FAILED")
+                    report(ended=carry.number, episode=episode, how="FAILED")
                 else:
-                    say(ended=carry.number, episode=episode, how="SUCCEEDED")
+                    report(ended=carry.number, episode=episode, how="SUCCEEDED")
                 await asyncio.sleep(rng.random() * 2 * pause_s)
-        say(closed=episode)
+        report(closed=episode)
         if rng.random() < 0.1:
             await memory.synced()
-        if told_to_stop():
+        if stop_requested():
             return
 
 
-async def _live(url: str, spool: Path, name: str, seed: int, pause_s: float) -> None:
+async def _run_lanes(url: str, spool: Path, name: str, seed: int, pause_s: float) -> None:
     async with Memory.open(url, spool=spool, writer="daemon", settings=SETTINGS) as memory:
         async with asyncio.TaskGroup() as lanes:
             for lane in range(LANES):
                 lanes.create_task(chores(memory, f"{name}.{lane}", random.Random(f"{seed} {lane}"), pause_s))
-        say(faults=memory.status.faults.total)
+        report(faults=memory.status.faults.total)
 
 
 def do_chores(url: str, spool: str, name: str, seed: int, pause_s: float) -> None:
-    """Until its input is closed; `pause_s` is how long it rests between two chores on average."""
-    asyncio.run(_live(url, Path(spool), name, seed, pause_s))
+    """Perform chores until the input is closed, with a mean pause of `pause_s` seconds between two chores."""
+    asyncio.run(_run_lanes(url, Path(spool), name, seed, pause_s))

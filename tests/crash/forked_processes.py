@@ -1,6 +1,6 @@
-"""Processes to be killed that begin at once: forked from one that has imported everything already.
+"""Start processes without delay and kill them: they fork from a server process that has imported everything.
 
-What they write to their output is in a pipe, which holds it when they die; their input is a pipe too.
+A process's output and input are pipes, and the output pipe keeps what a killed process wrote.
 """
 
 from __future__ import annotations
@@ -13,28 +13,28 @@ from multiprocessing.connection import Connection
 
 from tests.commands import FORKED, fork
 
-__all__ = ["Forked"]
+__all__ = ["ForkedProcess"]
 
 _HANGS_S = 300.0
 
 
-class Forked:
-    """One process that calls `target`, and all it said."""
+class ForkedProcess:
+    """A process that calls `target`, and the lines that it wrote."""
 
     def __init__(self, target: Callable[..., None], *arguments: object) -> None:
         mine, its_output = FORKED.Pipe(duplex=False)
         its_input, self._input = FORKED.Pipe(duplex=False)
-        self.process = FORKED.Process(target=_speaking, args=(its_input, its_output, target, *arguments))
+        self.process = FORKED.Process(target=_run_with_pipes, args=(its_input, its_output, target, *arguments))
         fork(self.process)
         its_input.close()
         its_output.close()
         self._output = mine
         self._bytes = bytearray()
         self._first = threading.Event()
-        self._reader = threading.Thread(target=self._listen)
+        self._reader = threading.Thread(target=self._read_output)
         self._reader.start()
 
-    def wait_for_its_first_words(self) -> None:
+    def wait_for_first_output(self) -> None:
         assert self._first.wait(_HANGS_S), "it says nothing"
         assert self._bytes, f"it ended without a word, with exit code {self.process.exitcode}"
 
@@ -42,16 +42,16 @@ class Forked:
         self.process.kill()
         self.wait()
 
-    def tell(self) -> None:
-        """Writes a byte to its input."""
+    def send_byte(self) -> None:
+        """Write one byte to the input of the process."""
         os.write(self._input.fileno(), b"!")
 
-    def tell_to_stop(self) -> None:
-        """Closes its input."""
+    def request_stop(self) -> None:
+        """Close the input of the process."""
         self._input.close()
 
     def wait(self) -> int:
-        """Its exit code, when it has ended."""
+        """Wait until the process has ended, and return its exit code."""
         self.process.join(timeout=_HANGS_S)
         assert self.process.exitcode is not None, "it does not end"
         self._reader.join()
@@ -60,19 +60,19 @@ class Forked:
         return self.process.exitcode
 
     @property
-    def said(self) -> list[str]:
-        """The lines that are whole."""
+    def lines(self) -> list[str]:
+        """The complete lines that the process has written so far."""
         whole = bytes(self._bytes)
         return whole[: whole.rfind(b"\n") + 1].decode().splitlines()
 
-    def _listen(self) -> None:
+    def _read_output(self) -> None:
         while chunk := os.read(self._output.fileno(), 1 << 16):
             self._bytes += chunk
             self._first.set()
         self._first.set()
 
 
-def _speaking(its_input: Connection, output: Connection, target: Callable[..., None], *arguments: object) -> None:
+def _run_with_pipes(its_input: Connection, output: Connection, target: Callable[..., None], *arguments: object) -> None:
     os.dup2(its_input.fileno(), 0)
     os.dup2(output.fileno(), 1)
     its_input.close()

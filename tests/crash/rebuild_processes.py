@@ -1,4 +1,4 @@
-"""Processes around a rebuild: one that rebuilds until it is killed at a statement, one that records, one that reads."""
+"""Processes that compete with a rebuild: a rebuild that is killed at one statement, a recorder, and a reader."""
 
 from __future__ import annotations
 
@@ -19,52 +19,52 @@ from pycrorm_async.projections import rebuild as steps
 from pycrorm_async.settings import Settings
 from tests.memory.note_actions import NoteActionPerformable
 
-__all__ = ["rebuild_until", "record_until_told", "read_until_told"]
+__all__ = ["rebuild_until", "record_until_stopped", "read_until_stopped"]
 
 
 _PATIENT = Settings(connect_timeout_s=120, flush_timeout_s=300)
 
 
 def rebuild_until(url: str, last: int, workers: int, batch_events: int) -> None:
-    """Dies before its statement of that number; with 0 it comes to its end, and says how many there were."""
+    """Rebuild, and die before statement number `last`; with 0 rebuild to the end and print the count of statements."""
     steps._BATCH_EVENTS = batch_events
     count = 0
 
-    def counted(*_: object) -> None:
+    def die_at_last(*_: object) -> None:
         nonlocal count
         count += 1
         if count == last:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    event.listen(Engine, "before_cursor_execute", counted)
-    event.listen(Engine, "commit", counted)
+    event.listen(Engine, "before_cursor_execute", die_at_last)
+    event.listen(Engine, "commit", die_at_last)
     print("began", flush=True)
     asyncio.run(rebuild_memory(url, workers=workers))
     print(count, flush=True)
 
 
-def _told() -> threading.Event:
-    """Set when nobody holds the other end of the input any more."""
-    told = threading.Event()
+def _input_closed() -> threading.Event:
+    """Return an event that is set when the other end of the input is closed."""
+    stop = threading.Event()
 
     def listen() -> None:
         os.read(0, 1)
-        told.set()
+        stop.set()
 
     threading.Thread(target=listen, daemon=True).start()
-    return told
+    return stop
 
 
-def record_until_told(url: str, spool: Path) -> None:
-    """Episodes of notes, each flushed; says how many there were and the longest wait for a flush, in s."""
-    asyncio.run(_record(url, spool, _told()))
+def record_until_stopped(url: str, spool: Path) -> None:
+    """Record and flush episodes of notes; print their number and the longest flush in seconds."""
+    asyncio.run(_record(url, spool, _input_closed()))
 
 
-async def _record(url: str, spool: Path, told: threading.Event) -> None:
+async def _record(url: str, spool: Path, stop: threading.Event) -> None:
     longest_s, episodes = 0.0, 0
     async with Memory.open(url, spool=spool, settings=_PATIENT) as memory:
         print("records", flush=True)
-        while not told.is_set():
+        while not stop.is_set():
             async with memory.episode(description="beside a rebuild"):
                 for turn in range(50):
                     await NoteActionPerformable(str(turn)).perform()
@@ -74,15 +74,15 @@ async def _record(url: str, spool: Path, told: threading.Event) -> None:
     print("recorded", episodes, longest_s, flush=True)
 
 
-def read_until_told(url: str) -> None:
-    """Says what it counts, again and again: episodes, nodes, actions, pick-ups; and the longest wait for it, in s."""
-    asyncio.run(_read(url, _told()))
+def read_until_stopped(url: str) -> None:
+    """Print counts of episodes, nodes, actions and pick-ups until the input is closed, and then the longest query."""
+    asyncio.run(_read(url, _input_closed()))
 
 
-async def _read(url: str, told: threading.Event) -> None:
+async def _read(url: str, stop: threading.Event) -> None:
     longest_s = 0.0
     async with Reading.open(url) as reading:
-        while not told.is_set():
+        while not stop.is_set():
             began = time.monotonic()
             episodes = len(await reading.episodes())
             async with reading.session() as session:

@@ -1,7 +1,8 @@
-"""A process to be killed: records without end, and says on its output what it was told.
+"""Record in a process that the tests kill, and report on the output each call that has returned.
 
-Every line is written at once, so the pipe holds it when the process dies: `put EPISODE SEQUENCE` when putting returned,
-`stored POSITION EPISODE SEQUENCE PAYLOAD` for each record of a batch before the batch is acknowledged.
+Every line is written at once, so that the pipe keeps it when the process dies: `put EPISODE SEQUENCE` when `put_nowait`
+has returned, and `stored POSITION EPISODE SEQUENCE PAYLOAD` for each record of a batch before the batch is
+acknowledged.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ SETTINGS = Settings(
 )
 
 
-def say(*words: object) -> None:
+def report(*words: object) -> None:
     os.write(1, (" ".join(map(str, words)) + "\n").encode())
 
 
@@ -38,7 +39,7 @@ def record_without_end(queue: RecorderQueue, rng: random.Random, events_max: int
         for index, kind in enumerate(kinds, start=1):
             payload = f"{name}/{index}/".encode() + b"x" * rng.randrange(0, 1200)
             sequence = queue.put_nowait(Heading(episode, kind, 1), payload)
-            say("put", name, sequence)
+            report("put", name, sequence)
         put += len(kinds)
 
 
@@ -46,13 +47,15 @@ async def store_without_end(queue: RecorderQueue, rng: random.Random) -> None:
     while batch := await queue.get_batch(events_max=rng.randrange(1, 50), bytes_max=2**16, age_s_max=0.001):
         for each in batch:
             assert each.episode is not None
-            said = each.payload.rstrip(b"x").decode()
-            say("stored", each.position, episode_text(each.episode), each.sequence, said)
+            lines = each.payload.rstrip(b"x").decode()
+            report("stored", each.position, episode_text(each.episode), each.sequence, lines)
         await queue.acknowledge(batch[-1].position)
 
 
 def record(spool: str, seed: int, threads: int, doing: str, events_max: int = sys.maxsize) -> None:
-    """Until it is killed; `doing` is "recording", or "storing" too. Each thread puts so many events, and waits then."""
+    """Record until the process is killed; `doing` is "recording" or "storing". Each thread puts a number of events and
+    waits.
+    """
     rng = random.Random(seed)
     queue = RecorderQueue.create(
         Path(spool),

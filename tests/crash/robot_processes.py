@@ -1,7 +1,7 @@
-"""Plans and daemons in processes of their own, started and killed at will, and the proof that nothing is lost by it.
+"""Plans and daemons in processes of their own that tests kill, and the proof that no event was lost.
 
-What the plans said before they died is kept here, outside the system; the memory is asked by connections that know
-nothing of it.
+The output of a plan is kept outside the system, and the proof reads the database through connections that do not use
+the memory.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ from collections import defaultdict
 from pathlib import Path
 
 from tests.commands import COMMAND, environment, pycrorm
-from tests.crash.forked_processes import Forked
-from tests.crash.step_robot import take_a_walk
+from tests.crash.forked_processes import ForkedProcess
+from tests.crash.step_robot import run_step_robot
 from tests.databases import ask
 
-__all__ = ["Robot", "Lab"]
+__all__ = ["RobotProcess", "Lab"]
 
 HANGS_S = 300.0
-"""After this long a process hangs, however busy the machine is."""
+"""A process that takes longer than this hangs, however busy the machine is."""
 
 
-class Robot:
-    """One plan's process, and all it said."""
+class RobotProcess:
+    """The process of one plan, and the lines that it wrote."""
 
     def __init__(self, url: str, spool: Path, name: str, seed: int) -> None:
         self.name = name
-        self.forked = Forked(take_a_walk, url, str(spool), name, seed)
+        self.forked = ForkedProcess(run_step_robot, url, str(spool), name, seed)
 
-    def wait_until_it_walks(self) -> None:
+    def wait_until_it_performs(self) -> None:
         deadline = time.monotonic() + HANGS_S
-        while len(self.said) < 5:
+        while len(self.lines) < 5:
             assert time.monotonic() < deadline
             time.sleep(0.01)
 
@@ -40,18 +40,18 @@ class Robot:
         self.forked.kill()
 
     def stop(self) -> None:
-        """It ends its episode and closes its memory."""
-        self.forked.tell_to_stop()
+        """Ask the process to end its episode and close its memory, and wait for it."""
+        self.forked.request_stop()
         assert self.forked.wait() == 0
 
     @property
-    def said(self) -> list[list[str]]:
-        """The words of each line that is whole."""
-        return [line.split() for line in self.forked.said]
+    def lines(self) -> list[list[str]]:
+        """The words of each complete line that the process has written."""
+        return [line.split() for line in self.forked.lines]
 
 
 class Lab:
-    """One database, one spool, robots that come and go, and a daemon now and then."""
+    """One database, one spool, the robots that record into it, and at most one daemon."""
 
     def __init__(self, folder: Path, url: str, seed: int) -> None:
         print(f"seed {seed}")
@@ -59,14 +59,14 @@ class Lab:
         self.url = url
         self.spool = folder / "spool"
         self.rng = random.Random(seed)
-        self.robots: list[Robot] = []
-        self.gone: list[Robot] = []
+        self.robots: list[RobotProcess] = []
+        self.gone: list[RobotProcess] = []
         self.daemon: subprocess.Popen[bytes] | None = None
         self.log = folder / "daemon.log"
 
-    def start_robot(self, name: str | None = None) -> Robot:
+    def start_robot(self, name: str | None = None) -> RobotProcess:
         name = name or f"robot{len(self.robots) + len(self.gone)}"
-        robot = Robot(self.url, self.spool, name, self.rng.randrange(2**31))
+        robot = RobotProcess(self.url, self.spool, name, self.rng.randrange(2**31))
         self.robots.append(robot)
         return robot
 
@@ -108,24 +108,24 @@ class Lab:
             time.sleep(0.05)
 
     def clear(self) -> None:
-        """Nothing of ours runs afterwards."""
+        """Kill every process that this lab started."""
         for robot in self.robots:
             robot.kill()
         if self.daemon is not None and self.daemon.poll() is None:
             self.kill_daemon()
 
-    def prove_that_everything_is_there_once_and_in_order(self) -> None:
-        """After one `pycrorm writer --once`, when nobody else is at work."""
+    def verify_every_step_stored_once_in_order(self) -> None:
+        """Drain with one `pycrorm writer --once`, after all other processes have ended, and compare the database."""
         assert not self.robots
         done = pycrorm("writer", "--once", "--url", self.url, "--spool", self.spool, cwd=self.folder)
         assert done.returncode == 0, done.stderr
         assert "Traceback" not in self.log.read_text()
         assert [path.name for path in self.spool.iterdir() if path.is_dir() and path.name != "stored"] == []
-        said = [line for robot in self.gone for line in robot.said]
+        lines = [line for robot in self.gone for line in robot.lines]
         did = {
-            (place, int(step)) for what, place, step, *_ in (line for line in said if len(line) == 3) if what == "did"
+            (place, int(step)) for what, place, step, *_ in (line for line in lines if len(line) == 3) if what == "did"
         }
-        ended = {line[1] for line in said if line[0] == "ended"}
+        ended = {line[1] for line in lines if line[0] == "ended"}
         assert len(did) > 100, "too little was done to prove anything"
 
         rows = ask(
@@ -138,10 +138,10 @@ class Lab:
             steps[place].append(step)
             assert status in ("SUCCEEDED", "LOST")
             assert status == "SUCCEEDED" or (place, step) not in did
-        assert all(found == list(range(len(found))) for found in steps.values())
-        there = {(place, step) for place, found in steps.items() for step in found}
-        assert did <= there
-        assert len(there) <= len(did) + len(self.gone)  # one that was done and not said, before each death
+        assert all(numbers == list(range(len(numbers))) for numbers in steps.values())
+        stored = {(place, step) for place, numbers in steps.items() for step in numbers}
+        assert did <= stored
+        assert len(stored) <= len(did) + len(self.gone)  # for each death one step that was performed and not reported
 
         episodes = ask(self.url, "SELECT description, status FROM process_metadata")
         statuses = dict(episodes)

@@ -1,7 +1,7 @@
-"""A plan in a process to be killed: remembers steps through a daemon, and says on its output what it did.
+"""Run a plan that records through a daemon, in a process that the tests kill, and report each step on the output.
 
-Every line is written at once, so the pipe holds it when the process dies: `did EPISODE STEP` when `perform` of a step
-has returned, `ended EPISODE` when the episode has. It goes on until its input is closed.
+Every line is written at once, so that the pipe keeps it when the process dies: `did EPISODE STEP` when `perform` of a
+step has returned, and `ended EPISODE` when the episode has ended. The plan runs until its input is closed.
 """
 
 from __future__ import annotations
@@ -33,34 +33,34 @@ class StepActionPerformable(ActionAbstract):
     step: int
 
     async def perform(self) -> None:
-        """Done."""
+        """Succeed without doing anything."""
 
 
-def say(*words: object) -> None:
+def report(*words: object) -> None:
     os.write(1, (" ".join(map(str, words)) + "\n").encode())
 
 
-def told_to_stop() -> bool:
+def stop_requested() -> bool:
     return bool(select.select([0], [], [], 0)[0])
 
 
-async def walk(url: str, spool: Path, name: str, rng: random.Random) -> None:
+async def perform_steps(url: str, spool: Path, name: str, rng: random.Random) -> None:
     async with Memory.open(url, spool=spool, writer="daemon", settings=SETTINGS) as memory:
-        say("opened")
+        report("opened")
         for number in itertools.count():
             episode = f"{name}.{number}"
             async with memory.episode(description=episode):
                 for step in range(rng.randrange(1, 60)):
                     await StepActionPerformable(episode, step).perform()
-                    say("did", episode, step)
+                    report("did", episode, step)
                     if rng.random() < 0.1:
                         await asyncio.sleep(rng.random() * 0.02)
-            say("ended", episode)
-            if told_to_stop():
+            report("ended", episode)
+            if stop_requested():
                 return
             if rng.random() < 0.05:
                 await memory.synced()
 
 
-def take_a_walk(url: str, spool: str, name: str, seed: int) -> None:
-    asyncio.run(walk(url, Path(spool), name, random.Random(seed)))
+def run_step_robot(url: str, spool: str, name: str, seed: int) -> None:
+    asyncio.run(perform_steps(url, Path(spool), name, random.Random(seed)))

@@ -1,6 +1,6 @@
-"""The bench of faults runs, makes every fault, and nothing is lost, doubled, misordered or changed by any of them.
+"""Run the bench of faults: it makes every fault, and none of them loses, doubles, reorders or changes an event.
 
-And it can tell: where the product is broken by hand, the counts rise.
+The bench detects such errors: with a deliberately broken product its counts rise.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ SLOW = [
     for each in FAULTS
     if each.startswith(("killed fold", "stopped fold", "deleted database", "foreign", "failover", "restored"))
 ]
-"""A round of these starts servers or many processes."""
+"""A round of these faults starts servers or many processes."""
 CHEAP = [
     "torn write at every byte",
     "flipped bit",
@@ -90,18 +90,18 @@ CHEAP = [
     "lost COMMIT reply",
     "cancelled append",
 ]
-"""Rounds of these need no process and no server of their own; together they take a few seconds."""
+"""Rounds of these faults need no process and no server of their own; together they take a few seconds."""
 COST = ("lost", "duplicated", "misordered", "changed", "broke")
 
 
 def faults(*arguments: str | Path) -> tuple[int, list[dict[str, Any]], str]:
-    """The exit code, what was found by each fault, and what was said about it."""
+    """Return the exit code, the outcome of each fault, and the error output of the bench."""
     command = [sys.executable, "-m", "bench.faults", "--quick", *map(str, arguments)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     return done.returncode, [json.loads(line) for line in done.stdout.splitlines()], done.stderr
 
 
-def test_the_list_of_faults_is_whole() -> None:
+def test_the_list_of_faults_is_complete() -> None:
     assert re.findall(r'^ +Fault\("(.+?)"', (ROOT / "bench/faults.py").read_text(), re.MULTILINE) == FAULTS
 
 
@@ -113,10 +113,10 @@ def test_the_list_of_faults_is_whole() -> None:
         pytest.param(SLOW, id="slow rows", marks=pytest.mark.soak),
     ],
 )
-def test_the_quick_version_makes_every_fault_and_costs_nothing(names: list[str]) -> None:
-    code, outcomes, said = faults(*(each for name in names for each in ("--only", name)))
+def test_the_quick_run_makes_every_fault_and_loses_no_event(names: list[str]) -> None:
+    code, outcomes, lines = faults(*(each for name in names for each in ("--only", name)))
     bad = [each for each in outcomes if any(each[name] for name in COST)]
-    assert (code, bad) == (0, []), said
+    assert (code, bad) == (0, []), lines
     assert [each["fault"] for each in outcomes] == names
     made = [each for each in outcomes if not each["note"].startswith("skipped: no permission to mount")]
     assert all(each["rounds"] >= 2 and each["events"] >= 20 for each in made)
@@ -124,7 +124,7 @@ def test_the_quick_version_makes_every_fault_and_costs_nothing(names: list[str])
 
 
 @pytest.mark.soak
-def test_a_run_goes_on_from_its_report_and_a_loss_in_it_is_a_problem(tmp_path: Path) -> None:
+def test_a_run_continues_from_its_report_and_a_recorded_loss_is_a_problem(tmp_path: Path) -> None:
     arguments = ("--only", "clock", "--seed", "7", "--report", tmp_path / "faults.md")
     code, [first], _ = faults(*arguments)
     lines = (tmp_path / "faults.md.jsonl").read_text()
@@ -141,7 +141,7 @@ def test_a_run_goes_on_from_its_report_and_a_loss_in_it_is_a_problem(tmp_path: P
     assert (code, other["lost"], other["seed"]) == (0, 0, 8)
 
 
-# --- broken by hand -----------------------------------------------------------------------------------------------
+# --- a product that is broken on purpose ------------------------------------------------------------------------------
 
 Given = Callable[[list[Record]], list[Record]]
 
@@ -177,7 +177,7 @@ _SEEN = [(fault, *each) for fault in (files.torn_writes, files.failed_syncs, fil
 
 
 @pytest.mark.parametrize(("fault", "breaks", "count"), _SEEN)
-def test_a_recovery_that_does_this_is_seen(
+def test_the_bench_detects_a_recovery_that_loses_doubles_swaps_or_changes_records(
     fault: Callable[[int, random.Random, Path, Step], Outcome],
     breaks: Given,
     count: str,
@@ -196,7 +196,7 @@ def test_a_recovery_that_does_this_is_seen(
     assert outcome.rounds_failed
 
 
-def test_a_queue_that_calls_synced_what_it_did_not_sync_is_seen(
+def test_the_bench_detects_a_queue_that_reports_records_as_synced_without_a_sync(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def careless(queue: RecorderQueue, **_: object) -> None:
@@ -208,7 +208,9 @@ def test_a_queue_that_calls_synced_what_it_did_not_sync_is_seen(
     assert files.power_cuts(40, random.Random(1), tmp_path, lambda: None).lost > 0
 
 
-def test_a_log_that_says_it_has_what_it_has_not_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bench_detects_a_log_that_reports_events_as_stored_without_storing_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     append = EventLog.append
 
     async def forgetful(log: EventLog, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
@@ -220,7 +222,7 @@ def test_a_log_that_says_it_has_what_it_has_not_is_seen(tmp_path: Path, monkeypa
 
 
 IN_AN_EPISODE = 0
-"""The seed of a round in which the database goes back in the middle of an episode."""
+"""The seed of a round in which the database is restored in the middle of an episode."""
 
 
 @pytest.fixture
@@ -229,11 +231,11 @@ def only_flushes_fold(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("only_flushes_fold")
-def test_a_round_is_verified_while_none_of_its_events_is_on_its_way(
+def test_the_bench_verifies_a_round_only_after_every_event_of_it_is_stored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def verify_later(log: EventLog) -> VerifyResult:
-        await asyncio.sleep(0.3)  # six times what an event needs to be stored
+        await asyncio.sleep(0.3)  # six times the delay of an append
         return await verify(log)
 
     monkeypatch.setattr(restores, "verify", verify_later)
@@ -242,7 +244,9 @@ def test_a_round_is_verified_while_none_of_its_events_is_on_its_way(
 
 
 @pytest.mark.usefixtures("only_flushes_fold")
-def test_a_flush_that_folds_nothing_after_a_restore_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bench_detects_a_flush_that_folds_nothing_after_a_restore(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     restore = Backup.restore
 
     async def fold_nothing(_: LogAndTables) -> int:

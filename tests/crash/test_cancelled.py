@@ -1,8 +1,8 @@
-"""Cancelled at every await there is, one after the other: of the writer beside a plan, of a flush, of the daemon.
+"""Cancel a writer beside a plan, a flush, and the daemon at every one of their awaits in turn.
 
-A loop whose tasks are stepped counts their awaits, and at the n-th cancels the work from outside, as a Ctrl-C or a
-timeout does; n goes through all of them. What was acknowledged is stored, what was not is given again, and the next
-writer finds no lock and no half batch.
+An event loop that steps its tasks counts their awaits, and cancels the work at the n-th from outside, as Ctrl-C or a
+timeout does; n takes every value. What was acknowledged is stored, what was not is supplied again, and the next writer
+finds no lock held and no part of a batch.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from tests.queue.factories import make
 from tests.writer.fakes import KeptSource
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 SETTINGS = Settings(batch_events_max=10, idle_ms=1, batch_age_ms=1)
 CLOSING = {"AsyncAdapt_aiosqlite_connection._terminate_graceful_close", "Connection._cancel"}
-"""What SQLAlchemy and asyncpg leave to the loop when they are cancelled while they end what was cancelled."""
+"""SQLAlchemy and asyncpg leave these tasks to the loop when they are cancelled while they close a connection."""
 TEXTS = ["a", "b", "c", "d", "e"]
 
 
 class Steps:
-    """Counts the awaits of all tasks that its loop makes, and cancels `work` at one of them."""
+    """An event loop's task factory that counts the awaits of all tasks, and cancels `work` at one of them."""
 
     def __init__(self, at: int) -> None:
         self.at = at
@@ -53,10 +53,10 @@ class Steps:
         self.names: dict[asyncio.Task[Any], str] = {}
 
     def make(self, loop: asyncio.AbstractEventLoop, work: Any, **options: Any) -> asyncio.Task[Any]:
-        """A task factory."""
+        """Make a task that counts its awaits."""
         task = asyncio.Task(self._run(work), loop=loop, **options)
         self.names[task] = work.__qualname__
-        task.add_done_callback(lambda _: work.close())  # if it was cancelled before it began
+        task.add_done_callback(lambda _: work.close())  # cancelled before its first step
         return task
 
     async def _run(self, work: Coroutine[Any, Any, Any]) -> Any:
@@ -90,7 +90,7 @@ def _sending(work: Coroutine[Any, Any, Any], value: object) -> Callable[[], Any]
 
 
 async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, alone: bool = True) -> bool:
-    """Runs it to its end or to its n-th await; whether it was cancelled. Nothing is left running if it was alone."""
+    """Run the work to its end or to its n-th await, and return whether it was cancelled; no task of it still runs."""
     loop, steps = asyncio.get_running_loop(), Steps(at)
     before = asyncio.all_tasks()
     loop.set_task_factory(steps.make)
@@ -102,7 +102,7 @@ async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, alone: bool 
         loop.set_task_factory(None)
     left = asyncio.all_tasks() - before if alone else set()
     assert {steps.names[task] for task in left} <= CLOSING
-    for task in left:  # as `asyncio.run` does at its end
+    for task in left:  # as `asyncio.run` does when it ends
         task.cancel()
     await asyncio.gather(*left, return_exceptions=True)
     if not steps.work.cancelled():
@@ -112,7 +112,7 @@ async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, alone: bool 
 
 
 async def at_every_await(round_: Callable[[int], Awaitable[bool]], *, awaits_min: int = 30) -> None:
-    """A round for each n, until one is not cancelled any more."""
+    """Run a round for each n until a round ends without being cancelled."""
     at = 1
     while await round_(at):
         at += 1
@@ -133,8 +133,8 @@ def script_of(number: int) -> Script:
     return script
 
 
-def proved(url: str, script: Script) -> None:
-    """The episode is in the log once and in order, and in the tables."""
+def verify_stored_in_order(url: str, script: Script) -> None:
+    """Verify that the episode is in the log once and in order, and in the tables."""
     name = episode_text(script.episode)
     [(number, head, folded, refused, parked)] = ask(
         url, f"SELECT number, head, folded, refused, parked FROM episode WHERE id = '{name}'"
@@ -151,12 +151,12 @@ def proved(url: str, script: Script) -> None:
 
 
 def stored(url: str, script: Script) -> int:
-    """How many events of the episode are in the log."""
+    """Return how many events of the episode are in the log."""
     heads = ask(url, f"SELECT head FROM episode WHERE id = '{episode_text(script.episode)}'")
     return int(heads[0][0]) if heads else 0
 
 
-def nobody_holds_a_lock(url: str) -> None:
+def verify_no_lock_is_held(url: str) -> None:
     ask(url, "SELECT 1 FROM episode FOR UPDATE NOWAIT" if url.startswith("postgresql") else "BEGIN IMMEDIATE")
 
 
@@ -169,29 +169,31 @@ def writer_of(source: KeptSource, destination: LogAndTables) -> LiveWriter:
 
 
 def kept_source(script: Script) -> KeptSource:
-    """Its declaration comes first."""
+    """Return a source that supplies the declaration first."""
     records = [*declarations(SAYING), *script.records]
     return KeptSource([each._replace(position=at) for at, each in enumerate(records, 1)], closed=True)
 
 
-async def test_opening_is_cancelled_at_each_of_its_awaits_and_leaves_no_lock(database_url: str, tmp_path: Path) -> None:
+async def test_an_opening_that_is_cancelled_at_any_await_leaves_no_lock_held(database_url: str, tmp_path: Path) -> None:
     async def life() -> None:
         async with opened(database_url, tmp_path / "spool"):
             pass
 
     async def round_(at: int) -> bool:
         was_cancelled = await cancelled_at(at, life())
-        nobody_holds_a_lock(database_url)
+        verify_no_lock_is_held(database_url)
         return was_cancelled
 
     await life()
     await at_every_await(round_)
     async with opened(database_url, tmp_path / "spool") as destination:
         await writer_of(kept_source(script_of(1)), destination).run()
-    proved(database_url, script_of(1))
+    verify_stored_in_order(database_url, script_of(1))
 
 
-async def test_the_writer_beside_a_plan_is_cancelled_at_each_of_its_awaits(database_url: str, tmp_path: Path) -> None:
+async def test_a_writer_cancelled_at_any_await_leaves_the_log_complete_and_ordered(
+    database_url: str, tmp_path: Path
+) -> None:
     async with opened(database_url, tmp_path / "spool") as destination:
 
         async def round_(at: int) -> bool:
@@ -200,17 +202,17 @@ async def test_the_writer_beside_a_plan_is_cancelled_at_each_of_its_awaits(datab
             was_cancelled = await cancelled_at(at, writer_of(source, destination).run())
             acknowledged = max(source.acknowledgements, default=0)
             assert stored(database_url, script) >= acknowledged - 1
-            nobody_holds_a_lock(database_url)
+            verify_no_lock_is_held(database_url)
             again = source.reopened()
             await writer_of(again, destination).run()
             assert again.kept == []
-            proved(database_url, script)
+            verify_stored_in_order(database_url, script)
             return was_cancelled
 
         await at_every_await(round_)
 
 
-async def test_a_flush_is_cancelled_at_each_of_its_awaits_and_the_writer_goes_on(
+async def test_a_flush_cancelled_at_any_await_leaves_the_writer_able_to_store_the_rest(
     database_url: str, tmp_path: Path
 ) -> None:
     async with opened(database_url, tmp_path / "spool") as destination:
@@ -223,31 +225,31 @@ async def test_a_flush_is_cancelled_at_each_of_its_awaits_and_the_writer_goes_on
             was_cancelled = await cancelled_at(at, writer.flush(15), alone=False)
             await running
             assert source.kept == []
-            proved(database_url, script)
+            verify_stored_in_order(database_url, script)
             return was_cancelled
 
         await at_every_await(round_, awaits_min=2)
 
 
-async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, tmp_path: Path) -> None:
+async def test_a_daemon_cancelled_at_any_await_loses_and_doubles_nothing(database_url: str, tmp_path: Path) -> None:
     held: list[ClaimedSource] = []
     async with opened(database_url, tmp_path / "spool") as destination:
 
         async def life(spool: Path) -> None:
             leave = asyncio.Event()
 
-            def say(line: str) -> None:
+            def report(line: str) -> None:
                 if "has ended" in line:
                     leave.set()
 
             look = _Folders(Spool(spool), destination.log_id, DatabaseAddress.parse(database_url))
 
-            def look_and_note(but: Collection[str]) -> ScanResult:
-                found = look(but)
-                held.extend(found.held)
-                return found
+            def scan_and_note(but: Collection[str]) -> ScanResult:
+                result = look(but)
+                held.extend(result.held)
+                return result
 
-            await Daemon(destination, destination, look_and_note, settings=SETTINGS, report=say).run(leave)
+            await Daemon(destination, destination, scan_and_note, settings=SETTINGS, report=report).run(leave)
 
         async def round_(at: int) -> bool:
             script = script_of(at)
@@ -258,17 +260,17 @@ async def test_the_daemon_is_cancelled_at_each_of_its_awaits(database_url: str, 
             await queue.synced_to()
             queue.close()
             was_cancelled = await cancelled_at(at, life(spool))
-            while held:  # its process ends then, and with it the locks
+            while held:  # the process of a cancelled daemon ends, which releases its locks
                 held.pop().release()
             assert stored(database_url, script) >= queue.stored - 1
-            nobody_holds_a_lock(database_url)
+            verify_no_lock_is_held(database_url)
             queue.release()
-            if Spool(spool).recorders():  # the next daemon finds it dead
+            if Spool(spool).recorders():  # the next daemon finds the folder of a dead recorder
                 report = await recover(database_url, spool=spool)
                 assert (report.failed, report.lost, report.drained.stopped) == ({}, (), {})
                 assert Spool(spool).recorders() == []
             await destination.fold()
-            proved(database_url, script)
+            verify_stored_in_order(database_url, script)
             return was_cancelled
 
         await at_every_await(round_)

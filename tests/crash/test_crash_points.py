@@ -1,7 +1,7 @@
-"""Killed at each step that touches the disk or the log, once and then once more: every event is stored once.
+"""Kill a process at each step that touches the disk or the log, and its successor too: every event is stored once.
 
-A forked child does the work and dies, without a chance to tidy up, before or after the n-th of these steps; n goes
-through all of them. What it was told before is in a pipe.
+A forked child does the work and exits at once, before or after the n-th such step, without closing anything; n takes
+every value. A pipe keeps what the child was promised before it died.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain import Drain
 from tests.databases import ask
-from tests.queue.factories import RECORDER, SMALL, STILL, Author, ended, episode, node, started
+from tests.queue.factories import RECORDER, SMALL, STILL, FolderWriter, ended, episode, node, started
 
 pytestmark = pytest.mark.slow
 
@@ -40,10 +40,10 @@ STORED = "SELECT sequence, type, payload FROM event JOIN episode ON number = epi
 
 
 def dying_at(step: int, *, after: bool) -> None:
-    """From now on, in this process, the so-manieth step is the last, or the last but what follows it."""
+    """Make the n-th of these steps in this process the last one, executed only if `after` is set."""
     done = 0
 
-    def counted(original: Callable[..., Any]) -> Callable[..., Any]:
+    def counting(original: Callable[..., Any]) -> Callable[..., Any]:
         def last(*arguments: Any, **options: Any) -> Any:
             nonlocal done
             done += 1
@@ -60,18 +60,18 @@ def dying_at(step: int, *, after: bool) -> None:
         async def finished(answer: Awaitable[Any], mine: int) -> Any:
             given = await answer
             if mine == step:
-                os._exit(9)  # committed, and nobody heard of it
+                os._exit(9)  # committed, but the caller never learns it
             return given
 
         return last
 
     for of, names in STEPS.items():
         for name in names:
-            setattr(of, name, counted(getattr(of, name)))
+            setattr(of, name, counting(getattr(of, name)))
 
 
 def in_a_child(work: Callable[[Callable[..., None]], None], step: int, *, after: bool) -> tuple[bool, list[list[str]]]:
-    """Whether it came to its end, and what it said."""
+    """Return whether the child finished its work, and the lines that it wrote."""
     mine, its = os.pipe()
     child = os.fork()
     if child == 0:
@@ -79,21 +79,21 @@ def in_a_child(work: Callable[[Callable[..., None]], None], step: int, *, after:
         code = 1
         with contextlib.suppress(BaseException):
             dying_at(step, after=after)
-            work(partial(_say, its))
+            work(partial(_report, its))
             code = 0
         os._exit(code)
     os.close(its)
-    said = b""
+    output = b""
     while chunk := os.read(mine, 1 << 16):
-        said += chunk
+        output += chunk
     os.close(mine)
     _, status = os.waitpid(child, 0)
     code = os.waitstatus_to_exitcode(status)
     assert code in (0, 9), (step, after, code)
-    return code == 0, [line.split() for line in said.decode().splitlines()]
+    return code == 0, [line.split() for line in output.decode().splitlines()]
 
 
-def _say(pipe: int, *words: object) -> None:
+def _report(pipe: int, *words: object) -> None:
     os.write(pipe, (" ".join(map(str, words)) + "\n").encode())
 
 
@@ -105,7 +105,7 @@ async def drained(url: str, queue: Any) -> None:
 
 
 def recover_all(url: str, spool: Path) -> None:
-    """What the next process does with what it finds."""
+    """Recover the spool as the next process does."""
     for folder in Spool(spool).recorders():
         recovered = open_dead(folder.path)
         if recovered is not None:
@@ -113,7 +113,7 @@ def recover_all(url: str, spool: Path) -> None:
             recovered.release()
 
 
-def _recover_all(url: str, spool: Path, _say: object) -> None:
+def _recover_all(url: str, spool: Path, _report: object) -> None:
     recover_all(url, spool)
 
 
@@ -122,16 +122,16 @@ def stored(url: str, number: int) -> list[tuple[int, str, str]]:
 
 
 AFTER = [False, pytest.param(True, marks=pytest.mark.soak)]
-"""Killed before each step; killed after it differs only by what a process does between two steps."""
+"""Killed before each step; a kill after the step differs only by what a process does between two steps."""
 
 
-# --- recovery ---------------------------------------------------------------------------------------------------
+# --- recovery of a dead recorder --------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def left(tmp_path: Path) -> tuple[str, Path]:
-    """A dead folder of three segments with a torn tail, two episodes open and one ended, and a log without it."""
-    author = Author(tmp_path / "spool")
+def crashed_folder(tmp_path: Path) -> tuple[str, Path]:
+    """A dead recorder's folder: three segments, a torn tail, two open episodes and one ended, none in the log."""
+    author = FolderWriter(tmp_path / "spool")
     for number in (1, 2, 3):
         author.put(started(number))
     for index in range(10):
@@ -152,7 +152,7 @@ async def _made(url: str) -> None:
     await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
 
 
-def whole(url: str) -> None:
+def complete(url: str) -> None:
     for number in (1, 2):
         rows = stored(url, number)
         assert [row[0] for row in rows] == [1, 2, 3, 4, 5, 6, 7]
@@ -162,17 +162,17 @@ def whole(url: str) -> None:
 
 
 def pairs() -> Iterator[tuple[int, int]]:
-    """Every first step alone, and each with a few seconds."""
+    """Kill at every first step alone, and at every first step with several second steps."""
     for first in range(1, 60):
         for second in (0, 1 + first * 3 % 30):
             yield first, second
 
 
 @pytest.mark.parametrize("after", AFTER)
-def test_a_recovery_killed_at_any_step_and_the_next_one_too_stores_every_event_once(
-    left: tuple[str, Path], after: bool, tmp_path_factory: pytest.TempPathFactory
+def test_a_recovery_killed_at_any_step_and_again_in_the_next_one_stores_every_event_once(
+    crashed_folder: tuple[str, Path], after: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    _, prepared = left
+    _, prepared = crashed_folder
     ended_at: int | None = None
     for first, second in pairs():
         place = tmp_path_factory.mktemp("round")
@@ -184,21 +184,21 @@ def test_a_recovery_killed_at_any_step_and_the_next_one_too_stores_every_event_o
         if second:
             in_a_child(partial(_recover_all, url, spool), second, after=not after)
         recover_all(url, spool)
-        whole(url)
-        # Killed between the folder's last file and the folder itself, it may stay, empty.
+        complete(url)
+        # A recovery that is killed after it deleted the last file may leave the folder, empty.
         left_behind = [folder for folder in spool.iterdir() if folder.name != "stored"]
         assert [path for folder in left_behind for path in folder.iterdir()] == []
         shutil.rmtree(place)
         if ended_at is not None and first > ended_at:
             break
-    assert ended_at is not None  # all of its steps were gone through
+    assert ended_at is not None  # the kills reached every one of its steps
     assert ended_at > 20
 
 
-# --- a living recorder ------------------------------------------------------------------------------------------
+# --- a recorder that is alive -----------------------------------------------------------------------------------------
 
 
-def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
+def record_and_drain(url: str, spool: Path, report: Callable[..., None]) -> None:
     queue = RecorderQueue.create(spool, settings=LIVE, clock=STILL, recorder=RECORDER)
 
     async def both() -> None:
@@ -206,13 +206,13 @@ def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
         settings = Settings(batch_events_max=4)
         drain = asyncio.create_task(Drain(queue, log.append, settings=settings).run())
         for number in (1, 2):
-            say("put", number, queue.put_nowait(started(number), b"{}"))
+            report("put", number, queue.put_nowait(started(number), b"{}"))
         for index in range(14):
             payload = b'"%d %s"' % (index, b"y" * 900)
-            say("put", 1 + index % 2, queue.put_nowait(node(1 + index % 2), payload))
+            report("put", 1 + index % 2, queue.put_nowait(node(1 + index % 2), payload))
             await queue.synced_to()
-            say("synced", queue.synced)
-        say("put", 1, queue.put_nowait(ended(1), b"{}"))
+            report("synced", queue.synced)
+        report("put", 1, queue.put_nowait(ended(1), b"{}"))
         queue.close()
         with contextlib.suppress(DatabaseError):
             await drain
@@ -223,7 +223,7 @@ def record_and_drain(url: str, spool: Path, say: Callable[..., None]) -> None:
 
 
 @pytest.mark.parametrize("after", AFTER)
-def test_a_recorder_and_its_writer_killed_at_any_step_lose_nothing_that_was_put(tmp_path: Path, after: bool) -> None:
+def test_a_recorder_and_its_writer_killed_at_any_step_lose_no_event_that_was_put(tmp_path: Path, after: bool) -> None:
     done = False
     step = 0
     while not done:
@@ -232,10 +232,10 @@ def test_a_recorder_and_its_writer_killed_at_any_step_lose_nothing_that_was_put(
         place.mkdir()
         url, spool = f"sqlite:///{place}/memory.db", place / "spool"
         asyncio.run(_made(url))
-        done, said = in_a_child(partial(record_and_drain, url, spool), step, after=after)
+        done, output = in_a_child(partial(record_and_drain, url, spool), step, after=after)
         recover_all(url, spool)
         for number in (1, 2):
-            put = [int(line[2]) for line in said if line[:2] == ["put", str(number)]]
+            put = [int(line[2]) for line in output if line[:2] == ["put", str(number)]]
             rows = [row for row in stored(url, number) if row[2] != '{"status":"LOST"}']
             assert [row[0] for row in rows] == list(range(1, len(rows) + 1))
             assert len(put) <= len(rows) <= len(put) + 1, (step, after)

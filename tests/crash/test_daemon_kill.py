@@ -1,4 +1,4 @@
-"""Daemons and plans killed with SIGKILL again and again: every step a plan did is remembered once and in its place."""
+"""Kill daemons and plans with SIGKILL repeatedly: every step a plan performed is stored once and in its order."""
 
 import random
 import sqlite3
@@ -16,13 +16,13 @@ pytestmark = pytest.mark.slow
 
 def kill_again_and_again(lab: Lab, *, robots: int, kills: int) -> None:
     for robot in [lab.start_robot() for _ in range(robots)]:
-        robot.wait_until_it_walks()
+        robot.wait_until_it_performs()
     for _ in range(kills):
         lab.start_daemon()
         if lab.rng.random() < 0.5:
             lab.kill_robot()
             lab.start_robot()
-        # Python takes a second to begin with; what comes before it drains anything is worth few of the kills.
+        # Python starts in about a second, so that most kills before that would hit a daemon that drains nothing.
         time.sleep(0.7 + lab.rng.random() ** 2 * 1.5)
         lab.kill_daemon()
     begun = lab.log.read_text().count("draining")
@@ -32,10 +32,10 @@ def kill_again_and_again(lab: Lab, *, robots: int, kills: int) -> None:
     lab.kill_robot()
     lab.stop_robots()
     assert lab.stop_daemon() == 0
-    lab.prove_that_everything_is_there_once_and_in_order()
+    lab.verify_every_step_stored_once_in_order()
 
 
-def test_daemons_and_plans_are_killed_and_every_step_is_there_once(database_url: str, tmp_path: Path) -> None:
+def test_killed_daemons_and_plans_leave_every_step_stored_once(database_url: str, tmp_path: Path) -> None:
     lab = Lab(tmp_path, database_url, random.randrange(2**31))
     try:
         kill_again_and_again(lab, robots=3, kills=2)
@@ -45,7 +45,7 @@ def test_daemons_and_plans_are_killed_and_every_step_is_there_once(database_url:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("round_", range(5))
-def test_daemons_and_plans_are_killed_a_hundred_times(
+def test_a_hundred_kills_of_daemons_and_plans_leave_every_step_stored_once(
     database_url: str, tmp_path: Path, round_: int, in_turn: bool
 ) -> None:
     lab = Lab(tmp_path, database_url, random.randrange(2**31))
@@ -61,13 +61,13 @@ def own_server() -> Iterator[Server]:
         yield running
 
 
-def test_a_server_that_is_stopped_and_started_under_load_costs_nothing(own_server: Server, tmp_path: Path) -> None:
+def test_a_server_that_restarts_under_load_costs_no_event(own_server: Server, tmp_path: Path) -> None:
     lab = Lab(tmp_path, own_server.new_database(), random.randrange(2**31))
     try:
         robots = [lab.start_robot() for _ in range(2)]
         lab.start_daemon()
         for robot in robots:
-            robot.wait_until_it_walks()
+            robot.wait_until_it_performs()
         lab.wait_for_log("appeared")
         own_server.stop()
         lab.wait_for_log("the database is unavailable")
@@ -75,17 +75,17 @@ def test_a_server_that_is_stopped_and_started_under_load_costs_nothing(own_serve
         lab.wait_for_log("the database is available again")
         lab.stop_robots()
         assert lab.stop_daemon() == 0
-        lab.prove_that_everything_is_there_once_and_in_order()
+        lab.verify_every_step_stored_once_in_order()
     finally:
         lab.clear()
 
 
-def test_a_file_that_another_program_locks_for_a_while_costs_nothing(tmp_path: Path) -> None:
+def test_a_database_file_that_another_program_locks_costs_no_event(tmp_path: Path) -> None:
     lab = Lab(tmp_path, f"sqlite:///{tmp_path / 'memory.db'}", random.randrange(2**31))
     try:
         robot = lab.start_robot()
         lab.start_daemon()
-        robot.wait_until_it_walks()
+        robot.wait_until_it_performs()
         lab.wait_for_log("appeared")
         other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None, timeout=30)
         other.execute("BEGIN EXCLUSIVE")
@@ -95,7 +95,7 @@ def test_a_file_that_another_program_locks_for_a_while_costs_nothing(tmp_path: P
         lab.wait_for_log("the database is available again")
         lab.stop_robots()
         assert lab.stop_daemon() == 0
-        lab.prove_that_everything_is_there_once_and_in_order()
+        lab.verify_every_step_stored_once_in_order()
     finally:
         lab.clear()
 
@@ -111,7 +111,7 @@ def test_two_daemons_of_two_spools_fold_into_one_server_without_hindering_each_o
             lab.folder.mkdir()
             lab.start_daemon()
             for prefix in ("a", "b"):
-                lab.start_robot(f"{lab.folder.name}.{prefix}").wait_until_it_walks()
+                lab.start_robot(f"{lab.folder.name}.{prefix}").wait_until_it_performs()
         time.sleep(20)
         for lab in labs:
             lab.stop_robots()
@@ -119,7 +119,7 @@ def test_two_daemons_of_two_spools_fold_into_one_server_without_hindering_each_o
             assert "tables cannot" not in lab.log.read_text()
             assert "away" not in lab.log.read_text()
         labs[0].gone += labs[1].gone
-        labs[0].prove_that_everything_is_there_once_and_in_order()
+        labs[0].verify_every_step_stored_once_in_order()
         assert [path.name for path in labs[1].spool.iterdir() if path.is_dir() and path.name != "stored"] == []
     finally:
         for lab in labs:

@@ -1,4 +1,4 @@
-"""A process that leaves with a full queue, and a clock that is set back while a plan runs."""
+"""A process that exits with a full queue, and a wall clock that is set back while a plan runs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ import pytest
 from pycrorm_async import Memory, Reading, Settings, recover
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import SpoolFull
-from tests.crash.forked_processes import Forked
+from tests.crash.forked_processes import ForkedProcess
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 SMALL = Settings(
     sync_interval_ms=5,
@@ -33,7 +33,7 @@ HOUR_NS = 3600 * 10**9
 
 
 def fill_and_leave(url: str, spool: str, how: str) -> None:
-    """Notes until there is no room any more, then leaves in the middle of the episode."""
+    """Record notes until the spool is full, and exit in the middle of the episode."""
     asyncio.run(_fill(url, Path(spool), how))
 
 
@@ -53,26 +53,26 @@ async def _fill(url: str, spool: Path, how: str) -> None:
 
 
 @pytest.mark.parametrize("how", ["exit", "_exit", "raise"])
-async def test_who_leaves_with_a_full_queue_loses_nothing(database_url: str, tmp_path: Path, how: str) -> None:
+async def test_a_process_that_exits_with_a_full_queue_loses_nothing(
+    database_url: str, tmp_path: Path, how: str
+) -> None:
     spool = tmp_path / "spool"
-    leaving = Forked(fill_and_leave, database_url, str(spool), how)
+    leaving = ForkedProcess(fill_and_leave, database_url, str(spool), how)
     assert await asyncio.to_thread(leaving.wait) == (1 if how == "raise" else 3)
-    said = leaving.said
-    assert said == [str(number) for number in range(len(said))]
-    assert len(said) > 50
+    lines = leaving.lines
+    assert lines == [str(number) for number in range(len(lines))]
+    assert len(lines) > 50
     report = await recover(database_url, spool=spool)
     assert report.failed == {}
     async with Reading.open(database_url) as reading:
-        assert await texts(reading) == said
+        assert await texts(reading) == lines
         [episode] = await reading.episodes()
-    # What ends an episode has room kept free for it.
+    # Events that end an episode use space that is reserved for them.
     assert episode.status == {"exit": "ERROR", "raise": "ERROR", "_exit": "LOST"}[how]
     assert [path for path in spool.iterdir() if path.is_dir() and path.name != "stored"] == []
 
 
-async def test_a_clock_that_is_set_back_an_hour_again_and_again_changes_no_order(
-    database_url: str, tmp_path: Path
-) -> None:
+async def test_a_clock_that_is_set_back_an_hour_repeatedly_changes_no_order(database_url: str, tmp_path: Path) -> None:
     back_ns = 0
     clock = Clock(wall_ns=lambda: time.time_ns() - back_ns, monotonic_ns=time.monotonic_ns)
     words = list("abcdefg")

@@ -1,4 +1,4 @@
-"""A plan killed in the middle: every node whose hook returned is remembered once, and the episode says LOST."""
+"""Kill a plan in the middle: every node whose hook returned is stored once, and the episode has the status LOST."""
 
 import os
 import random
@@ -41,7 +41,7 @@ async def plan():
 
 
 def killed(folder: Path, seconds: float) -> tuple[set[int], set[int]]:
-    """Runs the plan, kills it that long after its first step; the steps that said they started, and ended."""
+    """Kill the plan this long after its first step, and return the steps that it reported as started and as ended."""
     process = subprocess.Popen(
         [*COMMAND, "run", "walk.py"], cwd=folder, env=environment(), stdout=subprocess.PIPE, bufsize=0
     )
@@ -70,7 +70,7 @@ def killed(folder: Path, seconds: float) -> tuple[set[int], set[int]]:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_every_node_whose_hook_returned_is_there_once_and_the_episode_is_lost(tmp_path: Path, seed: int) -> None:
+def test_a_killed_plan_has_every_node_whose_hook_returned_and_its_episode_is_lost(tmp_path: Path, seed: int) -> None:
     (tmp_path / "walk.py").write_text(PLAN)
     seconds = random.Random(seed).uniform(0.0, 0.6)
     print(f"seed {seed}: killed after {seconds:.3f} s")
@@ -84,12 +84,12 @@ def test_every_node_whose_hook_returned_is_there_once_and_the_episode_is_lost(tm
     assert shown["episode"]["status"] == "LOST"
 
     steps = [node for node in shown["tree"] if node["dtype"] == "StepAction"]
-    found = {node["parameters"]["index"]: node["status"] for node in steps}
-    assert len(found) == len(steps)
-    assert started <= set(found) <= started | {len(started)}
-    assert {index for index in ended if found[index] != "SUCCEEDED"} == set()
-    assert set(found.values()) <= {"SUCCEEDED", "LOST"}
-    assert len([index for index in found if found[index] == "LOST"]) <= 1
+    status_by_index = {node["parameters"]["index"]: node["status"] for node in steps}
+    assert len(status_by_index) == len(steps)
+    assert started <= set(status_by_index) <= started | {len(started)}
+    assert {index for index in ended if status_by_index[index] != "SUCCEEDED"} == set()
+    assert set(status_by_index.values()) <= {"SUCCEEDED", "LOST"}
+    assert len([index for index in status_by_index if status_by_index[index] == "LOST"]) <= 1
     root = next(node for node in shown["tree"] if node["dtype"] is None)
     assert root["status"] == "LOST"
 

@@ -1,7 +1,7 @@
-"""Sixteen robots on two machines, one database, and a network between that fails in every way, all the time.
+"""Run sixteen robots on two machines with one database, behind a network that keeps failing in every way.
 
-Robots and daemons are killed meanwhile. What the robots say that they did is the oracle; what the database holds is
-read by a connection that knows nothing of the memory.
+Robots and daemons are killed meanwhile. The test compares the output of the robots with the database, which it reads
+through a connection that does not use the memory.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import pytest
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from tests.commands import pycrorm
 from tests.crash.chore_robot import LANES, do_chores
-from tests.crash.forked_processes import Forked
+from tests.crash.forked_processes import ForkedProcess
 from tests.crash.robot_processes import HANGS_S, Lab
 from tests.databases import Server, ask
 
@@ -33,11 +33,11 @@ pytestmark = pytest.mark.slow
 ROBOTS_A_MACHINE = 8
 
 
-class Robot:
-    """A robot's process and the name it has in the memory; `killed` if it did not come to its end."""
+class RobotProcess:
+    """A robot's process, and its name in the memory; `killed` if it did not run to its end."""
 
     def __init__(self, url: str, spool: Path, name: str, seed: int) -> None:
-        self.forked = Forked(do_chores, url, str(spool), name, seed, 0.2)
+        self.forked = ForkedProcess(do_chores, url, str(spool), name, seed, 0.2)
         self.name = name
         self.killed = False
 
@@ -46,68 +46,70 @@ class Robot:
         self.killed = True
 
     @property
-    def said(self) -> list[dict[str, Any]]:
-        return [json.loads(line) for line in self.forked.said]
+    def lines(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.forked.lines]
 
 
 class Machine:
-    """A spool, its daemon, the way from there to the server, and the robots."""
+    """A spool, its daemon, a proxy between them and the server, and the robots."""
 
     def __init__(self, folder: Path, proxy: Proxy, database: str, rng: random.Random) -> None:
         folder.mkdir()
         self.proxy = proxy
-        self.lab = Lab(folder, proxy.url(database), rng.randrange(2**31))  # of which only the daemon is used
+        self.lab = Lab(folder, proxy.url(database), rng.randrange(2**31))  # only its daemon is used
         self.rng = rng
-        self.robots: list[Robot] = []
+        self.robots: list[RobotProcess] = []
 
-    def start_robot(self) -> Robot:
+    def start_robot(self) -> RobotProcess:
         name = f"{self.lab.folder.name}.{len(self.robots)}"
-        robot = Robot(self.lab.url, self.lab.spool, name, self.rng.randrange(2**31))
+        robot = RobotProcess(self.lab.url, self.lab.spool, name, self.rng.randrange(2**31))
         self.robots.append(robot)
         return robot
 
-    def living(self) -> list[Robot]:
+    def living(self) -> list[RobotProcess]:
         return [robot for robot in self.robots if not robot.killed]
 
-    async def keep_a_daemon(self) -> NoReturn:
-        """As a service manager does: whenever it has gone, it is started again."""
+    async def keep_daemon_running(self) -> NoReturn:
+        """Start the daemon again whenever it has ended, as a service manager does."""
         while True:
             self.lab.start_daemon()
             assert self.lab.daemon is not None
             code = await asyncio.to_thread(self.lab.daemon.wait)
-            assert code in (3, -signal.SIGKILL), self.lab.log.read_text()  # 3: the database was away when it began
+            assert code in (3, -signal.SIGKILL), (
+                self.lab.log.read_text()
+            )  # 3: the database was unavailable when the daemon started
             await asyncio.sleep(0.1)
 
     async def kill_and_replace(self) -> None:
         await asyncio.to_thread(self.rng.choice(self.living()).kill)
-        await asyncio.to_thread(self.start_robot().forked.wait_for_its_first_words)
+        await asyncio.to_thread(self.start_robot().forked.wait_for_first_output)
 
     def folders(self) -> list[str]:
-        """Of recorders, which go when all in them is stored."""
+        """List the recorders' folders, which are deleted when all their records are stored."""
         return [path.name for path in self.lab.spool.iterdir() if path.is_dir() and path.name != "stored"]
 
     def clear(self) -> None:
         for robot in self.living():
-            with suppress(ValueError):  # it has ended by itself
+            with suppress(ValueError):  # the process has already ended
                 robot.forked.process.kill()
         self.lab.clear()
 
 
 async def work(machines: list[Machine], rng: random.Random, seconds: float) -> None:
-    """Everything happens at once, for so long; then the network is whole, and the daemons have time to do the rest."""
+    """Run everything concurrently for `seconds`, then restore the network and let the daemons store the rest."""
     async with asyncio.TaskGroup() as tasks:
-        keepers = [tasks.create_task(machine.keep_a_daemon()) for machine in machines]
+        keepers = [tasks.create_task(machine.keep_daemon_running()) for machine in machines]
         for machine in machines:
             await asyncio.to_thread(machine.lab.wait_for_log, "draining")
         for machine in machines:
             for robot in [machine.start_robot() for _ in range(ROBOTS_A_MACHINE)]:
-                await asyncio.to_thread(robot.forked.wait_for_its_first_words)
+                await asyncio.to_thread(robot.forked.wait_for_first_output)
             await asyncio.to_thread(machine.lab.wait_for_log, "appeared")
         troubles = [tasks.create_task(machine.proxy.trouble(rng, pause_s=0.25)) for machine in machines]
-        await kill_now_and_then(machines, seconds)
+        await kill_repeatedly(machines, seconds)
         living = [robot for machine in machines for robot in machine.living()]
         for robot in living:
-            robot.forked.tell_to_stop()
+            robot.forked.request_stop()
         for robot in living:
             assert await asyncio.to_thread(robot.forked.wait) == 0, robot.name
         for trouble in troubles:
@@ -128,8 +130,8 @@ async def until_all_is_stored(machines: list[Machine]) -> None:
         await asyncio.sleep(0.05)
 
 
-async def kill_now_and_then(machines: list[Machine], seconds: float) -> None:
-    """A robot of each machine and one daemon, again and again."""
+async def kill_repeatedly(machines: list[Machine], seconds: float) -> None:
+    """Kill one robot of each machine and one daemon in turn until the time is over."""
     deadline = asyncio.get_running_loop().time() + seconds
     for machine in itertools.cycle(machines):
         await asyncio.sleep(min(seconds / 4, 10.0))
@@ -170,17 +172,17 @@ async def test_sixteen_robots_and_two_daemons_behind_a_failing_network_lose_and_
         robots = [robot for machine in machines for robot in machine.robots]
         assert sum(not robot.killed for robot in robots) == 2 * ROBOTS_A_MACHINE
         assert sum(robot.killed for robot in robots) >= 4
-        told = await asyncio.to_thread(Told, url)
+        stored = await asyncio.to_thread(StoredMemory, url)
         for robot in robots:
-            compare(robot, told)
-        compare_all(robots, told)
+            compare(robot, stored)
+        compare_all(robots, stored)
 
 
-# --- what the database says ---------------------------------------------------------------------------------------
+# --- the content of the database --------------------------------------------------------------------------------------
 
 
-class Told:
-    """What the database holds, by the names the robots gave: its log, and its tables."""
+class StoredMemory:
+    """The log and the tables of the database, by the names that the robots chose."""
 
     def __init__(self, url: str) -> None:
         self.heads = ask(url, "SELECT number, head, folded, refused, parked FROM episode ORDER BY number")
@@ -216,7 +218,7 @@ class Told:
         }
 
     def _read_log(self, url: str) -> None:
-        """What each event says, in the order of their numbers: (what, which chore, how it ended)."""
+        """Read each event in the order of its number as (kind, chore, outcome)."""
         names: dict[int, str] = {}
         numbers: dict[tuple[int, int], int | None] = {}
         rows = ask(url, "SELECT episode, sequence, type, payload FROM event ORDER BY episode, sequence")
@@ -225,7 +227,7 @@ class Told:
             self.sequences[episode].append(sequence)
             if kind == "EpisodeStarted":
                 names[episode] = payload["description"]
-                numbers[episode, 2] = None  # the root
+                numbers[episode, 2] = None  # the root node has no chore
             elif kind == "NodeStarted" and payload["kind"] != "root":
                 number = numbers[episode, sequence] = payload["parameters"]["number"]
                 self.log[names[episode]].append(("began", number, None))
@@ -236,33 +238,33 @@ class Told:
             else:
                 raise AssertionError((kind, payload))
 
-    def nodes_of(self, robot: Robot) -> Iterator[tuple[Any, ...]]:
+    def nodes_of(self, robot: RobotProcess) -> Iterator[tuple[Any, ...]]:
         return (row for row in self.nodes if row[0].startswith(f"{robot.name}."))
 
 
-# --- the proof ----------------------------------------------------------------------------------------------------
+# --- the comparison ---------------------------------------------------------------------------------------------------
 
 
-def compare(robot: Robot, told: Told) -> None:
-    """All that this robot did is there once, in its order and with its values; one it was killed in did one more."""
-    said = robot.said
-    opened = [line["opened"] for line in said if "opened" in line]
-    closed = {line["closed"] for line in said if "closed" in line}
-    there = [name for name in told.episodes if name.startswith(f"{robot.name}.")]
-    assert set(opened) <= set(there)
-    assert len(there) <= len(opened) + robot.killed * LANES  # opened, and not said before it was killed
+def compare(robot: RobotProcess, stored: StoredMemory) -> None:
+    """Every chore of this robot is stored once, in order and with its values; each killed lane may have one more."""
+    lines = robot.lines
+    opened = [line["opened"] for line in lines if "opened" in line]
+    closed = {line["closed"] for line in lines if "closed" in line}
+    names = [name for name in stored.episodes if name.startswith(f"{robot.name}.")]
+    assert set(opened) <= set(names)
+    assert len(names) <= len(opened) + robot.killed * LANES  # opened, but not reported before the kill
     if not robot.killed:
-        assert closed == set(there)
-        assert said[-1] == {"faults": 0}
-    assert all(told.episodes[name] == ("SUCCEEDED", None) for name in closed)
+        assert closed == set(names)
+        assert lines[-1] == {"faults": 0}
+    assert all(stored.episodes[name] == ("SUCCEEDED", None) for name in closed)
     unsaid = 0
-    for name in there:
+    for name in names:
         did = [
             ("began", line["began"], None) if "began" in line else ("ended", line["ended"], line["how"])
-            for line in said
+            for line in lines
             if line.get("episode") == name
         ]
-        events = told.log[name]
+        events = stored.log[name]
         assert events[0] == ("NodeStarted", None, None) or (not did and robot.killed)
         inside = [each for each in events if each[0] in ("began", "ended")]
         assert inside[: len(did)] == did
@@ -272,18 +274,18 @@ def compare(robot: Robot, told: Told) -> None:
             assert events == [("NodeStarted", None, None), *did, *ends]
         else:
             assert events[-1][0] == "EpisodeEnded"
-            assert events[-1][2] in ("LOST", "SUCCEEDED")  # it may have ended, and not said so before it was killed
-            assert told.episodes[name][0] == events[-1][2]
+            assert events[-1][2] in ("LOST", "SUCCEEDED")  # it may have ended without a report before the kill
+            assert stored.episodes[name][0] == events[-1][2]
     assert unsaid <= robot.killed
-    compare_rows(robot, told)
+    compare_rows(robot, stored)
 
 
-def compare_rows(robot: Robot, told: Told) -> None:
-    said = robot.said
-    began = {(line["episode"], line["began"]): line for line in said if "began" in line}
-    ended = {(line["episode"], line["ended"]): line["how"] for line in said if "ended" in line}
+def compare_rows(robot: RobotProcess, stored: StoredMemory) -> None:
+    lines = robot.lines
+    began = {(line["episode"], line["began"]): line for line in lines if "began" in line}
+    ended = {(line["episode"], line["ended"]): line["how"] for line in lines if "ended" in line}
     rows = {}
-    for episode, number, *rest in told.nodes_of(robot):
+    for episode, number, *rest in stored.nodes_of(robot):
         assert (episode, number) not in rows
         rows[episode, number] = rest
     assert set(began) <= set(rows)
@@ -294,7 +296,7 @@ def compare_rows(robot: Robot, told: Told) -> None:
         how = ended.get((episode, number))
         if how is None:
             assert robot.killed
-            assert status == "LOST" or has_end  # its end was written, and not said
+            assert status == "LOST" or has_end  # its end was recorded but not reported
         else:
             assert (status, has_end) == (how, True)
         assert message == (f"slipped at {number}" if status == "FAILED" else None)
@@ -307,28 +309,30 @@ def compare_rows(robot: Robot, told: Told) -> None:
         line = began.get((episode, number))
         if line is not None:
             assert dtype == {"step": "StepAction", "carry": "CarryAction"}[line["what"]]
-            values = {"weight": weight, "hand": hand, "there": [x, y, z], "words": told.words.get(node, [])}
+            values = {"weight": weight, "hand": hand, "there": [x, y, z], "words": stored.words.get(node, [])}
             assert values == line.get("told", {"weight": None, "hand": None, "there": [None] * 3, "words": []})
 
 
-def compare_all(robots: list[Robot], told: Told) -> None:
-    """Nothing is there but what the robots did, and the tables show all of the log."""
-    assert all(head == folded and refused is None and parked is None for _, head, folded, refused, parked in told.heads)
-    assert {number: list(range(1, head + 1)) for number, head, *_ in told.heads} == told.sequences
-    assert set(told.descriptions.values()) == {1}
-    assert {name.rsplit(".", 2)[0] for name in told.descriptions} <= {robot.name for robot in robots}
-    roots = sum(event[0] == "NodeStarted" for events in told.log.values() for event in events)
-    began = Counter(row[2] for row in told.nodes)
-    words = sum(len(each) for each in told.words.values())
+def compare_all(robots: list[RobotProcess], stored: StoredMemory) -> None:
+    """The database holds only what the robots did, and the tables show all of the log."""
+    assert all(
+        head == folded and refused is None and parked is None for _, head, folded, refused, parked in stored.heads
+    )
+    assert {number: list(range(1, head + 1)) for number, head, *_ in stored.heads} == stored.sequences
+    assert set(stored.descriptions.values()) == {1}
+    assert {name.rsplit(".", 2)[0] for name in stored.descriptions} <= {robot.name for robot in robots}
+    roots = sum(event[0] == "NodeStarted" for events in stored.log.values() for event in events)
+    began = Counter(row[2] for row in stored.nodes)
+    words = sum(len(each) for each in stored.words.values())
     rows = {
-        "process_metadata": len(told.episodes),
-        "task_tree_node": roots + len(told.nodes),
+        "process_metadata": len(stored.episodes),
+        "task_tree_node": roots + len(stored.nodes),
         "step_action": began["StepAction"],
         "carry_action": began["CarryAction"],
         "pose": began["CarryAction"],
         "parameter_item": words,
     }
-    assert told.counts == {table: rows.get(table, 0) for table in told.counts}
-    done = sum("ended" in line for robot in robots for line in robot.said)
-    print(f"{len(told.episodes)} episodes, {done} chores and steps said done, {sum(rows.values())} rows")
+    assert stored.counts == {table: rows.get(table, 0) for table in stored.counts}
+    done = sum("ended" in line for robot in robots for line in robot.lines)
+    print(f"{len(stored.episodes)} episodes, {done} chores and steps said done, {sum(rows.values())} rows")
     assert done > 1000, "too little was done to prove anything"

@@ -1,4 +1,4 @@
-"""A disk that refuses: a failed sync is not believed a second time, a full disk is an error and not a signal."""
+"""A disk that fails: a later sync does not hide a failed one, and a full disk raises an error and no signal."""
 
 import asyncio
 import contextlib
@@ -25,20 +25,20 @@ SLOW = Settings(
 )
 
 
-def break_syncing(queue: RecorderQueue) -> None:
-    """The next sync of the current segment fails: its descriptor leads to a pipe, which cannot be synced."""
+def break_next_sync(queue: RecorderQueue) -> None:
+    """Make the next sync of the current segment fail: its descriptor refers to a pipe, which cannot be synced."""
     read, write = os.pipe()
     os.dup2(write, queue._appender._current.descriptor)
     os.close(read)
     os.close(write)
 
 
-async def test_a_failed_sync_refuses_everything_but_what_was_synced_before(tmp_path: Path) -> None:
+async def test_a_failed_sync_refuses_all_records_but_those_synced_before(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=SLOW)
     queue.put_nowait(started(), b"{}")
     await queue.synced_to()
     queue.put_nowait(node(), b"not synced")
-    break_syncing(queue)
+    break_next_sync(queue)
     waiters = [asyncio.ensure_future(queue.synced_to()) for _ in range(3)]
     for waiter in waiters:
         with pytest.raises(SpoolUnavailable, match="Invalid argument"):
@@ -65,12 +65,12 @@ async def test_a_failed_sync_refuses_everything_but_what_was_synced_before(tmp_p
     ]
 
 
-async def test_a_failed_sync_ends_the_waiting_of_the_writer(tmp_path: Path) -> None:
+async def test_a_failed_sync_ends_the_wait_of_the_writer(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=SLOW)
     waiting = asyncio.ensure_future(queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=1000.0))
     await asyncio.sleep(0)
     queue.put_nowait(started(), b"{}")
-    break_syncing(queue)
+    break_next_sync(queue)
     with pytest.raises(SpoolUnavailable):
         await queue.synced_to()
     with pytest.raises(SpoolUnavailable):
@@ -80,7 +80,7 @@ async def test_a_failed_sync_ends_the_waiting_of_the_writer(tmp_path: Path) -> N
 
 @pytest.fixture(params=["mounted", "simulated"])
 def small_disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A disk of 256 KiB: one of its own, and one that only says so, for machines that give no right to mount."""
+    """A disk of 256 KiB: a mounted one, and a simulated one for machines that do not permit a mount."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)]
@@ -91,7 +91,7 @@ def small_disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
     allocate = os.posix_fallocate
 
     def used_bytes() -> int:
-        while True:  # the other thread may rename a file while it is counted
+        while True:  # the other thread may rename a file during the count
             with contextlib.suppress(FileNotFoundError):
                 sizes, again = ({path: path.stat().st_size for path in disk.rglob("*")} for _ in range(2))
                 if sizes == again:
@@ -111,14 +111,16 @@ ON_A_SMALL_DISK = Settings(
 )
 
 
-async def test_a_full_disk_is_a_full_spool_and_goes_on_when_there_is_room(small_disk: Path) -> None:
+async def test_a_full_disk_is_reported_as_a_full_spool_and_recording_resumes_when_there_is_space(
+    small_disk: Path,
+) -> None:
     queue = RecorderQueue.create(small_disk / "spool", settings=ON_A_SMALL_DISK, clock=SYSTEM_CLOCK, recorder=RECORDER)
     queue.put_nowait(started(), b"{}")
     put = 1
     with contextlib.suppress(SpoolFull):
         while True:
             put = queue.put_nowait(node(), b"x" * 1000, reserved=True)
-    with pytest.raises(SpoolFull, match="No space left on device"):  # the disk is full, and not the spool
+    with pytest.raises(SpoolFull, match="No space left on device"):  # the disk is full and the spool is not
         queue.put_nowait(node(), b"x" * 1000, reserved=True)
     assert queue.full
     assert put > 150
@@ -135,7 +137,7 @@ async def test_a_full_disk_is_a_full_spool_and_goes_on_when_there_is_room(small_
     queue.release()
 
 
-def test_a_queue_that_does_not_fit_on_the_disk_is_one_clear_line_and_leaves_nothing(small_disk: Path) -> None:
+def test_a_queue_that_does_not_fit_on_the_disk_is_refused_in_one_line_and_leaves_no_files(small_disk: Path) -> None:
     with pytest.raises(SpoolUnavailable, match="No space left on device") as refused:
         RecorderQueue.create(
             small_disk / "spool",

@@ -1,9 +1,9 @@
-"""A power cut before and after every sync, on a disk that keeps any subset of what it was not yet told to keep.
+"""Cut the power before and after every sync, on a disk that keeps any subset of what was not synced.
 
-The queue and its files are real; only its thread is not started, the test takes its turns, and each `fdatasync` is
-watched. A cut mixes, sector by sector, what the last sync of a file made safe with all its states since; a file deleted
-since the power was last sure may be there again. A recorder may also be killed, and the power fail when another
-program has recovered what it left.
+The queue and its files are real. The test calls each turn of the sync thread itself and observes each `fdatasync`. A
+power cut mixes, sector by sector, the state that the last sync of a file made durable with all states since; a deleted
+file may exist again if the deletion was not durable. The recorder may also be killed, and the power may fail after
+another program has recovered its folder.
 """
 
 import os
@@ -32,7 +32,7 @@ ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
 
 
 class Machine:
-    """A queue on a disk that forgets, and the truth about what was put."""
+    """A queue on a disk that forgets, and the record of what was put."""
 
     def __init__(self, place: Path, rng: random.Random) -> None:
         self.queue: RecorderQueue = make(place / "running", settings=ROOMY)
@@ -40,7 +40,7 @@ class Machine:
         self.cuts: list[tuple[Path, int, int, int]] = []
         self._place = place
         self._rng = rng
-        self.meanwhile: Callable[[], Heading] = node  # what other threads put
+        self.meanwhile: Callable[[], Heading] = node  # records of other threads
         self.sequences: dict[EpisodeId, int] = {}
         self._safe: dict[Path, bytes] = {}
         self._since: dict[Path, list[bytes]] = {}
@@ -55,7 +55,9 @@ class Machine:
         self._since.setdefault(path, []).append(path.read_bytes())
 
     def put_meanwhile(self) -> None:
-        """What other threads put while the sync thread takes its turn: nothing, a little, or what rolls a segment."""
+        """Put what other threads put during a turn of the sync thread: nothing, a few records, or enough for a new
+        segment.
+        """
         for size in self._rng.choice([[], [], [], [], [], [10], [3000], [10, 3000]]):
             self.put(self.meanwhile(), b"m" * size)
 
@@ -63,13 +65,13 @@ class Machine:
         self._safe[path], self._since[path] = path.read_bytes(), []
 
     def turn(self) -> None:
-        """What the sync thread does when it is woken."""
+        """Run one turn of the sync thread."""
         before = {path: self._mixed(path) for path in self._files()}
         self.queue._turn()
         self._deleted += [(path, before[path]) for path in before if not path.exists()]
 
     def cut(self) -> None:
-        """Keeps the files as they may be found when power is back, with what is known at this moment."""
+        """Keep the files as they may be after a power cut, with what the queue reports as synced at this moment."""
         folder = self._place / str(len(self.cuts)) / self.queue.name
         folder.mkdir(parents=True)
         (folder / "alive").touch()
@@ -80,7 +82,7 @@ class Machine:
         self.cuts.append((folder, self.queue.synced, self.queue.stored, len(self.put_so_far)))
 
     def kill(self) -> Path:
-        """The folder as everybody finds it while there is power: all that was written is there."""
+        """Return the folder as other processes find it while there is power, with everything that was written."""
         folder = self._place / "killed" / self.queue.name
         folder.mkdir(parents=True)
         (folder / "alive").touch()
@@ -89,7 +91,9 @@ class Machine:
         return folder
 
     def cut_after_kill(self, killed: Path, *, safe: set[str]) -> Path:
-        """What is left of that folder without power, if whoever recovered it had the disk keep these files."""
+        """Return what is left of that folder without power if the program that recovered it had made these files
+        durable.
+        """
         folder = self._place / "cut" / self.queue.name
         folder.mkdir(parents=True)
         (folder / "alive").touch()
@@ -120,7 +124,7 @@ def ends_of(records: list[Record]) -> list[Record]:
 
 
 def spoil(folder: Path, position: int) -> None:
-    """Changes one bit of the record at this position."""
+    """Change one bit of the record at this position."""
     for path in folder.glob("*.segment"):
         content = path.read_bytes()
         salt = salt_of(RECORDER, int(path.stem)).to_bytes(4, "little")
@@ -140,7 +144,7 @@ def machine(tmp_path: Path, seed: int) -> Iterator[Machine]:
 
 @contextmanager
 def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
-    """A machine whose every sync is watched, with a cut before and after each."""
+    """Return a machine whose every sync is observed, with a power cut before and after each."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SyncThread, "start", lambda self: None)
         machine = Machine(place, rng)
@@ -170,8 +174,8 @@ def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
             machine.queue._source.reader.close()
 
 
-async def live_through(machine: Machine, rng: random.Random) -> None:
-    """A life of a recorder: puts, syncs, what is stored and deleted, and power cuts at every step of it."""
+async def live_through_cuts(machine: Machine, rng: random.Random) -> None:
+    """Run a recorder that puts, syncs, stores and deletes, with a power cut at every step."""
     for number in (1, 2, 3):
         machine.put(started(number), b"{}")
     for _ in range(6):
@@ -193,9 +197,9 @@ async def live_through(machine: Machine, rng: random.Random) -> None:
 
 
 @pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(6, 200))])
-async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(machine: Machine, seed: int) -> None:
+async def test_a_power_cut_costs_no_synced_record_and_is_never_reported_as_damage(machine: Machine, seed: int) -> None:
     rng = random.Random(seed + 1000)
-    await live_through(machine, rng)
+    await live_through_cuts(machine, rng)
 
     assert len(machine.cuts) > 20
     for folder, synced, stored, count in machine.cuts:
@@ -215,7 +219,7 @@ async def test_a_power_cut_costs_no_synced_record_and_is_never_taken_for_damage(
 
 
 @pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(8, 200))])
-async def test_what_a_recovery_gave_away_after_a_kill_is_given_again_after_a_power_cut(
+async def test_what_a_recovery_supplied_after_a_kill_is_supplied_again_after_a_power_cut(
     machine: Machine, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng = random.Random(seed + 2000)
@@ -247,7 +251,7 @@ async def test_what_a_recovery_gave_away_after_a_kill_is_given_again_after_a_pow
     recovered.release()
     monkeypatch.undo()
 
-    # Records that were not given away may be lost with the machine; then the ends are those of what is left.
+    # Records that no recovery supplied may be lost with the machine; the computed ends then follow from what is left.
     again = await recover(machine.cut_after_kill(killed, safe=safe))
     first, records = again[0].position, machine.put_so_far
     last = first - 1 + sum(not is_computed_end(each) for each in again)

@@ -1,4 +1,4 @@
-"""A rebuild is killed anywhere, and runs beside processes that record and read: nobody sees less than before."""
+"""Kill a rebuild anywhere, and run it beside processes that record and read: readers never see less than before."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.operations.rebuild import rebuild_memory
-from tests.crash.forked_processes import Forked
-from tests.crash.rebuild_processes import read_until_told, rebuild_until, record_until_told
+from tests.crash.forked_processes import ForkedProcess
+from tests.crash.rebuild_processes import read_until_stopped, rebuild_until, record_until_stopped
 from tests.databases import ask
 from tests.projections.rebuild_cases import TYPES, folded_elsewhere, picking, store, traces
 from tests.table_comparison import differences, tables_of
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 EPISODES = 30
 BATCH_EVENTS = 60
@@ -29,22 +29,22 @@ async def filled(url: str, episodes: int = EPISODES) -> None:
 
 
 def killed_at(url: str, last: int, *, workers: int) -> None:
-    process = Forked(rebuild_until, url, last, workers, BATCH_EVENTS)
-    assert process.wait() in (-9, 0), process.said
+    process = ForkedProcess(rebuild_until, url, last, workers, BATCH_EVENTS)
+    assert process.wait() in (-9, 0), process.lines
 
 
 async def kill_again_and_again(url: str, kills: int, *, workers: int) -> None:
     await filled(url)
     before = tables_of(url)
-    whole = Forked(rebuild_until, url, 0, workers, BATCH_EVENTS)
+    whole = ForkedProcess(rebuild_until, url, 0, workers, BATCH_EVENTS)
     assert whole.wait() == 0
-    count = int(whole.said[-1])
+    count = int(whole.lines[-1])
     assert differences(before, tables_of(url)) == []
     seed = random.randrange(2**31)
     print("seed", seed, "statements", count)
     rng = random.Random(seed)
     for _ in range(kills):
-        # Half of them at the end, where the new tables are put in place and the old ones dropped.
+        # Half of the kills hit the end, where the rebuild publishes the new tables and drops the old ones.
         last = rng.randint(1, count) if rng.random() < 0.5 else rng.randint(count * 2 // 3, count)
         killed_at(url, last, workers=workers)
         assert differences(before, tables_of(url)) == [], f"killed at statement {last}"
@@ -57,23 +57,25 @@ async def kill_again_and_again(url: str, kills: int, *, workers: int) -> None:
     assert traces(url) == []
 
 
-async def test_killed_anywhere_people_see_the_same_and_the_next_rebuild_leaves_no_trace(database_url: str) -> None:
+async def test_a_rebuild_killed_anywhere_changes_nothing_readers_see_and_the_next_one_leaves_no_trace(
+    database_url: str,
+) -> None:
     await kill_again_and_again(database_url, 3, workers=1)
 
 
-async def test_so_it_is_when_workers_fold(tmp_path: Path) -> None:
+async def test_a_rebuild_with_workers_killed_anywhere_changes_nothing_readers_see(tmp_path: Path) -> None:
     await kill_again_and_again(f"sqlite:///{tmp_path}/memory.db", 1, workers=2)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("workers", [1, 2])
-async def test_killed_at_fifty_points_people_see_the_same(database_url: str, workers: int, in_turn: bool) -> None:
+async def test_a_rebuild_killed_at_fifty_points_changes_nothing_readers_see(
+    database_url: str, workers: int, in_turn: bool
+) -> None:
     await kill_again_and_again(database_url, 8 if in_turn else 50, workers=workers)
 
 
-async def test_a_worker_that_is_killed_costs_time_and_no_event(
-    database_url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_killed_worker_costs_time_and_no_event(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from multiprocessing.context import SpawnProcess
 
     await filled(database_url)
@@ -90,27 +92,30 @@ async def test_a_worker_that_is_killed_costs_time_and_no_event(
     assert differences(before, tables_of(database_url)) == []
 
 
-async def beside_others(url: str, folder: Path, *, episodes: int, rebuilds: int, readers: int) -> None:
+async def rebuild_beside_recorders(url: str, folder: Path, *, episodes: int, rebuilds: int, readers: int) -> None:
     await filled(url, episodes)
-    others = [Forked(record_until_told, url, folder / "spool"), *(Forked(read_until_told, url) for _ in range(readers))]
+    others = [
+        ForkedProcess(record_until_stopped, url, folder / "spool"),
+        *(ForkedProcess(read_until_stopped, url) for _ in range(readers)),
+    ]
     for each in others:
-        each.wait_for_its_first_words()
+        each.wait_for_first_output()
     began = time.monotonic()
     for _ in range(rebuilds):
         assert (await rebuild_memory(url)).left == []
     took_s = time.monotonic() - began
     for each in others:
-        each.tell_to_stop()
+        each.request_stop()
     codes = [each.wait() for each in others]
-    assert codes == [0] * len(others), [each.said[-3:] for each in others]
+    assert codes == [0] * len(others), [each.lines[-3:] for each in others]
     for each in others[1:]:
-        *counts, waited = each.said
+        *counts, waited = each.lines
         seen = [tuple(map(int, line.split()[1:])) for line in counts]
         assert seen[0][0] >= episodes
         assert seen[0][3] >= 5 * episodes
         assert all(a <= b for one, other in pairwise(seen) for a, b in zip(one, other, strict=True)), seen
         print(f"read {len(seen)} times, {waited} s at most")
-    _, recorded, longest_s = others[0].said[-1].split()
+    _, recorded, longest_s = others[0].lines[-1].split()
     print(f"{recorded} episodes recorded in {took_s:.1f} s, flushed in {longest_s} s at most")
     assert ask(url, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
     assert ask(url, "SELECT count(*) FROM process_metadata") == [(episodes + int(recorded),)]
@@ -119,12 +124,12 @@ async def beside_others(url: str, folder: Path, *, episodes: int, rebuilds: int,
     assert traces(url) == []
 
 
-async def test_processes_that_record_and_read_meanwhile_see_nothing_of_it(database_url: str, tmp_path: Path) -> None:
-    await beside_others(database_url, tmp_path, episodes=100, rebuilds=2, readers=2)
+async def test_a_rebuild_changes_nothing_for_processes_that_record_and_read(database_url: str, tmp_path: Path) -> None:
+    await rebuild_beside_recorders(database_url, tmp_path, episodes=100, rebuilds=2, readers=2)
 
 
 @pytest.mark.soak
-async def test_processes_that_record_and_read_for_long_see_nothing_of_it(
+async def test_a_long_rebuild_changes_nothing_for_processes_that_record_and_read(
     database_url: str, tmp_path: Path, in_turn: bool
 ) -> None:
-    await beside_others(database_url, tmp_path, episodes=1_000 if in_turn else 10_000, rebuilds=5, readers=4)
+    await rebuild_beside_recorders(database_url, tmp_path, episodes=1_000 if in_turn else 10_000, rebuilds=5, readers=4)

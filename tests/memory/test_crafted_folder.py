@@ -17,7 +17,7 @@ from tests.commands import pycrorm
 from tests.databases import ask
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable
-from tests.queue.factories import Author, ended, episode, node, started
+from tests.queue.factories import FolderWriter, ended, episode, node, started
 from tests.queue.forged_segments import change_a_frame
 from tests.writer.writer_threads import until
 
@@ -33,9 +33,9 @@ def spool(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def crafted(spool: Path) -> Author:
+def crafted(spool: Path) -> FolderWriter:
     """Its only event's name is no text. It is the oldest folder, so that others come after it."""
-    author = Author(spool, settings=QUICK)
+    author = FolderWriter(spool, settings=QUICK)
     author.put(started(), encode(EpisodeStarted("crafted", "me", "host", "1.0", "3.11")))
     author.sync()
     change_a_frame(author.segments[0], random.Random(0), name=b"\xff\xfe")
@@ -43,15 +43,17 @@ def crafted(spool: Path) -> Author:
 
 
 @pytest.fixture
-def whole(spool: Path, crafted: Author) -> Author:
-    author = Author(spool, settings=QUICK, recorder=episode(99))
+def whole(spool: Path, crafted: FolderWriter) -> FolderWriter:
+    author = FolderWriter(spool, settings=QUICK, recorder=episode(99))
     author.put(started(2), encode(EpisodeStarted("whole", "me", "host", "1.0", "3.11")))
     author.put(ended(2), encode(EpisodeEnded("SUCCEEDED")))
     author.sync()
     return author
 
 
-async def test_one_round_drains_the_next_folder(database_url: str, spool: Path, crafted: Author, whole: Author) -> None:
+async def test_one_round_drains_the_next_folder(
+    database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter
+) -> None:
     report = await recover(database_url, spool=spool)
     [(name, fault)] = report.failed.items()
     assert isinstance(fault, SpoolDamaged)
@@ -61,7 +63,7 @@ async def test_one_round_drains_the_next_folder(database_url: str, spool: Path, 
 
 
 async def test_the_daemon_drains_the_next_folder(
-    database_url: str, spool: Path, crafted: Author, whole: Author
+    database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter
 ) -> None:
     running = Daemon(database_url, spool)
     await running.says("is not UTF-8; retrying with pauses$")
@@ -71,7 +73,7 @@ async def test_the_daemon_drains_the_next_folder(
 
 
 async def test_a_plan_that_starts_beside_them_adopts_the_next_folder(
-    database_url: str, spool: Path, crafted: Author, whole: Author, caplog: pytest.LogCaptureFixture
+    database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Memory.open(database_url, spool=spool, settings=QUICK) as memory:
         await NoteActionPerformable("beside").perform()
@@ -80,7 +82,9 @@ async def test_a_plan_that_starts_beside_them_adopts_the_next_folder(
     assert len([each for each in caplog.records if each.levelno >= logging.WARNING]) == 1
 
 
-def test_every_verb_says_it_in_one_line(tmp_path: Path, spool: Path, crafted: Author, whole: Author) -> None:
+def test_every_verb_says_it_in_one_line(
+    tmp_path: Path, spool: Path, crafted: FolderWriter, whole: FolderWriter
+) -> None:
     (spool / os.fsdecode(b"\xff")).touch()
     crafted_folder, url = crafted.folder, f"sqlite:///{tmp_path / 'memory.db'}"
     (whole.folder / "drain").symlink_to("drain")
@@ -106,7 +110,7 @@ def test_every_verb_says_it_in_one_line(tmp_path: Path, spool: Path, crafted: Au
 async def test_an_episode_of_nonsense_is_stopped_and_the_one_beside_it_is_in_the_tables(
     database_url: str, spool: Path
 ) -> None:
-    author = Author(spool, settings=QUICK)
+    author = FolderWriter(spool, settings=QUICK)
     author.put(started(1), encode(EpisodeStarted("nonsense", "me", "host", "1.0", "3.11")))
     author.put(node(1), b'{"node":99999999999999999999999}')
     author.put(started(2), encode(EpisodeStarted("sound", "me", "host", "1.0", "3.11")))

@@ -19,7 +19,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from tests.databases import ask
 from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable
-from tests.queue.factories import WALL_NS, Author, episode, overwrite, started
+from tests.queue.factories import WALL_NS, FolderWriter, episode, overwrite, started
 from tests.writer.writer_threads import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
@@ -35,9 +35,9 @@ def spool(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def damaged(spool: Path) -> Author:
+def damaged(spool: Path) -> FolderWriter:
     """Of twenty events, each safe and two in a file, the thirteenth is not what it was."""
-    author = Author(spool)
+    author = FolderWriter(spool)
     author.put(started(), encode(EpisodeStarted("damaged further on", "me", "host", "1.0", "3.11")))
     added, here = Heading(episode(1), "ObjectAdded", 1), PoseValue((0, 0, 0), (0, 0, 0, 1), "map", WALL_NS)
     for number in range(2, 21):
@@ -49,7 +49,7 @@ def damaged(spool: Path) -> Author:
 
 
 async def test_the_daemon_tells_it_once_and_stores_what_a_repair_keeps_of_the_rest(
-    database_url: str, spool: Path, damaged: Author
+    database_url: str, spool: Path, damaged: FolderWriter
 ) -> None:
     running = Daemon(database_url, spool)
     await running.says("is dead: recovering")
@@ -67,7 +67,7 @@ async def test_the_daemon_tells_it_once_and_stores_what_a_repair_keeps_of_the_re
 
 
 async def test_one_round_reports_it_and_stores_what_a_repair_keeps_of_the_rest(
-    database_url: str, spool: Path, damaged: Author
+    database_url: str, spool: Path, damaged: FolderWriter
 ) -> None:
     for _ in range(2):
         report = await recover(database_url, spool=spool)
@@ -83,7 +83,7 @@ async def test_one_round_reports_it_and_stores_what_a_repair_keeps_of_the_rest(
 
 
 async def test_a_plan_that_starts_beside_it_tells_it_once_and_goes_on(
-    database_url: str, spool: Path, damaged: Author, caplog: pytest.LogCaptureFixture
+    database_url: str, spool: Path, damaged: FolderWriter, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Memory.open(database_url, spool=spool, settings=QUICK) as memory:
         await NoteActionPerformable("beside").perform()
@@ -98,7 +98,7 @@ async def test_a_plan_that_starts_beside_it_tells_it_once_and_goes_on(
 
 
 def test_where_damage_was_met_all_is_looked_at_before_any_of_it_is_given_again(
-    tmp_path: Path, spool: Path, damaged: Author
+    tmp_path: Path, spool: Path, damaged: FolderWriter
 ) -> None:
     look = _Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))
     first = look(())

@@ -1,4 +1,4 @@
-"""Events written by hand: an episode is a list of things that happen, one second apart, with known times."""
+"""A script of events: an episode is a list of events, one second apart, at known times."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ T0_US = T0_NS // 1000
 
 
 def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, *, turned: float = 0.0) -> PoseValue:
-    """A pose made a millisecond and 7 ns before T0; `turned` is its quaternion's z, with any w that fits."""
+    """Return a pose made a millisecond and 7 ns before T0; `turned` is its quaternion's z, with a matching w."""
     return PoseValue((x, y, z), (0.0, 0.0, turned, (1 - turned**2) ** 0.5), "map", T0_NS - 1_000_007)
 
 
@@ -54,12 +54,12 @@ SAYING = declared("SayingAction", "saying_action", field("text", "text", 2))
 
 
 def name_of(declaration: DesignatorTypeDeclared) -> str:
-    """The fingerprint a NodeStarted carries."""
+    """The fingerprint that a NodeStarted event carries."""
     return fingerprint(encode(declaration))
 
 
 class Script:
-    """One episode being written. `put` gives the event's sequence, as a queue would."""
+    """Collect the events of one episode. `put` returns the event's sequence, as a queue would."""
 
     def __init__(self, episode: int = 1) -> None:
         self.episode = EpisodeId(bytes([0, 0, 0, 0, 0, 0, 0x70, 0, 0x80, 0, 0, 0, 0, 0, episode // 256, episode % 256]))
@@ -75,7 +75,7 @@ class Script:
         return sequence
 
     def stored(self, number: int = 1) -> list[StoredEvent]:
-        """The events as a log gives them back."""
+        """The events as a log returns them."""
         return [
             StoredEvent(number, each.sequence, each.type, each.version, each.wall_ns, each.monotonic_ns, each.payload)
             for each in self.records
@@ -83,7 +83,7 @@ class Script:
 
 
 def declarations(*types: DesignatorTypeDeclared) -> list[Record]:
-    """Records of the recorder itself."""
+    """The records that belong to the recorder and to no episode."""
     return [
         Record(position, None, 0, "DesignatorTypeDeclared", 1, T0_NS, 0, encode(each))
         for position, each in enumerate(types, 1)
@@ -91,16 +91,16 @@ def declarations(*types: DesignatorTypeDeclared) -> list[Record]:
 
 
 def time_us(sequence: int) -> int:
-    """When an event happened."""
+    """The time of an event."""
     return T0_US + sequence * 1_000_000
 
 
 def row(sequence: int, slot: int = 0, *, number: int = 1) -> int:
-    """The id a row must have: 22 bits of episode, 26 of sequence, 5 of slot."""
+    """Return the expected id of a row: 22 bits of episode, 26 of sequence, 5 of slot."""
     return number * 2**31 + sequence * 2**5 + slot
 
 
 def mixed(*scripts: Script) -> Sequence[Record]:
-    """The records of several episodes, one of each in turn."""
+    """Interleave the records of several episodes, one of each in turn."""
     longest = max(len(each.records) for each in scripts)
     return [each.records[index] for index in range(longest) for each in scripts if index < len(each.records)]

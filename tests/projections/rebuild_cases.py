@@ -1,4 +1,4 @@
-"""What the tests of a rebuild begin with: episodes, the same folded elsewhere, and what a rebuild must not leave."""
+"""Cases for a rebuild: episodes, the same log folded elsewhere, and the traces that a rebuild must not leave."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tests.table_comparison import Tables, tables_of
 
 TYPES = declarations(PICK_UP, SAYING)
 WHISPERING = declared("WhisperingAction", "whispering_action", field("text", "text", 2), field("soft", "real", 3))
-"""A type that somebody adds later."""
+"""A type that is declared later."""
 
 
 def picking(number: int, *, nodes: int = 5, simulated: bool = False) -> Script:
-    """An episode of pick-ups below a root; every third fails."""
+    """Return an episode of pick-ups below a root, of which every third fails."""
     script = Script(number)
     thought_by = NodeReference(str_of(number - 1), 2) if simulated else None
     script.put(EpisodeStarted(f"e{number}", "me", "h", "0", "3", simulated=simulated, thought_by=thought_by))
@@ -40,12 +40,12 @@ def picking(number: int, *, nodes: int = 5, simulated: bool = False) -> Script:
 
 
 def str_of(number: int) -> str:
-    """The UUID of the episode of that number, as text."""
+    """Return the UUID of the episode with this number as text."""
     return f"00000000-0000-7000-8000-{number:012x}"
 
 
 def lost(number: int) -> Script:
-    """An episode that recovery ended, in the middle of a node."""
+    """Return an episode that recovery ended in the middle of a node."""
     script = Script(number)
     script.records = picking(number).records[:6]
     script.put_payload(EpisodeEnded.__name__, LOST)
@@ -53,7 +53,7 @@ def lost(number: int) -> Script:
 
 
 def parking(number: int) -> Script:
-    """An episode with a node, then one of a type nobody declared, then another."""
+    """Return an episode with a node, one of a type that was never declared, and another node."""
     script = Script(number)
     script.put(EpisodeStarted(f"e{number}", "me", "h", "0", "3"))
     script.put(NodeStarted("root"))
@@ -70,7 +70,7 @@ def whispering(number: int) -> list[Record]:
 
 
 async def store(url: str, records: Iterable[Record], *, folded: bool = True) -> None:
-    """Into the log, and into the tables."""
+    """Store the scripts in the log and fold them into the tables."""
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     try:
         assert await log.append(list(records)) == {}
@@ -83,7 +83,7 @@ async def store(url: str, records: Iterable[Record], *, folded: bool = True) -> 
 
 
 async def folded_elsewhere(url: str, folder: Path) -> Tables:
-    """What the tables must show: the same log, folded into a new database where nobody ever rebuilt anything."""
+    """Return the expected tables: the same log, folded into a new database without a rebuild."""
     other = f"sqlite:///{folder}/elsewhere.db"
     types = "SELECT payload FROM pycrorm_declaration ORDER BY ordinal"
     records = [
@@ -102,24 +102,26 @@ async def folded_elsewhere(url: str, folder: Path) -> Tables:
 
 
 def traces(url: str) -> list[str]:
-    """What is of no use any more: tables of another generation, notes, views that were replaced, a file beside it."""
+    """Return what is useless after a rebuild: tables of another generation, notes, replaced views, a file beside the
+    database.
+    """
     at = "memory_tables." if url.startswith("postgresql:") else ""
     notes = [name for (name,) in ask(url, f"SELECT projection FROM {at}pycrorm_generation")]
-    [(shown,)] = ask(url, f"SELECT generation FROM {at}pycrorm_generation WHERE projection = 'tables'")
+    [(current,)] = ask(url, f"SELECT generation FROM {at}pycrorm_generation WHERE projection = 'tables'")
     listed = (
         "SELECT tablename FROM pg_tables WHERE schemaname = 'memory_tables'"
         if at
         else "SELECT name FROM sqlite_master WHERE type = 'table'"
     )
     tables = [name for (name,) in ask(url, listed)]
-    found = [each for each in notes if each != "tables"]
-    found += [each for each in tables if "__" in each and not each.endswith(f"__{shown}")]
-    found += [each for each in tables if each.startswith("pycrorm_progress")]
+    traces_left = [each for each in notes if each != "tables"]
+    traces_left += [each for each in tables if "__" in each and not each.endswith(f"__{current}")]
+    traces_left += [each for each in tables if each.startswith("pycrorm_progress")]
     if at:
         gone = "SELECT nspname FROM pg_namespace WHERE nspname LIKE 'memory\\_gone\\_%' OR nspname = 'memory_new'"
-        return found + [name for (name,) in ask(url, gone)]
+        return traces_left + [name for (name,) in ask(url, gone)]
     file = Path(url.removeprefix("sqlite:///"))
-    return found + [each.name for each in file.parent.glob(f"{file.name}-rebuild*")]
+    return traces_left + [each.name for each in file.parent.glob(f"{file.name}-rebuild*")]
 
 
 __all__ = [

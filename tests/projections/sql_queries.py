@@ -1,4 +1,4 @@
-"""What a test asks of a database, past every class of ours: plain SQL, plain tuples."""
+"""Query a database with plain SQL that bypasses the package's classes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ async def ask(log: EventLog, question: str, *parameters: Any) -> list[tuple[Any,
 
 
 async def stored_and_folded(log: EventLog, records: Sequence[Record]) -> Projector:
-    """A projector that has shown all of these."""
+    """Return a projector that has folded all of these scripts."""
     projector = Projector(log)
     await projector.open()
     await log.append(records)
@@ -33,13 +33,13 @@ _NAMED = {
 
 
 async def names(log: EventLog, *kinds: str) -> list[str]:
-    """The tables, or the views, or both, that are in the database."""
+    """Return the names of the tables, or of the views, or of both in the database."""
     database = log.engine.dialect.name
     asked = _NAMED[database].format(", ".join(_KINDS[database][each] for each in kinds))
     return [name for (name,) in await ask(log, asked)]
 
 
 async def all_rows(log: EventLog) -> dict[str, list[tuple[Any, ...]]]:
-    """Every table of the first generation, ordered."""
+    """Return every table of the first generation, ordered."""
     tables = [name for name in await names(log, "table") if name.endswith("__1")]
     return {name: sorted(await ask(log, f'SELECT * FROM "{name}"'), key=repr) for name in tables}

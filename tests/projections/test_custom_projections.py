@@ -1,4 +1,4 @@
-"""A projection of one's own: kept live, rebuilt and verified like the memory's tables, and never at their cost."""
+"""Custom projections: folded live, rebuilt and verified like the memory's tables, and never at their cost."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.projections.event_script import PICK_UP, SAYING, Script, declarations
 from tests.projections.sql_queries import ask, names
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 _TRIES = table("grasp_try", column("arm"), column("status"))
 _RATE = select(_TRIES.c.arm, func.count().label("tries")).group_by(_TRIES.c.arm)
@@ -47,8 +47,8 @@ class GraspRate(Projection):
 
     def fold(self, event: Event, rows: Changes) -> None:
         match event.happening:
-            case NodeStarted(parameters=given) if event.dtype == "PickUpAction":
-                rows.insert("grasp_try", event.id, arm=given["arm"], grasp=given["grasp"], status="RUNNING")
+            case NodeStarted(parameters=parameters) if event.dtype == "PickUpAction":
+                rows.insert("grasp_try", event.id, arm=parameters["arm"], grasp=parameters["grasp"], status="RUNNING")
             case NodeEnded(node=node, status=status):
                 rows.update("grasp_try", event.row(node), status=status)
 
@@ -62,14 +62,14 @@ TRIES = [
 
 
 def tries(episode: int = 1, *, simulated: bool = False, many: Sequence[Any] = TRIES) -> Script:
-    """An episode of pick-ups, one after the other: arm, grasp, status; None for one that has not ended."""
+    """Return an episode of consecutive pick-ups: arm, grasp, status; None for a pick-up that has not ended."""
     script = Script(episode)
     script.put(EpisodeStarted("", "me", "host", "", "3.11", simulated=simulated))
     root = script.put(NodeStarted("root", simulated=simulated))
     for arm, grasp, status in many:
-        given = {"object_designator": {"row": 1, "object": 1}, "arm": arm, "grasp": grasp}
+        parameters = {"object_designator": {"row": 1, "object": 1}, "arm": arm, "grasp": grasp}
         node = script.put(
-            NodeStarted("action", root, designator=name_of(PICK_UP), parameters=given, simulated=simulated)
+            NodeStarted("action", root, designator=name_of(PICK_UP), parameters=parameters, simulated=simulated)
         )
         if status is not None:
             script.put(NodeEnded(node, status))
@@ -77,12 +77,12 @@ def tries(episode: int = 1, *, simulated: bool = False, many: Sequence[Any] = TR
 
 
 def rows_of(episode: int, many: Sequence[Any] = TRIES) -> list[tuple[Any, ...]]:
-    """What the table must have: counted from the list, with no fold. A try's node is the next event after the last."""
-    found, sequence = [], 3
+    """Compute the expected rows from the list, without a fold. A pick-up's node is the event after the previous end."""
+    result, sequence = [], 3
     for arm, grasp, status in many:
-        found.append((row(sequence, number=episode), episode, arm, grasp, status or "RUNNING"))
+        result.append((row(sequence, number=episode), episode, arm, grasp, status or "RUNNING"))
         sequence += 1 if status is None else 2
-    return found
+    return result
 
 
 async def folded(log: EventLog, records: Sequence[Any], *projections: Projection, **options: Any) -> Projector:
@@ -93,7 +93,7 @@ async def folded(log: EventLog, records: Sequence[Any], *projections: Projection
     return projector
 
 
-async def shown(log: EventLog) -> list[tuple[Any, ...]]:
+async def visible_rows(log: EventLog) -> list[tuple[Any, ...]]:
     return await ask(log, "SELECT * FROM grasp_try ORDER BY id")
 
 
@@ -105,46 +105,44 @@ async def rebuilt(log: EventLog, projection: Projection) -> None:
 
 
 @pytest.mark.parametrize("batch_events", [1, 3, 10_000])
-async def test_its_rows_are_what_happened_however_many_events_are_folded_at_once(
-    log: EventLog, batch_events: int
-) -> None:
+async def test_rows_do_not_depend_on_the_number_of_events_in_a_batch(log: EventLog, batch_events: int) -> None:
     records = [*declarations(PICK_UP), *mixed(tries(1), tries(2))]
     await folded(log, records, GraspRate(), batch_events=batch_events)
-    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
     assert sorted(await ask(log, "SELECT arm, tries FROM grasp_tries_per_arm")) == [("LEFT", 6), ("RIGHT", 2)]
 
 
-async def test_it_follows_event_by_event_as_the_daemon_folds(log: EventLog) -> None:
+async def test_rows_follow_event_by_event_as_the_daemon_folds(log: EventLog) -> None:
     projector = await folded(log, [*declarations(PICK_UP), *tries().records[:4]], GraspRate())
-    assert [row[-1] for row in await shown(log)] == ["SUCCEEDED"]
+    assert [row[-1] for row in await visible_rows(log)] == ["SUCCEEDED"]
     await log.append(tries().records)
     while await projector.fold_next_batch():
         pass
-    assert await shown(log) == rows_of(1)
+    assert await visible_rows(log) == rows_of(1)
 
 
-async def test_what_was_only_thought_through_is_left_out_unless_it_is_asked_for(log: EventLog) -> None:
+async def test_simulations_are_left_out_unless_the_projection_asks_for_them(log: EventLog) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2, simulated=True))], GraspRate())
-    assert await shown(log) == rows_of(1)
+    assert await visible_rows(log) == rows_of(1)
     async with Reading(log).session(simulated=True) as session:
         seen = await session.execute(text("SELECT * FROM grasp_try ORDER BY id"))
         assert [tuple(each) for each in seen] == [*rows_of(1), *rows_of(2)]
         assert (await session.execute(text("SELECT sum(tries) FROM grasp_tries_per_arm"))).scalar_one() == 8
 
 
-async def test_a_process_that_does_not_know_it_leaves_it_and_one_that_does_catches_up(log: EventLog) -> None:
+async def test_a_process_without_the_projection_leaves_it_and_one_with_it_catches_up(log: EventLog) -> None:
     await folded(log, [*declarations(PICK_UP), *tries(1).records[:4]], GraspRate())
     await folded(log, [*declarations(SAYING), *mixed(tries(1), tries(2))])
-    assert len(await shown(log)) == 1
+    assert len(await visible_rows(log)) == 1
     assert await ask(log, "SELECT count(*) FROM task_tree_node") == [(10,)]
     await folded(log, [], GraspRate())
-    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
 
 
-async def test_a_projection_that_comes_later_begins_with_the_beginning_of_the_log(log: EventLog) -> None:
+async def test_a_projection_that_is_installed_later_begins_with_the_first_event_of_the_log(log: EventLog) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))])
     await folded(log, [], GraspRate())
-    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
 
 
 @pytest.mark.parametrize(
@@ -152,7 +150,7 @@ async def test_a_projection_that_comes_later_begins_with_the_beginning_of_the_lo
     [b'{"version":2,"kind":"action"}', b"?", b'{"kind":"action","dtype":"XAction","table":7}', b"[" * 100_000],
     ids=["newer", "no JSON", "another shape", "too deep"],
 )
-async def test_a_declaration_that_cannot_be_read_stops_nothing_else(log: EventLog, payload: bytes) -> None:
+async def test_an_unreadable_declaration_stops_nothing_else(log: EventLog, payload: bytes) -> None:
     strange = declarations(PICK_UP)[0]._replace(payload=payload)
     await log.append([*declarations(PICK_UP), strange, *tries().records])
     projector = Projector(log, projections=[GraspRate()])
@@ -161,7 +159,7 @@ async def test_a_declaration_that_cannot_be_read_stops_nothing_else(log: EventLo
     assert await ask(log, "SELECT * FROM grasp_try ORDER BY id") == rows_of(1)
 
 
-async def test_two_that_fold_at_once_show_every_event_once(log: EventLog) -> None:
+async def test_two_concurrent_processes_fold_every_event_once(log: EventLog) -> None:
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 21)))]
     await folded(log, records)
     other = await EventLog.open(log.address, create=True)
@@ -172,7 +170,7 @@ async def test_two_that_fold_at_once_show_every_event_once(log: EventLog) -> Non
         await asyncio.gather(*(each.catch_up() for each in both))
     finally:
         await other.close()
-    assert Counter(await shown(log)) == Counter(each for episode in range(1, 21) for each in rows_of(episode))
+    assert Counter(await visible_rows(log)) == Counter(each for episode in range(1, 21) for each in rows_of(episode))
 
 
 class NoLeftHand(GraspRate):
@@ -182,19 +180,19 @@ class NoLeftHand(GraspRate):
             raise ZeroDivisionError("no right hand")
 
 
-async def test_a_fold_that_raises_stops_its_episode_there_and_nowhere_else(
+async def test_a_fold_that_raises_stops_its_episode_and_no_other(
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
     left = [each for each in TRIES if each[0] == "LEFT"]
     records = [*declarations(PICK_UP), *mixed(tries(1), tries(2, many=left))]
     await folded(log, records, NoLeftHand())
-    assert await shown(log) == [*rows_of(1)[:2], *rows_of(2, left)]  # the event that raised has left nothing
+    assert await visible_rows(log) == [*rows_of(1)[:2], *rows_of(2, left)]  # the event that raised has left no row
     assert await ask(log, "SELECT number, folded, parked FROM episode ORDER BY number") == [(1, 9, None), (2, 7, None)]
     (state,) = await states(log, [])
     assert state.parked == {1: "event 7: grasp_rate raised ZeroDivisionError: no right hand"}
     assert "episode 1 is parked in the projection grasp_rate: event 7" in caplog.text
     await rebuilt(log, GraspRate())
-    assert await shown(log) == [*rows_of(1), *rows_of(2, left)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2, left)]
 
 
 class NextGraspRate(GraspRate):
@@ -207,27 +205,27 @@ class NextGraspRate(GraspRate):
             rows.insert("grasp_try", event.id, arm=event.parameters["arm"], hard=event.parameters["grasp"] == "TOP")
 
 
-async def test_another_version_is_not_folded_before_it_is_rebuilt(
-    log: EventLog, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_new_version_is_not_folded_before_a_rebuild(log: EventLog, caplog: pytest.LogCaptureFixture) -> None:
     await folded(log, [*declarations(PICK_UP), *tries(1).records], GraspRate())
     before = await folded(log, [], GraspRate())
     projector = await folded(log, tries(2).records, NextGraspRate())
     assert "have version 1, its code has version 2: run `pycrorm rebuild grasp_rate`" in caplog.text
-    assert await shown(log) == rows_of(1)
+    assert await visible_rows(log) == rows_of(1)
     await rebuilt(log, NextGraspRate())
     new = [(each[0], each[1], each[2], each[3] == "TOP") for episode in (1, 2) for each in rows_of(episode)]
-    assert await shown(log) == new
+    assert await visible_rows(log) == new
     assert "grasp_tries_per_arm" not in await names(log, "view")
     caplog.clear()
     await log.append(tries(3).records)
-    await before.catch_up()  # it knows version 1 only, and leaves it
-    assert await shown(log) == new
+    await before.catch_up()  # this process has version 1, and leaves the table
+    assert await visible_rows(log) == new
     assert "this process stops folding the projection grasp_rate" in caplog.text
     assert await projector.catch_up() == 0
 
 
-async def test_the_reason_why_a_process_stops_folding_it_stays_until_it_is_set_up_again(log: EventLog) -> None:
+async def test_the_reason_why_a_process_stops_folding_it_remains_until_the_projection_is_set_up_again(
+    log: EventLog,
+) -> None:
     projector = await folded(log, [*declarations(PICK_UP), *tries(1).records], GraspRate())
     records = tries(2).records
     await log.append(records)
@@ -247,39 +245,39 @@ async def test_the_reason_why_a_process_stops_folding_it_stays_until_it_is_set_u
     assert state.fault is None
 
 
-async def test_rebuilt_it_is_what_it_was_live(log: EventLog) -> None:
+async def test_a_rebuild_gives_the_same_rows_as_live_folding(log: EventLog) -> None:
     projector = await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], GraspRate())
     await rebuilt(log, GraspRate())
-    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
     assert "pycrorm_own_grasp_try__2" in await names(log, "table")
     assert not [each for each in await names(log, "table") if "grasp_" in each and each.endswith("__1")]
-    await log.append(tries(3).records)  # who folded the old tables goes on with the new ones
+    await log.append(tries(3).records)  # a process that folded the old tables continues with the new ones
     await projector.catch_up()
-    assert await shown(log) == [*rows_of(1), *rows_of(2), *rows_of(3)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2), *rows_of(3)]
 
 
-async def test_a_rebuild_of_our_tables_leaves_it_as_it_is(log: EventLog) -> None:
+async def test_a_rebuild_of_the_memorys_tables_leaves_a_custom_projection_unchanged(log: EventLog) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2, simulated=True))], GraspRate())
     async with claimed(log):
         rebuild = await Rebuild.begin(log)
         await rebuild.show()
         assert await clear(log) == []
-    assert await shown(log) == rows_of(1)
+    assert await visible_rows(log) == rows_of(1)
 
 
-async def test_a_rebuild_that_broke_off_is_taken_up(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_interrupted_rebuild_is_continued(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], GraspRate())
     monkeypatch.setattr("pycrorm_async.projections.rebuild._BATCH_EVENTS", 5)
     async with claimed(log):
         broken = await Rebuild.begin(log, projection=GraspRate())
         assert await broken.fold_next_batch() == 5
-    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
     async with claimed(log):
         again = await Rebuild.begin(log, projection=GraspRate())
         assert again.number == broken.number
         assert await again.left() == 18 - 5
     await rebuilt(log, GraspRate())
-    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
 
 
 class TakesAView(GraspRate):
@@ -302,14 +300,16 @@ class TakesALeaf(TakesAView):
         (TakesALeaf(), "the projection other needs the name 'pick_up_action', which the memory has"),
     ],
 )
-async def test_a_name_that_is_taken_is_refused_with_both(log: EventLog, projection: Projection, reason: str) -> None:
+async def test_a_name_that_is_already_used_is_refused_with_both_owners(
+    log: EventLog, projection: Projection, reason: str
+) -> None:
     await folded(log, [], GraspRate())
     with pytest.raises(CallerError, match=reason):
         await Projector(log, projections=[projection]).open()
-    await Projector(log, installed=[projection]).open()  # of a package that is installed it is only told
+    await Projector(log, installed=[projection]).open()  # a conflict with an installed package is only reported
 
 
-async def test_a_type_that_is_declared_later_has_its_table_all_the_same(
+async def test_a_type_that_is_declared_later_still_gets_its_table(
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
     projector = await folded(log, [*declarations(PICK_UP), *tries(1).records], GraspRate())
@@ -354,29 +354,29 @@ class Wrong(Projection):
         ([("wrong_row", row(1), {}), ("wrong_row", row(1), {})], "wrong_row has a row 2147483680 already"),
     ],
 )
-def test_a_row_that_cannot_be_kept_is_refused_on_every_database_alike(changes: Any, reason: str) -> None:
+def test_a_row_that_cannot_be_stored_is_refused_alike_on_every_database(changes: Any, reason: str) -> None:
     rows = CustomRows(Wrong(("wrong_row", row(1, slot=1), {"n": 1}), *changes), {})
     with pytest.raises(CannotFold, match=reason):
         rows.fold(tries().stored()[0])
     assert rows.to_insert() == {}
 
 
-async def test_values_are_kept_as_they_are_also_in_columns_with_names_of_the_database(log: EventLog) -> None:
-    given = {"n": -(2**62), "x": 1, "said": "ä", "is_it": False, "order": {"b": [1, None]}}
+async def test_values_are_kept_exactly_in_columns_with_names_that_the_database_reserves(log: EventLog) -> None:
+    parameters = {"n": -(2**62), "x": 1, "said": "ä", "is_it": False, "order": {"b": [1, None]}}
 
     class Changing(Wrong):
         def fold(self, event: Event, rows: Changes) -> None:
             if event.sequence == 1:
-                rows.insert("wrong_row", event.id, **given)
+                rows.insert("wrong_row", event.id, **parameters)
                 rows.insert("wrong_row", event.row(1, 31))
             if event.sequence == 2:
-                rows.update("wrong_row", event.row(1, 31), **given)
-                rows.update("wrong_row", event.row(9), n=1)  # there is none
+                rows.update("wrong_row", event.row(1, 31), **parameters)
+                rows.update("wrong_row", event.row(9), n=1)  # no such column
 
     await folded(log, tries(many=[]).records, Changing(), batch_events=1)
     whole = (-(2**62), 1.0, "ä", False, '{"b":[1,null]}')
-    found = await ask(log, 'SELECT id, n, x, said, is_it, "order" FROM wrong_row ORDER BY id')
-    assert found == [(row(1), *whole), (row(1, 31), *whole)]
+    result = await ask(log, 'SELECT id, n, x, said, is_it, "order" FROM wrong_row ORDER BY id')
+    assert result == [(row(1), *whole), (row(1, 31), *whole)]
 
 
 @pytest.mark.parametrize(
@@ -391,21 +391,19 @@ async def test_values_are_kept_as_they_are_also_in_columns_with_names_of_the_dat
         ({"tables": {"grasp_tries_per_arm": {}}}, "two of its tables and views have the name 'grasp_tries_per_arm'"),
     ],
 )
-def test_a_projection_that_cannot_be_is_refused_at_once(attributes: dict[str, Any], reason: str) -> None:
+def test_an_impossible_projection_is_refused_at_once(attributes: dict[str, Any], reason: str) -> None:
     kind: type[Projection] = type("Mine", (GraspRate,), attributes)
     with pytest.raises(CallerError, match=f"the projection Mine: {reason}"):
         Memory.open("sqlite://", projections=[kind()])
 
 
-async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not(
-    log: EventLog, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_verify_finds_every_change_and_nothing_else(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("pycrorm_async.projections.verify.parts._PART_EVENTS", 10)  # several parts
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 5)))]
     await folded(log, [*records, *tries(5).records[:6]], GraspRate())
-    found = await verify(log, projections=[GraspRate()])
-    assert (found.drift, found.damage, found.not_compared) == (0, 0, {})
-    assert found.rows == (await verify(log)).rows + 4 * 4 + 2
+    result = await verify(log, projections=[GraspRate()])
+    assert (result.drift, result.damage, result.not_compared) == (0, 0, {})
+    assert result.rows == (await verify(log)).rows + 4 * 4 + 2
     assert (await verify(log)).not_compared == {"grasp_rate": "its code is not installed here"}
     table = "pycrorm_own_grasp_try__1"
     first, second = rows_of(2)[:2]
@@ -416,8 +414,8 @@ async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not
             f"INSERT INTO {table} (id, process_metadata_id) VALUES ({row(5, number=9)}, 9)",
         ):
             await connection.exec_driver_sql(change)
-    found = await verify(log, projections=[GraspRate()])
-    assert found.differences == [
+    result = await verify(log, projections=[GraspRate()])
+    assert result.differences == [
         Difference(2, 3, "grasp_try", "arm", "BOTH", "LEFT"),
         Difference(2, 5, "grasp_try", None, None, second),
         Difference(9, 5, "grasp_try", None, (row(5, number=9), 9, None, None, None), None),
@@ -428,11 +426,11 @@ async def test_verify_finds_nothing_where_all_is_well_and_every_change_where_not
     assert (await verify(log, projections=[GraspRate()])).drift == 0
 
 
-async def test_verify_tells_of_a_fold_that_means_something_else_under_the_same_version(log: EventLog) -> None:
+async def test_verify_reports_a_fold_that_was_changed_without_a_new_version(log: EventLog) -> None:
     await folded(log, [*declarations(PICK_UP), *tries().records], GraspRate())
-    found = await verify(log, projections=[NoLeftHand()])
-    (told,) = map(str, found.differences)
-    assert told == (
+    result = await verify(log, projections=[NoLeftHand()])
+    (difference,) = map(str, result.differences)
+    assert difference == (
         "grasp_rate.fold is 'folded in the tables', and should be"
         " 'parked: grasp_rate raised ZeroDivisionError: no right hand'"
     )
@@ -440,10 +438,12 @@ async def test_verify_tells_of_a_fold_that_means_something_else_under_the_same_v
 
 
 def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
-    """Folds four events at a time; dies when the rows of that many batches are written, the last not committed."""
+    """Fold four events at a time, and die when the rows of that many batches are written but the last is not
+    committed.
+    """
     write, count = CustomRows.write, 0
 
-    async def written(self: CustomRows, connection: AsyncConnection, generation: int) -> None:
+    async def count_written(self: CustomRows, connection: AsyncConnection, generation: int) -> None:
         nonlocal count
         await write(self, connection, generation)
         count += 1
@@ -458,15 +458,13 @@ def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
         await folded(log, [], GraspRate(), batch_events=4)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CustomRows, "write", written)
+        patch.setattr(CustomRows, "write", count_written)
         patch.setattr("pycrorm_async.projections.rebuild._BATCH_EVENTS", 4)
         asyncio.run(fold())
 
 
 @pytest.mark.parametrize("rebuilding", [False, True])
-async def test_killed_in_the_middle_it_goes_on_where_it_was(
-    log: EventLog, database_url: str, *, rebuilding: bool
-) -> None:
+async def test_a_killed_fold_continues_where_it_was(log: EventLog, database_url: str, *, rebuilding: bool) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], *([GraspRate()] if rebuilding else []))
     for last in (1, 2):
         process = multiprocessing.get_context("spawn").Process(
@@ -476,12 +474,12 @@ async def test_killed_in_the_middle_it_goes_on_where_it_was(
         await asyncio.to_thread(process.join)
         assert process.exitcode == -signal.SIGKILL
     if rebuilding:
-        assert await shown(log) == [*rows_of(1), *rows_of(2)]
+        assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
         async with claimed(log):
             assert await (await Rebuild.begin(log, projection=GraspRate())).left() == 18 - 4
         await rebuilt(log, GraspRate())
     else:
-        assert await shown(log) == rows_of(1)[:1]
+        assert await visible_rows(log) == rows_of(1)[:1]
         await folded(log, [], GraspRate())
-    assert await shown(log) == [*rows_of(1), *rows_of(2)]
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]
     assert (await verify(log, projections=[GraspRate()])).drift == 0

@@ -1,4 +1,4 @@
-"""Events in, rows out: every expected row is written here by hand, column by column as in `tables.CORE`."""
+"""The fold of events into rows; every expected row is written here by hand, column by column as in `tables.CORE`."""
 
 from __future__ import annotations
 
@@ -71,12 +71,12 @@ EVERYTHING = declared(
 
 
 def rows_of(script: Script, *types: DesignatorTypeDeclared, number: int = 1) -> dict[str, list[tuple[Any, ...]]]:
-    """Every row, by table; the columns of leaf tables go with their name."""
+    """Return every row by table; the columns of leaf tables come with their names."""
     rows = folded(script, *types, number=number)
-    made = rows.to_insert()
+    rows_by_table = rows.to_insert()
     return {
         table if columns == COLUMNS.get(table) else f"{table}({','.join(columns)})": values
-        for (table, columns), values in made.items()
+        for (table, columns), values in rows_by_table.items()
     }
 
 
@@ -143,7 +143,7 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
     }  # fmt: skip
 
 
-def test_a_node_that_ends_in_the_batch_it_started_in_is_one_insert() -> None:
+def test_a_node_that_ends_in_the_batch_in_which_it_started_is_one_insert() -> None:
     script = Script()
     node = script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
     failure = FailureValue("plans.failures.IKError", "no way", ["left", 1])
@@ -166,13 +166,13 @@ def test_the_end_of_a_node_from_an_earlier_batch_is_an_update() -> None:
     assert rows.node_ends == [(row(77), "SUCCEEDED", time_us(1), 1_000_000_005, 1, None, None, None, None)]
 
 
-def test_a_node_that_is_lost_has_no_end_time() -> None:
+def test_a_lost_node_has_no_end_time() -> None:
     script = Script()
     script.put(NodeEnded(77, "LOST"))
     assert folded(script).node_ends == [(row(77), "LOST", None, None, None, None, None, None, None)]
 
 
-def test_an_episode_that_is_lost_takes_its_running_nodes_with_it() -> None:
+def test_a_lost_episode_makes_its_running_nodes_lost() -> None:
     script = Script()
     root = script.put(NodeStarted("root"))
     done = script.put(NodeStarted("action", root, name_of(SAYING), {"text": "a"}))
@@ -214,14 +214,14 @@ def test_every_type_of_field_has_its_column_and_its_rows() -> None:
         )
     )
     assert (milk, node) == (1, 2)
-    made = rows_of(script, EVERYTHING)
+    rows_by_table = rows_of(script, EVERYTHING)
     leaf = "everything_action(id,count,speed,text,flag,due,arm,there_id,thing_id)"
     # 2026-01-02 03:04:05.000006 UTC
-    assert made[leaf] == [(row(2), 3, 0.1, "Käse", True, 1_767_323_045_000_006, "LEFT", row(2, 8), row(1))]
-    assert made["pose"][1:] == [(row(2, 8), 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
+    assert rows_by_table[leaf] == [(row(2), 3, 0.1, "Käse", True, 1_767_323_045_000_006, "LEFT", row(2, 8), row(1))]
+    assert rows_by_table["pose"][1:] == [(row(2, 8), 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
     nothing = (None,) * 5
     nowhere = (None,) * 8
-    assert made["parameter_item"] == [
+    assert rows_by_table["parameter_item"] == [
         (row(2), "via", 0, 1, None, *nothing, 5.0, 6.0, 7.0, 0.0, 0.0, 0.0, 1.0, "map", None, None, None),
         (row(2), "via", 1, 1, None, *nothing, 8.0, 9.0, 10.0, 0.0, 0.0, 0.0, 1.0, "map", None, None, None),
         (row(2), "joints", 0, 1, "b", None, 2.5, None, None, None, *nowhere, None, None, None),
@@ -243,74 +243,74 @@ def test_a_part_and_a_believed_object_have_rows_of_their_own() -> None:
     handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1, 1, 1), ObjectReference(fridge, fridge))
     cup = ObjectValue("BelieveObject", "cup")
     script.put(NodeStarted("action", None, name_of(opening), {"object_designator": handle, "cup": cup}))
-    made = rows_of(script, opening)
-    assert made["object"][1:] == [
+    rows_by_table = rows_of(script, opening)
+    assert rows_by_table["object"][1:] == [
         (
             row(2, 2), 1, "ObjectPart", "handle", "GENERIC_OBJECT", row(2, 2), row(1), None, time_us(2), row(2), None,
         ),
         (row(2, 3), 1, "BelieveObject", "cup", None, None, None, None, time_us(2), row(2), None),
     ]  # fmt: skip
-    assert made["pose"][1:] == [(row(2, 2), 1, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
-    assert made["open_action(id,object_designator_id,cup_id)"] == [(row(2), row(2, 2), row(2, 3))]
+    assert rows_by_table["pose"][1:] == [(row(2, 2), 1, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
+    assert rows_by_table["open_action(id,object_designator_id,cup_id)"] == [(row(2), row(2, 2), row(2, 3))]
 
 
-def test_what_was_recorded_as_missing_or_left_out_is_null() -> None:
+def test_a_value_recorded_as_missing_or_left_out_is_null() -> None:
     script = Script()
     script.put(NodeStarted("action", None, name_of(PICK_UP), {"arm": MissingValue("no member", "<x>")}))
     assert rows_of(script, PICK_UP)["pick_up_action(id,object_designator_id,arm,grasp)"] == [(row(1), None, None, None)]
 
 
-def test_the_world_as_it_changes_is_one_row_a_change() -> None:
+def test_each_change_of_the_world_is_one_row() -> None:
     script = Script()
     table = script.put(ObjectAdded("table", "GENERIC_OBJECT", pose()))
     milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
     root = script.put(NodeStarted("root"))
     moved = script.put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), root))
-    there = ObjectReference(milk, moved)
-    script.put(ObjectAttached(ObjectReference(table, table), there, "top", root))
-    script.put(ObjectDetached(ObjectReference(table, table), there))
+    milk_before = ObjectReference(milk, moved)
+    script.put(ObjectAttached(ObjectReference(table, table), milk_before, "top", root))
+    script.put(ObjectDetached(ObjectReference(table, table), milk_before))
     script.put(JointsMoved(ObjectReference(table, table), {"leaf": 0.5, "drawer": 0.25}, root))
-    script.put(ObjectRemoved(there, root))
-    made = rows_of(script)
-    assert made["object"][2] == (
+    script.put(ObjectRemoved(milk_before, root))
+    rows_by_table = rows_of(script)
+    assert rows_by_table["object"][2] == (
         row(4), 1, "Object", "milk", "MILK", row(4), None, row(2), time_us(4), row(3), None,
     )  # fmt: skip
-    assert made["pose"][2] == (row(4), 1, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)
-    assert made["attachment"] == [
+    assert rows_by_table["pose"][2] == (row(4), 1, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)
+    assert rows_by_table["attachment"] == [
         (row(5), 1, "attached", row(1), row(4), "top", time_us(5), row(3)),
         (row(6), 1, "detached", row(1), row(4), None, time_us(6), None),
     ]
-    assert made["joint_change"] == [
+    assert rows_by_table["joint_change"] == [
         (row(7), "leaf", 1, row(1), 0.5, time_us(7), row(3)),
         (row(7), "drawer", 1, row(1), 0.25, time_us(7), row(3)),
     ]
-    assert made["object_removal"] == [(row(8), 1, row(4), row(2), time_us(8), row(3))]
+    assert rows_by_table["object_removal"] == [(row(8), 1, row(4), row(2), time_us(8), row(3))]
 
 
-def test_a_resolved_location_keeps_what_was_offered_and_what_was_taken() -> None:
+def test_a_resolved_location_keeps_the_offered_and_the_chosen_candidates() -> None:
     script = Script()
     root = script.put(NodeStarted("root"))
     offered = (CandidateValue(pose(1, 1), ("LEFT", "RIGHT")), CandidateValue(pose(2, 2), ("LEFT",), "TOP", 0.25))
     refused = (RefusalValue(pose(3, 3), "LEFT: too far"), RefusalValue(pose(4, 4), "not visible"))
     script.put(LocationResolved("CostmapLocation", offered, taken=1, considered=600, node=root, refused=refused))
     script.put(LocationResolved("AccessingLocation", considered=3))
-    made = rows_of(script)
-    assert made["location_resolution"] == [
+    rows_by_table = rows_of(script)
+    assert rows_by_table["location_resolution"] == [
         (row(2), 1, row(1), "CostmapLocation", 600, 2, 1, row(2), time_us(2)),
         (row(3), 1, None, "AccessingLocation", 3, 0, None, None, time_us(3)),
     ]
-    assert made["location_candidate"] == [
+    assert rows_by_table["location_candidate"] == [
         (row(2), 0, 1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT,RIGHT", False, None, None),
         (row(2), 1, 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT", True, "TOP", 0.25),
     ]
-    assert made["location_refusal"] == [
+    assert rows_by_table["location_refusal"] == [
         (row(2), 0, 1, 3.0, 3.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT: too far"),
         (row(2), 1, 1, 4.0, 4.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "not visible"),
     ]
-    assert made["pose"] == [(row(2), 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
+    assert rows_by_table["pose"] == [(row(2), 1, 2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
 
 
-def test_what_was_seen_is_a_row_each_best_first() -> None:
+def test_each_detection_is_a_row_and_the_best_one_is_first() -> None:
     script = Script()
     milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
     root = script.put(NodeStarted("root"))
@@ -344,13 +344,13 @@ def test_a_sample_of_the_robot_is_a_row_for_each_channel() -> None:
     ]
 
 
-def test_nodes_of_the_language_have_their_table_too() -> None:
+def test_nodes_of_the_language_have_a_table_too() -> None:
     repeat = declared("Repeat", "repeat", field("times", "integer", 2), kind="language")
     script = Script()
     script.put(NodeStarted("language", None, name_of(repeat), {"times": 3}))
-    made = rows_of(script, repeat)
-    assert made["repeat(id,times)"] == [(row(1), 3)]
-    assert made["task_tree_node"][0][3:5] == ("language", "Repeat")
+    rows_by_table = rows_of(script, repeat)
+    assert rows_by_table["repeat(id,times)"] == [(row(1), 3)]
+    assert rows_by_table["task_tree_node"][0][3:5] == ("language", "Repeat")
 
 
 @pytest.mark.parametrize(
@@ -381,7 +381,7 @@ def test_nodes_of_the_language_have_their_table_too() -> None:
     ],
     ids=["undeclared", "another type", "no pose", "no sequence", "no candidate", "no object"],
 )
-def test_an_event_that_cannot_be_folded_says_why_and_leaves_no_row(event: Any, reason: str) -> None:
+def test_an_event_that_cannot_be_folded_gives_the_reason_and_leaves_no_row(event: Any, reason: str) -> None:
     script = Script()
     script.put(event)
     rows = Rows()
@@ -400,7 +400,7 @@ def test_an_event_that_cannot_be_folded_says_why_and_leaves_no_row(event: Any, r
         ("NodeEnded", b"{", 1, "NodeEnded cannot be decoded: Input data was truncated"),
     ],
 )
-def test_an_event_of_another_time_cannot_be_folded(type_: str, payload: bytes, version: int, reason: str) -> None:
+def test_an_event_of_an_unknown_version_cannot_be_folded(type_: str, payload: bytes, version: int, reason: str) -> None:
     script = Script()
     script.put_payload(type_, payload, version)
     with pytest.raises(CannotFold) as raised:
@@ -408,7 +408,7 @@ def test_an_event_of_another_time_cannot_be_folded(type_: str, payload: bytes, v
     assert str(raised.value) == reason
 
 
-def test_a_dict_with_text_may_have_a_key_called_missing_beside_others() -> None:
+def test_a_dict_field_may_contain_the_key_missing_among_others() -> None:
     notes = declared("NoteAction", "note_action", field("notes", "dict", 2, item="text"))
     script = Script()
     script.put(NodeStarted("action", None, name_of(notes), {"notes": {"missing": "milk", "bought": "bread"}}))
@@ -422,8 +422,8 @@ def test_a_pose_keeps_every_bit_of_its_numbers() -> None:
     script = Script()
     odd = PoseValue((0.1 + 0.2, -0.0, 5e-324), (1 / 3, 1e300, -1.7976931348623157e308, 0.0), "map", 1999)
     script.put(ObjectAdded("milk", "MILK", odd))
-    made = rows_of(script)["pose"][0]
-    assert [value.hex() for value in made[2:9]] == [
+    rows_by_table = rows_of(script)["pose"][0]
+    assert [value.hex() for value in rows_by_table[2:9]] == [
         "0x1.3333333333334p-2",
         "-0x0.0p+0",
         "0x0.0000000000001p-1022",
@@ -432,4 +432,4 @@ def test_a_pose_keeps_every_bit_of_its_numbers() -> None:
         "-0x1.fffffffffffffp+1023",
         "0x0.0p+0",
     ]
-    assert made[10] == 1
+    assert rows_by_table[10] == 1

@@ -1,4 +1,4 @@
-"""One bad declaration stops nobody else: each is mapped, or parks the episodes that perform it, on both databases."""
+"""A bad declaration affects no other type: each is mapped, or parks the episodes that use it, on both databases."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LONG = "Ä" * 35 + "_field"
 
 
 def performing(number: int, designator: DesignatorTypeDeclared | str, **parameters: Any) -> list[Record]:
-    """An episode that performs it once: the third of its events."""
+    """Return an episode that performs the type once, in its third event."""
     script = Script(number)
     script.put(EpisodeStarted("hostile", "me", "host", "1.0", "3.11"))
     root = script.put(NodeStarted("root"))
@@ -47,19 +47,19 @@ def performing(number: int, designator: DesignatorTypeDeclared | str, **paramete
 
 
 def with_fields(dtype: str, kind: FieldType, *names: str) -> DesignatorTypeDeclared:
-    """As the hooks declare a class with these fields."""
+    """Declare a class with these fields as the hooks do."""
     fields = [FieldDeclared(name, column_name(name, kind), kind, slot) for slot, name in enumerate(names, 2)]
     return declared(dtype, table_name(dtype), *fields)
 
 
-async def told(log: EventLog) -> list[tuple[int, str]]:
+async def parked_reasons(log: EventLog) -> list[tuple[int, str]]:
     return [(each.number, each.parked or "") for each in await log.stopped()]
 
 
-async def clean(log: EventLog) -> VerifyResult:
-    found = await verify(log)
-    assert (found.damage, found.drift) == (0, 0), found
-    return found
+async def assert_verified(log: EventLog) -> VerifyResult:
+    result = await verify(log)
+    assert (result.damage, result.drift) == (0, 0), result
+    return result
 
 
 SYSTEM = ("xmin", "xmax", "cmin", "cmax", "ctid", "tableoid", "oid", "rowid")
@@ -68,13 +68,13 @@ LONGEST = with_fields("Reach" + "Far" * 60 + "Action", "object", "container_id",
 TRUTH = with_fields("TruthAction", "boolean", "true", "False", "true_", "select", "user")
 
 
-async def test_names_that_a_database_keeps_for_itself_are_columns_of_the_view_and_are_rebuilt(log: EventLog) -> None:
+async def test_names_that_a_database_reserves_are_columns_of_the_view_and_are_rebuilt(log: EventLog) -> None:
     box = {name: float(place) for place, name in enumerate(SYSTEM)}
     records = [*performing(1, BOX, **box), *performing(2, TRUTH, true=True, False_=None, true_=False, user=True)]
     records += [*performing(3, LONGEST), *performing(4, SAYING, text="others")]
     await stored_and_folded(log, [*declarations(BOX, TRUTH, LONGEST, SAYING), *records])
     for _ in range(2):
-        assert await told(log) == []
+        assert await parked_reasons(log) == []
         assert await ask(log, "SELECT xmin, xmax, cmin, cmax, ctid, tableoid, oid, rowid FROM bounding_box_action") == [
             (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
         ]
@@ -82,19 +82,19 @@ async def test_names_that_a_database_keeps_for_itself_are_columns_of_the_view_an
         assert [tuple(map(bool, row)) for row in await ask(log, truth)] == [(True, False, False, False, True)]
         assert await ask(log, f"SELECT count(*) FROM {table_name(LONGEST.dtype)}") == [(1,)]
         assert await ask(log, "SELECT text FROM saying_action") == [("others",)]
-        assert (await clean(log)).unmade == {}
+        assert (await assert_verified(log)).unmade == {}
         await rebuilt(log)
 
 
-async def test_an_index_is_named_shortly_however_long_table_and_column_are(log: EventLog) -> None:
+async def test_the_name_of_an_index_is_short_however_long_table_and_column_are(log: EventLog) -> None:
     reach = with_fields("ReachIntoTheUpperLeftKitchenCupboardAction", "object", "container_id")
     assert len(index_name(reach.table, reach.fields[0].column, 7)) == 63
     await stored_and_folded(log, [*declarations(reach), *performing(1, reach)])
-    assert await told(log) == []
-    await clean(log)
+    assert await parked_reasons(log) == []
+    await assert_verified(log)
 
 
-def test_names_fit_for_every_generation_and_stay_apart() -> None:
+def test_names_fit_for_every_generation_and_are_unique() -> None:
     tables = ["a" * 60, "a" * 59 + "b", "ñ" * 30]
     for generation in (1, 7, 10, 123_456_789):
         names = [physical_name(each, generation) for each in tables]
@@ -116,25 +116,25 @@ async def test_a_type_has_any_number_of_descendants(log: EventLog) -> None:
         script.put(NodeStarted("action", None, name_of(kinds[place]), {"size": float(place)}))
     await stored_and_folded(log, [*declarations(root, *kinds), *script.records])
     assert await ask(log, "SELECT size FROM root_action ORDER BY size") == [(0.0,), (499.0,), (500.0,), (519.0,)]
-    assert await told(log) == []
+    assert await parked_reasons(log) == []
 
 
-async def test_tables_are_grown_by_several_transactions_where_one_would_hold_too_many_locks(
+async def test_tables_are_altered_in_several_transactions_where_one_would_hold_too_many_locks(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(growth, "_SLICE", 3)
     types = [with_fields(f"Kind{n}Action", "real", "size") for n in range(8)]
     projector = await stored_and_folded(log, [*declarations(*types), *performing(1, types[7], size=7.0)])
     assert projector._fold is not None
-    assert projector._fold.generation.revision == 4  # made, and grown three times
+    assert projector._fold.generation.revision == 4  # made once, and altered three times
     assert await ask(log, "SELECT size FROM kind7_action") == [(7.0,)]
     await rebuilt(log)
     assert await ask(log, "SELECT size FROM kind7_action") == [(7.0,)]
-    await clean(log)
+    await assert_verified(log)
 
 
 def crafted(**changes: Any) -> DesignatorTypeDeclared:
-    """A declaration that no class of this version makes."""
+    """Return a declaration that no class of this version makes."""
     values = {"kind": "action", "dtype": "EvilAction", "table": "evil_action", **changes}
     return DesignatorTypeDeclared(**values)
 
@@ -177,7 +177,7 @@ def raw(payload: bytes) -> Record:
 
 
 def payload_of(bad: DesignatorTypeDeclared | bytes) -> bytes:
-    return bad if isinstance(bad, bytes) else msgspec.json.encode(bad)  # past our own checks
+    return bad if isinstance(bad, bytes) else msgspec.json.encode(bad)  # past the checks of this package
 
 
 async def test_crafted_declarations_park_their_own_episodes_and_the_others_are_folded(log: EventLog) -> None:
@@ -189,33 +189,33 @@ async def test_crafted_declarations_park_their_own_episodes_and_the_others_are_f
         assert await ask(log, "SELECT text FROM saying_action") == [("fine",)]
         assert await ask(log, "SELECT leaf FROM designator_type WHERE dtype = 'SayingAction'") == [("saying_action",)]
         numbers = {each.id: each.number for each in await log.episodes()}
-        reasons = dict(await told(log))
+        reasons = dict(await parked_reasons(log))
         assert len(reasons) == len(HOSTILE)
         for number, (_, reason) in enumerate(HOSTILE, 2):
-            told_of = reasons[numbers[f"00000000-0000-7000-8000-{number:012x}"]]
-            assert told_of.startswith("event 3: ")
-            assert reason in told_of
+            parked = reasons[numbers[f"00000000-0000-7000-8000-{number:012x}"]]
+            assert parked.startswith("event 3: ")
+            assert reason in parked
         assert await ask(log, "SELECT count(*) FROM task_tree_node") == [(len(HOSTILE) + 2,)]
-        found = await clean(log)
-        assert len(found.stopped) == len(HOSTILE)
-        assert set(found.unmade) >= {"EvilAction", "Evil Action"}
+        result = await assert_verified(log)
+        assert len(result.stopped) == len(HOSTILE)
+        assert set(result.unmade) >= {"EvilAction", "Evil Action"}
         await rebuilt(log)
 
 
-async def test_the_columns_and_the_types_of_a_memory_have_a_bound_that_parks(
+async def test_the_numbers_of_columns_and_types_have_a_limit_that_parks(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(layout, "COLUMNS_MAX", 50)
     wide = [with_fields("WideAction", "real", *(f"f{n}" for n in range(20 * k, 20 * k + 20))) for k in range(3)]
     records = [each for number, type_ in enumerate(wide, 1) for each in performing(number, type_, f0=1.0)]
     projector = await stored_and_folded(log, [*declarations(*wide), *records])
-    assert await told(log) == [(3, "event 3: WideAction would have 60 columns, 50 are allowed")]
-    assert (await clean(log)).unmade == {"WideAction": "WideAction would have 60 columns, 50 are allowed"}
+    assert await parked_reasons(log) == [(3, "event 3: WideAction would have 60 columns, 50 are allowed")]
+    assert (await assert_verified(log)).unmade == {"WideAction": "WideAction would have 60 columns, 50 are allowed"}
     [(leaves,)] = [(len(projector._fold.generation.layout.leaves),)] if projector._fold else []
     monkeypatch.setattr(layout, "LEAVES_MAX", leaves)
     await log.append([*declarations(SAYING), *performing(4, SAYING, text="too many")])
     await projector.catch_up()
-    assert (await told(log))[1:] == [
+    assert (await parked_reasons(log))[1:] == [
         (4, f"event 3: SayingAction would be type {leaves + 1:,}, a memory has tables for {leaves:,}")
     ]
 
@@ -229,7 +229,7 @@ async def change(log: EventLog, statement: str) -> None:
         await connection.exec_driver_sql(statement)
 
 
-async def test_a_table_in_the_way_parks_that_type_alone_until_it_is_renamed(log: EventLog) -> None:
+async def test_a_foreign_table_with_a_used_name_parks_that_type_alone_until_it_is_renamed(log: EventLog) -> None:
     types = [with_fields(f"Kind{n}Action", "real", "size") for n in range(7)]
     await change(log, "CREATE TABLE kind5_action__1 (mine integer)") if log.address.is_sqlite else None
     projector = Projector(log)
@@ -239,25 +239,25 @@ async def test_a_table_in_the_way_parks_that_type_alone_until_it_is_renamed(log:
     records: Sequence[Record] = [each for n, type_ in enumerate(types) for each in performing(n + 1, type_, size=n)]
     await log.append([*declarations(*types), *records])
     await projector.catch_up()
-    [(number, reason)] = await told(log)
+    [(number, reason)] = await parked_reasons(log)
     assert number == 6
     assert reason.startswith("event 3: the database refuses the tables of Kind5Action: ")
     assert reason.endswith("already exists: rename your table or view, then open the memory again")
     for n in (0, 1, 2, 3, 4, 6):
         assert await ask(log, f"SELECT size FROM kind{n}_action") == [(float(n),)]
-    assert [*(await clean(log)).unmade] == ["Kind5Action"]
-    await stored_and_folded(log, [])  # in the way still
-    assert await told(log) == [(6, reason)]
+    assert [*(await assert_verified(log)).unmade] == ["Kind5Action"]
+    await stored_and_folded(log, [])  # the foreign table is still there
+    assert await parked_reasons(log) == [(6, reason)]
     await change(log, f"ALTER TABLE {place(log, 'kind5_action__1')} RENAME TO my_kinds")
     await stored_and_folded(log, [])
-    assert await told(log) == []
+    assert await parked_reasons(log) == []
     assert await ask(log, "SELECT size FROM kind5_action") == [(5.0,)]
-    assert (await clean(log)).unmade == {}
+    assert (await assert_verified(log)).unmade == {}
 
 
-async def test_a_lock_that_is_not_given_is_no_fault_of_a_type(log: EventLog) -> None:
+async def test_a_lock_that_times_out_is_no_fault_of_a_type(log: EventLog) -> None:
     if log.address.is_sqlite:
-        return  # a change of tables there waits for nobody who reads
+        return  # PostgreSQL changes tables without waiting for readers
     projector = await stored_and_folded(log, [*declarations(SAYING), *performing(1, SAYING, text="a")])
     louder = declared("SayingAction", "saying_action", field("text", "text", 2), field("volume", "real", 3))
     await log.append([*declarations(louder), *performing(2, louder, text="b", volume=2.0)])
@@ -265,13 +265,15 @@ async def test_a_lock_that_is_not_given_is_no_fault_of_a_type(log: EventLog) -> 
         await reader.execute(text("SELECT * FROM saying_action"))
         with pytest.raises(DatabaseUnavailable, match="lock timeout"):
             await projector.catch_up()
-    assert await told(log) == []
+    assert await parked_reasons(log) == []
     await projector.catch_up()
     assert await ask(log, "SELECT text, volume FROM saying_action ORDER BY text") == [("a", None), ("b", 2.0)]
 
 
-async def test_a_memory_with_names_that_only_sqlite_takes_is_copied_to_a_server(tmp_path: Path, server: Server) -> None:
-    """Also one of an earlier version, which recorded the column `true` under that name."""
+async def test_a_memory_with_names_that_only_sqlite_accepts_is_copied_to_a_server(
+    tmp_path: Path, server: Server
+) -> None:
+    """Include a memory of an earlier version, which recorded the column `true` under that name."""
     older = declared("OlderAction", "older_action", field("true", "boolean", 2), field("xmin", "real", 3))
     source, target = f"sqlite:///{tmp_path}/memory.db", server.new_database()
     log = await EventLog.open(DatabaseAddress.parse(source), create=True)

@@ -1,4 +1,4 @@
-"""What declarations add to the tables, and which of them cannot be added."""
+"""The layout of tables: what declarations add, and which declarations are refused."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def layout_of(*types: DesignatorTypeDeclared) -> Layout:
     return layout
 
 
-def test_columns_of_one_type_unite_in_the_order_they_came() -> None:
+def test_columns_of_one_type_unite_in_the_order_of_declaration() -> None:
     louder = declared("SayingAction", "saying_action", field("volume", "real", 2), field("text", "text", 3))
     layout = layout_of(SAYING, louder)
     assert layout.leaves == {"saying_action": {"text": "text", "volume": "real"}}
@@ -59,25 +59,27 @@ def test_lists_and_dicts_have_no_column() -> None:
     ],
     ids=["another type", "another case", "another kind", "a table of ours", "a table in another case"],
 )
-def test_what_cannot_share_the_tables_is_refused_with_both_named(second: DesignatorTypeDeclared, reason: str) -> None:
+def test_a_declaration_that_contradicts_a_table_is_refused_with_both_named(
+    second: DesignatorTypeDeclared, reason: str
+) -> None:
     with pytest.raises(LayoutConflict) as raised:
         layout_of(SAYING, second)
     assert str(raised.value) == reason
 
 
-def test_a_contradiction_with_another_table_of_the_type_is_one_too() -> None:
+def test_a_contradiction_with_another_table_of_the_same_type_is_refused() -> None:
     with pytest.raises(LayoutConflict):
         layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
 
 
-def test_a_table_that_an_authors_class_gave_a_contradicting_column_cannot_join_the_type() -> None:
+def test_a_table_to_which_an_authors_class_gave_a_contradicting_column_cannot_join_the_type() -> None:
     layout = layout_of(SAYING).with_leaves([Leaf("ORMSaying", {"text": "real"})])
     with pytest.raises(LayoutConflict, match=r"SayingAction\.text is declared as text and as real"):
         layout.with_declaration(declared("SayingAction", "ORMSaying", field("volume", "real", 2)))
     assert layout.with_declaration(SAYING) == layout
 
 
-def test_a_view_shows_the_type_all_its_tables_and_its_descendants() -> None:
+def test_a_view_lists_all_tables_of_its_type_and_of_its_descendants() -> None:
     careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
     gentle = declared("GentlePickUpAction", "gentle", bases=("CarefulPickUpAction", "PickUpAction"))
     other_name = declared("PickUpAction", "ORMPickUp")
@@ -87,7 +89,7 @@ def test_a_view_shows_the_type_all_its_tables_and_its_descendants() -> None:
     assert layout.members("gentle") == ("gentle",)
 
 
-def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_a_class_that_exists() -> None:
+def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_an_existing_class() -> None:
     careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
     layout = layout_of(PICK_UP, careful, SAYING, declared("MoveMotion", "move_motion", kind="motion"))
     assert layout.lineage("SayingAction") == "SayingAction Action"
@@ -95,7 +97,7 @@ def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_a_class
     assert layout.lineage("CarefulPickUpAction") == "CarefulPickUpAction careful PickUpAction Action"
 
 
-def test_mapped_classes_add_what_is_missing_and_never_change_what_is_declared() -> None:
+def test_mapped_classes_add_missing_columns_and_never_change_declared_ones() -> None:
     layout = layout_of(SAYING).with_leaves(
         [Leaf("saying_action", {"text": "integer", "volume": "real"}, "SayingAction", "action"), Leaf("ORMLog", {})]
     )
@@ -103,7 +105,7 @@ def test_mapped_classes_add_what_is_missing_and_never_change_what_is_declared() 
     assert layout.types["SayingAction"].tables == ("saying_action",)
 
 
-# --- types that were renamed --------------------------------------------------------------------------------------
+# --- renamed types ----------------------------------------------------------------------------------------------------
 
 GREET = declared("GreetAction", "greet_action", field("whom", "text", 2), field("loud", "boolean", 3))
 WELCOME = replace(
@@ -115,7 +117,7 @@ LOUD = declared("LoudGreetAction", "loud_greet_action", bases=("GreetAction",))
 
 
 @pytest.mark.parametrize("order", list(permutations([GREET, WELCOME, HELLO, LOUD])))
-def test_a_type_and_what_it_was_called_are_one_type_whichever_was_declared_first(
+def test_a_type_and_its_former_name_are_one_type_whichever_was_declared_first(
     order: tuple[DesignatorTypeDeclared, ...],
 ) -> None:
     layout = layout_of(*order)
@@ -135,17 +137,17 @@ def test_a_type_and_what_it_was_called_are_one_type_whichever_was_declared_first
     assert layout.lineage("LoudGreetAction").split()[:2] == ["LoudGreetAction", "HelloAction"]
 
 
-def test_a_name_that_two_types_say_they_had_is_that_of_the_first() -> None:
+def test_a_former_name_that_two_types_claim_belongs_to_the_first() -> None:
     bow = replace(declared("BowAction", "bow_action"), aliases=("GreetAction",))
     layout = layout_of(GREET, WELCOME)
     with pytest.raises(LayoutConflict, match="so BowAction cannot have the alias GreetAction: remove it"):
         layout.with_declaration(bow)
-    # Who says both names continues both.
+    # A type that names both continues both.
     both = layout.with_declaration(replace(bow, aliases=("GreetAction", "WelcomeAction")))
     assert both.renamed == {"GreetAction": "BowAction", "WelcomeAction": "BowAction"}
 
 
-def test_a_type_that_gets_an_earlier_name_back_stays_one_type() -> None:
+def test_a_type_that_returns_to_an_earlier_name_stays_one_type() -> None:
     back = replace(GREET, aliases=("WelcomeAction",))
     layout = layout_of(GREET, WELCOME, back)
     assert layout == layout_of(GREET, WELCOME)
@@ -166,16 +168,14 @@ def test_a_type_that_gets_an_earlier_name_back_stays_one_type() -> None:
         (declared("GreetAction", "greet_action", kind="motion"), "declared as motion and as action"),
     ],
 )
-def test_what_a_type_cannot_have_been_is_refused_and_changes_nothing(
-    former: DesignatorTypeDeclared, reason: str
-) -> None:
+def test_an_impossible_former_name_is_refused_and_changes_nothing(former: DesignatorTypeDeclared, reason: str) -> None:
     layout = layout_of(former)
     with pytest.raises(LayoutConflict, match=reason):
         layout.with_declaration(WELCOME)
     assert layout_of(WELCOME).types["WelcomeAction"].tables == ("welcome_action",)
 
 
-def test_tables_that_become_those_of_one_type_must_all_agree() -> None:
+def test_tables_that_become_one_type_must_all_agree() -> None:
     own = replace(declared("WelcomeAction", "ORMWelcome"), aliases=("GreetAction",))
     layout = layout_of(GREET, declared("WelcomeAction", "welcome_action", field("loud", "text", 2)))
     with pytest.raises(LayoutConflict, match="loud"):

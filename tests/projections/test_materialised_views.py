@@ -1,4 +1,4 @@
-"""Users' views that are kept as tables show at every flush what the plain view of the same meaning shows."""
+"""Materialised user views show at every flush the same rows as the plain view of the same query."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def talk(episode: int, count: int) -> Script:
     return script
 
 
-async def shown(log: EventLog, view: str) -> list[tuple[object, ...]]:
+async def visible_rows(log: EventLog, view: str) -> list[tuple[object, ...]]:
     return await ask(log, f"SELECT * FROM {view} ORDER BY id")
 
 
@@ -44,7 +44,7 @@ async def kept_tables_of(log: EventLog) -> list[str]:
 
 
 @pytest.mark.parametrize("step", [1, 3, 1000])
-async def test_it_shows_at_every_flush_what_the_plain_view_shows(log: EventLog, step: int) -> None:
+async def test_a_materialised_view_shows_at_every_flush_the_rows_of_the_plain_view(log: EventLog, step: int) -> None:
     projector = Projector(log, views=[KEPT, PLAIN])
     await projector.open()
     await log.append(declarations(SAYING))
@@ -52,21 +52,21 @@ async def test_it_shows_at_every_flush_what_the_plain_view_shows(log: EventLog, 
     for start in range(0, len(records), step):
         await log.append(records[start : start + step])
         await projector.catch_up()
-        assert await shown(log, "said") == await shown(log, "said_plainly")
-    assert len(await shown(log, "said")) == 8
-    assert {status for _, _, status, _ in await shown(log, "said")} == {"SUCCEEDED"}
+        assert await visible_rows(log, "said") == await visible_rows(log, "said_plainly")
+    assert len(await visible_rows(log, "said")) == 8
+    assert {status for _, _, status, _ in await visible_rows(log, "said")} == {"SUCCEEDED"}
 
 
-async def test_a_process_that_does_not_know_it_keeps_it_up_to_date(log: EventLog) -> None:
+async def test_a_process_that_does_not_register_it_keeps_it_up_to_date(log: EventLog) -> None:
     await Projector(log, views=[KEPT]).open()
     other = Projector(log)
     await other.open()
     await log.append([*declarations(SAYING), *talk(1, 4).records])
     await other.catch_up()
-    assert len(await shown(log, "said")) == 4
+    assert len(await visible_rows(log, "said")) == 4
 
 
-async def test_one_registered_later_shows_what_was_there_before(log: EventLog) -> None:
+async def test_one_that_is_registered_later_shows_earlier_rows(log: EventLog) -> None:
     first = Projector(log)
     await first.open()
     await log.append([*declarations(SAYING), *mixed(*(talk(each, 2) for each in range(1, 501)))])
@@ -74,10 +74,10 @@ async def test_one_registered_later_shows_what_was_there_before(log: EventLog) -
     later = Projector(log, views=[KEPT])
     await later.open()
     await later.catch_up()
-    assert len(await shown(log, "said")) == 1000
+    assert len(await visible_rows(log, "said")) == 1000
 
 
-async def test_another_meaning_of_the_same_name_is_shown_and_the_old_rows_go_with_the_next_rebuild(
+async def test_a_changed_query_under_the_same_name_is_shown_and_the_next_rebuild_drops_the_old_rows(
     log: EventLog,
 ) -> None:
     projector = Projector(log, views=[KEPT])
@@ -95,29 +95,29 @@ async def test_another_meaning_of_the_same_name_is_shown_and_the_old_rows_go_wit
     assert len(await kept_tables_of(log)) == 2
 
 
-async def test_it_can_become_a_plain_view_and_kept_again(log: EventLog) -> None:
+async def test_a_materialised_view_can_become_a_plain_view_and_back(log: EventLog) -> None:
     await log.append([*declarations(SAYING), *talk(1, 4).records])
     for view in (KEPT, UserView("said", MEANING), KEPT):
         projector = Projector(log, views=[view])
         await projector.open()
         await projector.catch_up()
-        assert len(await shown(log, "said")) == 4
+        assert len(await visible_rows(log, "said")) == 4
 
 
-async def test_a_rebuild_makes_it_anew_and_it_goes_on(log: EventLog) -> None:
+async def test_a_rebuild_makes_it_again_and_it_is_kept_up_to_date(log: EventLog) -> None:
     projector = Projector(log, views=[KEPT, PLAIN])
     await projector.open()
     await log.append([*declarations(SAYING), *mixed(talk(1, 4), talk(2, 7))])
     await projector.catch_up()
-    before = await shown(log, "said")
+    before = await visible_rows(log, "said")
     old = set(await kept_tables_of(log))
     await rebuild_memory(log.address.to_type)
-    assert await shown(log, "said") == before
+    assert await visible_rows(log, "said") == before
     assert old.isdisjoint(await kept_tables_of(log))
     await log.append(talk(3, 2).records)
     await projector.catch_up()
-    assert await shown(log, "said") == await shown(log, "said_plainly")
-    assert len(await shown(log, "said")) == 13
+    assert await visible_rows(log, "said") == await visible_rows(log, "said_plainly")
+    assert len(await visible_rows(log, "said")) == 13
 
 
 async def test_one_whose_rows_name_no_episode_is_refused(log: EventLog) -> None:

@@ -1,4 +1,4 @@
-"""Two hands fold one log, each a projector with a log of its own: one prepares a batch while the other one writes."""
+"""Fold one log by two workers, each a projector with a log of its own: one prepares a batch while the other writes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from tests.projections.sql_queries import ask
 pytestmark = pytest.mark.slow
 
 
-class InLoop:
-    """A hand in this loop. `wrote` is how many events each of its batches had."""
+class WorkerInLoop:
+    """A worker in this loop; `wrote` lists the number of events of its batches."""
 
     def __init__(self, projector: Projector) -> None:
         self.projector = projector
@@ -40,16 +40,16 @@ class InLoop:
         return self.wrote[-1]
 
 
-class Unheard(InLoop):
-    """Writes, and its answers do not arrive."""
+class LosesAnswers(WorkerInLoop):
+    """Write, but let every answer be lost."""
 
     async def write(self) -> int:
         await super().write()
         return 0
 
 
-class Forgetful(InLoop):
-    """Has lost every third batch when it is to write it."""
+class LosesBatches(WorkerInLoop):
+    """Lose every third batch before writing it."""
 
     asked = 0
 
@@ -58,8 +58,8 @@ class Forgetful(InLoop):
         return 0 if self.asked % 3 == 0 else await super().write()
 
 
-class Mortal(InLoop):
-    """Dies at every third request; another one takes its place."""
+class DiesOften(WorkerInLoop):
+    """Die at every third request, so that another worker replaces it."""
 
     asked = 0
 
@@ -81,8 +81,8 @@ class Died(Exception):
     pass
 
 
-class Eager(InLoop):
-    """Writes before it is asked to, and again then."""
+class WritesTwice(WorkerInLoop):
+    """Write before the request and again at it."""
 
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         preview = await super().prepare(spans)
@@ -105,7 +105,7 @@ async def other_log(log: EventLog) -> AsyncIterator[EventLog]:
 
 
 def talk(episode: int, *, words: int) -> Script:
-    """Nodes in nodes, so that rows are made in one batch and ended in another."""
+    """Return nested nodes, so that rows are made in one batch and ended in another."""
     script = Script(episode)
     script.put(EpisodeStarted("a talk", "me", "host", "1.0", "3.11"))
     root = script.put(NodeStarted("root"))
@@ -119,7 +119,7 @@ def talk(episode: int, *, words: int) -> Script:
     return script
 
 
-async def hands_of(logs: Sequence[EventLog], kind: type[InLoop], batch_events: int) -> list[InLoop]:
+async def workers_of(logs: Sequence[EventLog], kind: type[WorkerInLoop], batch_events: int) -> list[WorkerInLoop]:
     hands = []
     for log in logs:
         projector = Projector(log, batch_events=batch_events)
@@ -128,8 +128,8 @@ async def hands_of(logs: Sequence[EventLog], kind: type[InLoop], batch_events: i
     return hands
 
 
-async def fold_all(log: EventLog, hands: Sequence[InLoop], batch_events: int) -> int:
-    """Until nothing is behind; the number of events that were folded, as far as the pipeline knows."""
+async def fold_all(log: EventLog, hands: Sequence[WorkerInLoop], batch_events: int) -> int:
+    """Fold until nothing is left, and return the number of events that the pipeline counted."""
     pipeline, count = FoldPipeline(LiveTarget(log), batch_events=batch_events), 0
     while True:
         try:
@@ -143,16 +143,16 @@ async def fold_all(log: EventLog, hands: Sequence[InLoop], batch_events: int) ->
 
 
 async def folded_by_two(
-    log: EventLog, other_log: EventLog, records: Sequence[Record], kind: type[InLoop], batch_events: int
-) -> list[InLoop]:
-    hands = await hands_of([log, other_log], kind, batch_events)
+    log: EventLog, other_log: EventLog, records: Sequence[Record], kind: type[WorkerInLoop], batch_events: int
+) -> list[WorkerInLoop]:
+    hands = await workers_of([log, other_log], kind, batch_events)
     await log.append(records)
     await fold_all(log, hands, batch_events)
     return hands
 
 
-async def told(log: EventLog) -> list[tuple[object, ...]]:
-    """Every word: its row, the node above it, how it ended, and the word."""
+async def stored_words(log: EventLog) -> list[tuple[object, ...]]:
+    """Return every word: its row, the parent node, its status, and the text."""
     return await ask(
         log,
         "SELECT node.id, node.parent_id, node.status, text FROM saying_action JOIN task_tree_node AS node"
@@ -161,7 +161,7 @@ async def told(log: EventLog) -> list[tuple[object, ...]]:
 
 
 def words_of(number: int, words: int, *, episode: int | None = None) -> list[tuple[object, ...]]:
-    """What must be told of a talk that is the episode of this number."""
+    """Return the expected rows of the episode with this number."""
     expected: list[tuple[object, ...]] = []
     for word in range(0, words, 2):
         outer, status = row(3 + 2 * word, number=number), "FAILED" if word % 3 else "SUCCEEDED"
@@ -174,14 +174,22 @@ def words_of(number: int, words: int, *, episode: int | None = None) -> list[tup
 
 @pytest.mark.parametrize(
     ("hand", "batch_events"),
-    [(InLoop, 1), (InLoop, 2), (InLoop, 7), (Unheard, 2), (Forgetful, 2), (Mortal, 2), (Eager, 3)],
+    [
+        (WorkerInLoop, 1),
+        (WorkerInLoop, 2),
+        (WorkerInLoop, 7),
+        (LosesAnswers, 2),
+        (LosesBatches, 2),
+        (DiesOften, 2),
+        (WritesTwice, 3),
+    ],
 )
-async def test_every_event_is_shown_once_and_in_its_place(
-    log: EventLog, other_log: EventLog, hand: type[InLoop], batch_events: int
+async def test_every_event_is_folded_once_and_in_its_place(
+    log: EventLog, other_log: EventLog, hand: type[WorkerInLoop], batch_events: int
 ) -> None:
     records = [*declarations(SAYING), *mixed(talk(1, words=12), talk(2, words=2)), *talk(3, words=6).records]
     hands = await folded_by_two(log, other_log, records, hand, batch_events)
-    assert await told(log) == [*words_of(1, 12), *words_of(2, 2), *words_of(3, 6)]
+    assert await stored_words(log) == [*words_of(1, 12), *words_of(2, 2), *words_of(3, 6)]
     assert await ask(log, "SELECT status, count(*) FROM process_metadata GROUP BY status") == [("SUCCEEDED", 3)]
     assert await ask(log, "SELECT count(*) FROM task_tree_node WHERE parent_id IS NULL AND end_time IS NOT NULL") == [
         (3,)
@@ -191,14 +199,16 @@ async def test_every_event_is_shown_once_and_in_its_place(
         (2, 0, None),
         (3, 0, None),
     ]
-    if hand is InLoop:
+    if hand is WorkerInLoop:
         assert all(sum(each.wrote) >= len(records) // 3 for each in hands)
-        assert not any(0 in each.wrote[1:] for each in hands)  # nothing is folded in vain; first the tables grow
+        assert not any(
+            0 in each.wrote[1:] for each in hands
+        )  # no batch is prepared in vain; first the tables are altered
 
 
 @pytest.mark.parametrize("bad", ["unknown", "refused by the database", "missing"])
 @pytest.mark.parametrize("place", [6, 7])
-async def test_an_episode_stops_where_it_cannot_be_folded_whoever_meets_that(
+async def test_an_episode_stops_where_it_cannot_be_folded_whichever_worker_meets_that(
     log: EventLog, other_log: EventLog, bad: str, place: int
 ) -> None:
     first = talk(1, words=20)
@@ -211,20 +221,22 @@ async def test_an_episode_stops_where_it_cannot_be_folded_whoever_meets_that(
         case _:
             await _forget_when_stored(log, place)
     records = [*declarations(SAYING), *first.records, *talk(2, words=4).records]
-    await folded_by_two(log, other_log, records, InLoop, batch_events=2)
+    await folded_by_two(log, other_log, records, WorkerInLoop, batch_events=2)
     rows = await ask(log, "SELECT number, folded, parked IS NULL FROM episode ORDER BY number")
     assert [tuple(map(int, each)) for each in rows] == [(1, place - 1, 0), (2, 12, 1)]
     ((reason,),) = await ask(log, "SELECT parked FROM episode WHERE number = 1")
     assert reason.startswith(f"event {place}")
     begun = [each for each in (3, 4, 7, 8) if each < place]
-    shown = await told(log)
-    assert [each[0] for each in shown if each not in words_of(2, 4)] == [row(each) for each in begun]
-    assert [each for each in shown if each in words_of(2, 4)] == words_of(2, 4)
+    rows = await stored_words(log)
+    assert [each[0] for each in rows if each not in words_of(2, 4)] == [row(each) for each in begun]
+    assert [each for each in rows if each in words_of(2, 4)] == words_of(2, 4)
 
 
-async def test_types_that_come_meanwhile_are_learned_by_both(log: EventLog, other_log: EventLog) -> None:
-    class Interrupted(InLoop):
-        """The first times that it is to prepare, a type that is new to both is recorded before that, and used."""
+async def test_types_that_are_declared_meanwhile_are_learned_by_both_workers(
+    log: EventLog, other_log: EventLog
+) -> None:
+    class Interrupted(WorkerInLoop):
+        """Record and use a type that is new to both workers before its first batches are prepared."""
 
         count = 0
 
@@ -241,7 +253,7 @@ async def test_types_that_come_meanwhile_are_learned_by_both(log: EventLog, othe
     records = [*declarations(SAYING), *talk(1, words=30).records]
     await folded_by_two(log, other_log, records, Interrupted, batch_events=4)
     loud = [(row(1, number=number), None, "RUNNING", "LOUD") for number in (2, 3, 4)]
-    assert await told(log) == [*words_of(1, 30), *loud]
+    assert await stored_words(log) == [*words_of(1, 30), *loud]
     assert await ask(log, "SELECT volume1, volume2, volume3 FROM saying_action WHERE text = 'LOUD' ORDER BY id") == [
         (0.5, None, None),
         (None, 0.5, None),
@@ -253,17 +265,17 @@ def volume(number: int) -> FieldDeclared:
     return field(f"volume{number}", "real", 2 + number)
 
 
-async def test_several_pipelines_show_every_event_once(log: EventLog, other_log: EventLog) -> None:
-    pairs = [await hands_of([log, other_log], InLoop, 3) for _ in range(2)]
+async def test_several_pipelines_fold_every_event_once(log: EventLog, other_log: EventLog) -> None:
+    pairs = [await workers_of([log, other_log], WorkerInLoop, 3) for _ in range(2)]
     talks = [talk(number, words=10) for number in range(1, 6)]
     await log.append([*declarations(SAYING), *mixed(*talks)])
     counts = await asyncio.gather(*(fold_all(log, each, 3) for each in pairs))
-    assert await told(log) == [word for number in range(1, 6) for word in words_of(number, 10)]
+    assert await stored_words(log) == [word for number in range(1, 6) for word in words_of(number, 10)]
     assert sum(counts) == sum(len(each.records) for each in talks)
 
 
 async def _forget_when_stored(log: EventLog, place: int) -> None:
-    """Event `place` of the first episode is gone as soon as it is stored, as if the file had lost it."""
+    """Delete event `place` of the first episode as soon as it is stored, as if the file had lost it."""
     is_server = log.engine.dialect.name == "postgresql"
     async with log.engine.begin() as connection:
         if is_server:

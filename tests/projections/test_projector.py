@@ -1,4 +1,4 @@
-"""Live folding on real SQLite: what is shown, what stops, what several projectors do to one memory."""
+"""Live folding on a real SQLite file: visible rows, stopped episodes, and several projectors of one memory."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ REFUSED = RefusalValue(pose(2, 2), "LEFT: too far")
 
 
 def rich_episode(number: int) -> Script:
-    """Everything that can happen, so that every table is filled."""
+    """Return an episode with every kind of event, so that every table has rows."""
     script = Script(number)
     put = script.put
     put(EpisodeStarted(f"episode {number}", "me", "host", "1.0", "3.11"))
@@ -80,7 +80,7 @@ def rich_episode(number: int) -> Script:
     return script
 
 
-async def test_every_table_is_filled_by_what_happens(log: EventLog) -> None:
+async def test_every_table_has_rows_after_every_kind_of_event(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records])
     filled = {name for name, rows in (await all_rows(log)).items() if rows}
     assert filled == {
@@ -92,7 +92,7 @@ async def test_every_table_is_filled_by_what_happens(log: EventLog) -> None:
 
 
 @pytest.mark.parametrize("batch_events", [1, 2, 3, 7, 10_000])
-async def test_batches_of_any_size_show_the_same_rows(log: EventLog, batch_events: int) -> None:
+async def test_batches_of_any_size_give_the_same_rows(log: EventLog, batch_events: int) -> None:
     episodes = [rich_episode(1), rich_episode(2)]
     lost = Script(3)
     lost.put(NodeStarted("action", lost.put(NodeStarted("root")), name_of(SAYING), {"text": "oh"}))
@@ -124,7 +124,7 @@ async def test_batches_of_any_size_show_the_same_rows(log: EventLog, batch_event
 async def test_one_batch_and_event_by_event_give_the_same_tables(log: EventLog, tmp_path: object) -> None:
     records = [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records]
     await stored_and_folded(log, records)
-    at_once = await all_rows(log)
+    in_own_loop = await all_rows(log)
     other = await EventLog.open(type(log.address).parse(f"sqlite:///{tmp_path}/other.db"), create=True)
     try:
         projector = Projector(other)
@@ -132,12 +132,12 @@ async def test_one_batch_and_event_by_event_give_the_same_tables(log: EventLog, 
         for record in records:
             await other.append([record])
             await projector.catch_up()
-        assert await all_rows(other) == at_once
+        assert await all_rows(other) == in_own_loop
     finally:
         await other.close()
 
 
-async def test_nothing_behind_is_nothing_to_do(log: EventLog) -> None:
+async def test_without_unfolded_events_nothing_is_done(log: EventLog) -> None:
     projector = await stored_and_folded(log, rich_episode(1).records[:2])
     assert await projector.catch_up() == 0
 
@@ -162,7 +162,7 @@ async def test_nothing_behind_is_nothing_to_do(log: EventLog) -> None:
         ),
     ],
 )
-async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_go_on(
+async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_continue(
     log: EventLog, bad: str, reason: str
 ) -> None:
     numeric = declared("SayingAction", "saying_action", field("text", "integer", 2))
@@ -201,7 +201,7 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_g
 
 
 @pytest.mark.parametrize("batch_events", [1, 2, 10_000])
-async def test_an_event_whose_row_is_there_already_parks_its_episode_and_changes_nothing(
+async def test_an_event_whose_row_exists_already_parks_its_episode_and_changes_nothing(
     log: EventLog, batch_events: int
 ) -> None:
     script = Script()
@@ -220,7 +220,7 @@ async def test_an_event_whose_row_is_there_already_parks_its_episode_and_changes
     assert reason.startswith("event 3: ")
 
 
-async def test_a_type_that_grows_gets_a_column_and_older_rows_stay(log: EventLog) -> None:
+async def test_a_type_with_a_new_field_gets_a_column_and_keeps_older_rows(log: EventLog) -> None:
     louder = declared("SayingAction", "saying_action", field("text", "text", 2), field("volume", "real", 3))
     script = Script()
     script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
@@ -236,7 +236,7 @@ async def test_a_type_that_grows_gets_a_column_and_older_rows_stay(log: EventLog
     ]
 
 
-async def test_a_descendant_is_among_its_base_also_when_the_base_came_later(log: EventLog) -> None:
+async def test_a_descendant_is_listed_with_its_base_even_if_the_base_was_declared_later(log: EventLog) -> None:
     fields = (field("object_designator", "object", 2), field("arm", "enum", 3))
     base = declared("GrabAction", "grab_action", *fields)
     careful = declared(
@@ -255,7 +255,7 @@ async def test_a_descendant_is_among_its_base_also_when_the_base_came_later(log:
     assert await ask(log, "SELECT * FROM careful_grab_action") == [(row(1), None, "LEFT", 0.5)]
 
 
-async def test_several_projectors_show_every_event_once(log: EventLog) -> None:
+async def test_several_projectors_fold_every_event_once(log: EventLog) -> None:
     projectors = [Projector(log, batch_events=5) for _ in range(4)]
     for each in projectors:
         await each.open()
@@ -269,7 +269,7 @@ async def test_several_projectors_show_every_event_once(log: EventLog) -> None:
     assert await ask(log, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
 
 
-async def test_a_projector_that_knows_older_tables_learns_of_the_new_ones(log: EventLog) -> None:
+async def test_a_projector_with_older_tables_learns_the_new_ones(log: EventLog) -> None:
     first, second = Projector(log), Projector(log)
     await first.open()
     await second.open()
@@ -283,7 +283,7 @@ async def test_a_projector_that_knows_older_tables_learns_of_the_new_ones(log: E
     assert await ask(log, "SELECT text FROM saying_action ORDER BY id") == [("hi",), ("ho",)]
 
 
-async def test_doubles_arrive_in_the_tables_bit_by_bit(log: EventLog) -> None:
+async def test_doubles_are_stored_bit_by_bit(log: EventLog) -> None:
     chance = random.Random(11)
     special = [0.1 + 0.2, 0.0, 5e-324, 1.7976931348623157e308, 2.0**53 + 1, 1 / 3]
     numbers = [*special, *(chance.uniform(-1, 1) * 10.0 ** chance.randint(-300, 300) for _ in range(2_994))]
@@ -295,7 +295,7 @@ async def test_doubles_arrive_in_the_tables_bit_by_bit(log: EventLog) -> None:
     assert [value.hex() for value in stored] == [value.hex() for value in numbers]
 
 
-async def test_text_of_any_kind_arrives_as_it_was(log: EventLog) -> None:
+async def test_text_of_any_kind_is_stored_unchanged(log: EventLog) -> None:
     texts = ["", "Käse 🧀", "'; DROP TABLE pose__1; --", '"%s" ?1 :x', "a\nb\t\\", "\ud7ff\uffff"]
     script = Script()
     for text in texts:
@@ -307,10 +307,10 @@ async def test_text_of_any_kind_arrives_as_it_was(log: EventLog) -> None:
 async def test_opening_again_changes_nothing(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(SAYING), *rich_episode(1).records[:2]])
     before = await ask(log, "SELECT * FROM pycrorm_generation")
-    there = await names(log, "table", "view")
+    names_before = await names(log, "table", "view")
     await Projector(log).open()
     assert await ask(log, "SELECT * FROM pycrorm_generation") == before
-    assert await names(log, "table", "view") == there
+    assert await names(log, "table", "view") == names_before
 
 
 async def test_tables_of_another_version_are_refused(log: EventLog) -> None:
@@ -323,7 +323,7 @@ async def test_tables_of_another_version_are_refused(log: EventLog) -> None:
 
 
 @pytest.mark.parametrize("missing", [1, 2, 3])
-async def test_an_event_that_is_missing_parks_its_episode_and_the_others_go_on(log: EventLog, missing: int) -> None:
+async def test_a_missing_event_parks_its_episode_and_the_others_continue(log: EventLog, missing: int) -> None:
     projector = Projector(log)
     await projector.open()
     await log.append([*rich_episode(1).records[:3], *rich_episode(2).records[:3]])

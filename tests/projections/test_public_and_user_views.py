@@ -1,4 +1,4 @@
-"""Views that join what learning asks for, and those that users register."""
+"""Views for learning, and views that users register."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ pytestmark = pytest.mark.slow
 
 
 def two_pick_ups() -> Script:
-    """The milk stands at (1, 2) and is picked up from (0.25, 2.5); then it is moved to (5, 5)."""
+    """Return two episodes: the milk is at (1, 2), is picked up from (0.25, 2.5), and is then moved to (5, 5)."""
     script = Script()
     milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 0.9)))
     robot = RobotValue(pose(0.25, 2.5, 0, turned=0.6), "ROBOT", 0.3)
@@ -65,7 +65,7 @@ def two_pick_ups() -> Script:
     return script
 
 
-async def test_the_view_of_pick_ups_has_the_columns_of_the_thesis_and_the_pose_at_execution(log: EventLog) -> None:
+async def test_the_pick_up_view_has_the_columns_of_the_thesis_and_the_pose_at_execution(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
     async with log.engine.connect() as connection:
         answer = await connection.exec_driver_sql('SELECT * FROM "PickUpWithContextView" ORDER BY id')
@@ -102,9 +102,9 @@ LIFT = msgspec.structs.replace(declared("LiftAction", "lift_action", *CAREFUL.fi
         (PICK_UP, CAREFUL, msgspec.structs.replace(LIFT, bases=("PickUpAction",)), WARY),
     ],
 )
-@pytest.mark.parametrize("at_once", [True, False])
-async def test_it_has_those_of_descendants_and_of_former_names_whatever_came_first(
-    log: EventLog, types: tuple[DesignatorTypeDeclared, ...], at_once: bool
+@pytest.mark.parametrize("in_own_loop", [True, False])
+async def test_the_pick_up_view_includes_descendants_and_former_names_in_any_order(
+    log: EventLog, types: tuple[DesignatorTypeDeclared, ...], in_own_loop: bool
 ) -> None:
     script = Script()
     milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 0.9)))
@@ -115,7 +115,7 @@ async def test_it_has_those_of_descendants_and_of_former_names_whatever_came_fir
         parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
         robot = RobotValue(pose(0.25, 2.5), "ROBOT", 0.3)
         rows.append(row(script.put(NodeStarted("action", None, name_of(each), parameters, robot))))
-        if not at_once:
+        if not in_own_loop:
             await log.append([*declarations(each), *script.records])
             await projector.catch_up()
     await log.append([*declarations(*types), *script.records])
@@ -132,7 +132,7 @@ def turn(axis: tuple[float, float, float], angle: float) -> NDArray[np.float64]:
 
 
 def turned(axis: tuple[float, float, float], angle: float) -> tuple[float, float, float, float]:
-    """The same rotation as a quaternion."""
+    """Return the same rotation as a quaternion."""
     x, y, z = np.array(axis) / np.linalg.norm(axis) * math.sin(angle / 2)
     return float(x), float(y), float(z), math.cos(angle / 2)
 
@@ -140,11 +140,11 @@ def turned(axis: tuple[float, float, float], angle: float) -> tuple[float, float
 @pytest.mark.parametrize(
     ("axis", "angle"), [((0, 0, 1), 0.0), ((0, 0, 1), math.pi / 2), ((0, 0, 1), -2.5), ((1, -2, 0.5), 2.0)]
 )
-async def test_the_view_says_where_the_robot_stood_as_seen_from_the_object(
+async def test_the_pick_up_view_gives_the_robots_position_in_the_frame_of_the_object(
     log: EventLog, axis: tuple[float, float, float], angle: float
 ) -> None:
     script = Script()
-    there = np.array([1.3, 1.0, 0.9])
+    object_position = np.array([1.3, 1.0, 0.9])
     milk = script.put(ObjectAdded("milk", "MILK", PoseValue((1.3, 1.0, 0.9), turned(axis, angle), "map", T0_NS)))
     stand, heading = np.array([0.6, 0.4, 0.0]), 0.7
     robot = RobotValue(PoseValue((0.6, 0.4, 0.0), turned((0, 0, 1), heading), "map", T0_NS), "ROBOT", 0.3)
@@ -159,17 +159,17 @@ async def test_the_view_says_where_the_robot_stood_as_seen_from_the_object(
                 view.object_qx, view.object_qy, view.object_qz, view.object_qw,
             )
         )  # fmt: skip
-    of_thing = turn(axis, angle)
-    np.testing.assert_allclose(seen[:3], of_thing.T @ (stand - there), atol=1e-12)
-    # The robot's heading, as a direction: turned by the quaternion it is what the object sees.
+    object_rotation = turn(axis, angle)
+    np.testing.assert_allclose(seen[:3], object_rotation.T @ (stand - object_position), atol=1e-12)
+    # The robot's heading as a direction, which the quaternion rotates into the object's frame.
     x, y, z, w = seen[3:]
     ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
     upwards = np.array([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)])
-    np.testing.assert_allclose(ahead, of_thing.T @ [math.cos(heading), math.sin(heading), 0], atol=1e-12)
-    np.testing.assert_allclose(upwards, of_thing.T @ [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(ahead, object_rotation.T @ [math.cos(heading), math.sin(heading), 0], atol=1e-12)
+    np.testing.assert_allclose(upwards, object_rotation.T @ [0, 0, 1], atol=1e-12)
 
 
-async def test_the_view_says_how_much_higher_than_the_lifted_torso_the_object_is(log: EventLog) -> None:
+async def test_the_pick_up_view_gives_the_height_of_the_object_above_the_lifted_torso(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
     view = PickUpWithContextView
     async with AsyncSession(log.engine) as session:
@@ -177,7 +177,7 @@ async def test_the_view_says_how_much_higher_than_the_lifted_torso_the_object_is
     assert heights == [pytest.approx(0.9 - 0.3), None]
 
 
-async def test_the_mapped_view_gives_and_takes_members(log: EventLog) -> None:
+async def test_the_mapped_view_accepts_and_returns_enum_members(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
     async with AsyncSession(log.engine) as session:
         view = PickUpWithContextView
@@ -185,7 +185,7 @@ async def test_the_mapped_view_gives_and_takes_members(log: EventLog) -> None:
         assert [(each.arm, each.grasp, each.obj_type) for each in won] == [(Arms.RIGHT, Grasp.FRONT, ObjectType.MILK)]
 
 
-async def test_a_careful_pick_up_is_in_the_view_too(log: EventLog) -> None:
+async def test_the_pick_up_view_includes_a_careful_pick_up(log: EventLog) -> None:
     careful = declared(
         "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5),
         bases=("PickUpAction",),
@@ -198,7 +198,7 @@ async def test_a_careful_pick_up_is_in_the_view_too(log: EventLog) -> None:
     assert await ask(log, 'SELECT id, relative_x, relative_y FROM "PickUpWithContextView"') == [(row(2), -1.0, -2.0)]
 
 
-async def test_a_view_of_a_user_is_made_beside_the_tables_and_changed_with_its_meaning(log: EventLog) -> None:
+async def test_a_user_view_is_made_beside_the_tables_and_changed_with_its_query(log: EventLog) -> None:
     node = TaskTreeNode
     reasons = UserView(
         "reasons",
@@ -214,7 +214,7 @@ async def test_a_view_of_a_user_is_made_beside_the_tables_and_changed_with_its_m
     assert await ask(log, "SELECT * FROM reasons") == [("IKError",)]
 
 
-async def test_a_view_of_a_user_stays_when_another_process_opens_the_memory_without_it(log: EventLog) -> None:
+async def test_a_user_view_stays_when_another_process_opens_the_memory_without_it(log: EventLog) -> None:
     await Projector(log, views=[UserView("arms", select(PickUpAction.arm))]).open()
     await Projector(log).open()
     assert await ask(log, "SELECT * FROM arms") == []
@@ -224,23 +224,23 @@ async def test_a_view_of_a_user_stays_when_another_process_opens_the_memory_with
     "name",
     ["pose", "Action", "event", "pycrorm_x", "pg_x", "pose__1", "x__12", "park_arms_action", "pickupWithContextView"],
 )
-async def test_a_view_cannot_take_a_name_that_is_taken(log: EventLog, name: str) -> None:
+async def test_a_view_cannot_use_the_name_of_a_table(log: EventLog, name: str) -> None:
     with pytest.raises(CallerError, match=f"the view name '{name}' is taken"):
         await Projector(log, views=[UserView(name, select(ParkArmsAction.arm))]).open()
 
 
-async def test_every_name_in_a_fresh_memory_is_taken_for_designators_and_for_views(log: EventLog) -> None:
+async def test_every_name_in_a_fresh_memory_is_reserved_for_designators_and_for_views(log: EventLog) -> None:
     await Projector(log).open()
-    there = set(await names(log, "table", "view"))
-    assert len(there) > 60
-    assert {"event", "pycrorm_generation", "designator", "pose", "pose__1", "PickUpWithContextView"} <= there
+    names_used = set(await names(log, "table", "view"))
+    assert len(names_used) > 60
+    assert {"event", "pycrorm_generation", "designator", "pose", "pose__1", "PickUpWithContextView"} <= names_used
     async with log.engine.connect() as connection:
         generation = await current_generation(connection)
     assert generation is not None
     layout = generation.layout
-    # The table of an author's class waits for the designator that will name it.
+    # The table of an author's class is for the designator that will use its name.
     waiting = layout.leaves.keys() - {table for each in layout.types.values() for table in each.tables}
-    for name in there - waiting:
+    for name in names_used - waiting:
         with pytest.raises(LayoutConflict):
             layout.with_declaration(declared("NobodysAction", name))
         with pytest.raises(CallerError):

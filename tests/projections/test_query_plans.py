@@ -1,4 +1,4 @@
-"""How the databases go about a question, and what SQLite is told of new tables, for it never counts by itself."""
+"""Query plans of both databases, and the statistics that SQLite gets for new tables because it never collects them."""
 
 import sqlite3
 from contextlib import closing
@@ -25,7 +25,7 @@ VIEW = 'SELECT arm, relative_x FROM "PickUpWithContextView" WHERE {}'
         ("SELECT n.id FROM action a JOIN task_tree_node n USING (id) WHERE n.parent_id = 64", "SEARCH task_tree_node"),
     ],
 )
-async def test_a_question_begins_with_what_is_fewest(tmp_path: Path, question: str, begins: str) -> None:
+async def test_a_query_plan_begins_with_the_smallest_table(tmp_path: Path, question: str, begins: str) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
         pass
     with closing(sqlite3.connect(tmp_path / "memory.db")) as file:
@@ -33,9 +33,7 @@ async def test_a_question_begins_with_what_is_fewest(tmp_path: Path, question: s
     assert first.startswith(begins)
 
 
-async def test_of_a_pick_up_with_context_it_is_asked_once_whether_it_happened(
-    database_url: str, tmp_path: Path
-) -> None:
+async def test_the_pick_up_view_looks_up_the_status_of_each_pick_up_once(database_url: str, tmp_path: Path) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool"):
         pass
     explain = "EXPLAIN QUERY PLAN" if database_url.startswith("sqlite") else "EXPLAIN"
@@ -46,20 +44,20 @@ async def test_of_a_pick_up_with_context_it_is_asked_once_whether_it_happened(
 
 @pytest.fixture
 async def new_on_a_server(server: Server, tmp_path: Path) -> str:
-    """The URL of a memory in which nothing is yet."""
+    """Return the URL of an empty memory."""
     url = server.new_database()
     async with Memory.open(url, spool=tmp_path / "spool"):
         pass
     return url
 
 
-def test_a_server_finds_the_pick_ups_that_succeeded_without_reading_all_nodes_that_did(new_on_a_server: str) -> None:
+def test_a_server_finds_successful_pick_ups_without_reading_all_successful_nodes(new_on_a_server: str) -> None:
     question = VIEW.format("status = 'SUCCEEDED'")
     plan = "\n".join(step for (step,) in ask(new_on_a_server, f"EXPLAIN {question}"))
     assert "dtype = 'PickUpAction'" in plan
 
 
-def test_a_server_knows_from_its_index_where_the_robot_was_when_the_pick_ups_ended(new_on_a_server: str) -> None:
+def test_a_server_reads_the_robots_pose_at_the_end_of_pick_ups_from_its_index(new_on_a_server: str) -> None:
     database = new_on_a_server.partition("?")[0].rpartition("/")[2]
     for way in ("seqscan", "bitmapscan"):
         ask_to_change(new_on_a_server, f'ALTER DATABASE "{database}" SET enable_{way} = off')
@@ -68,18 +66,18 @@ def test_a_server_knows_from_its_index_where_the_robot_was_when_the_pick_ups_end
     assert "Index Only Scan" in plan
 
 
-async def test_what_is_expected_of_a_table_goes_with_it_when_it_is_made_anew(tmp_path: Path) -> None:
+async def test_the_statistics_of_a_table_follow_it_through_a_rebuild(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     async with Memory.open(url):
         pass
 
-    def told() -> set[str]:
+    def analysed_tables() -> set[str]:
         with closing(sqlite3.connect(tmp_path / "memory.db")) as file:
             tables = file.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchall()
-            known = {name for (name,) in file.execute("SELECT DISTINCT tbl FROM sqlite_stat1")}
-            assert known <= {name for (name,) in tables}
-            return {name for name in known if name.startswith("task_tree_node")}
+            counted = {name for (name,) in file.execute("SELECT DISTINCT tbl FROM sqlite_stat1")}
+            assert counted <= {name for (name,) in tables}
+            return {name for name in counted if name.startswith("task_tree_node")}
 
-    assert told() == {"task_tree_node__1"}
+    assert analysed_tables() == {"task_tree_node__1"}
     await rebuild_memory(url)
-    assert told() == {"task_tree_node__2"}
+    assert analysed_tables() == {"task_tree_node__2"}

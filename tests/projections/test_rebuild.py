@@ -1,4 +1,4 @@
-"""Tables made anew from the log: the same rows, nothing missing for whoever reads or records meanwhile."""
+"""Rebuild tables from the log: the same rows, and nothing missing for concurrent readers and recorders."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ STOPPED = "SELECT number, folded, parked FROM episode ORDER BY number"
 OUR_VIEW = UserView("Failed", select(TaskTreeNode.id, TaskTreeNode.reason).where(TaskTreeNode.reason.is_not(None)))
 
 
-async def some_of_everything(url: str, spool: Path) -> None:
-    """Random plans with types of their own and failures, a thought, one that was lost, one that cannot be folded."""
+async def every_kind_of_episode(url: str, spool: Path) -> None:
+    """Return random plans with types of their own and failures, a simulation, a lost episode, and a parked one."""
     async with Memory.open(url, spool=spool, views=[OUR_VIEW], settings=PATIENT) as memory:
         for seed in range(6):
             await play(seed, memory)
@@ -64,12 +64,12 @@ async def some_of_everything(url: str, spool: Path) -> None:
     await store(url, whispering(11))
 
 
-async def test_tables_made_anew_hold_row_for_row_what_was_kept_up_to_date(database_url: str, tmp_path: Path) -> None:
-    await some_of_everything(database_url, tmp_path / "spool")
+async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: str, tmp_path: Path) -> None:
+    await every_kind_of_episode(database_url, tmp_path / "spool")
     before, stopped, failed = tables_of(database_url), ask(database_url, STOPPED), ask(database_url, FAILED)
     assert len([why for _, _, why in stopped if why]) == 1
     assert failed
-    # Whatever became of the tables: they are made of the log, not of themselves.
+    # A rebuild uses only the log, whatever was changed in the tables.
     at = "memory_tables." if database_url.startswith("postgresql:") else ""
     for change in ("DELETE FROM {}pose__1", "UPDATE {}task_tree_node__1 SET status = 'RUNNING'"):
         ask_to_change(database_url, change.format(at))
@@ -90,7 +90,7 @@ async def test_tables_made_anew_hold_row_for_row_what_was_kept_up_to_date(databa
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_a_view_of_ours_that_was_noted_as_a_users_one_is_made_anew_too(database_url: str) -> None:
+async def test_a_view_of_the_package_that_was_noted_as_a_users_one_is_rebuilt_too(database_url: str) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
     asked = 'SELECT id, arm, status FROM "PickUpWithContextView" ORDER BY id'
     before = ask(database_url, asked)
@@ -118,7 +118,7 @@ FAILED = 'SELECT * FROM "Failed" ORDER BY id'
         pytest.param(100, {0, 1, 2, 3}, 2.4, [2], marks=pytest.mark.soak),
     ],
 )
-async def test_large_logs_are_remade_by_two_processes_where_two_cores_are_idle(
+async def test_large_logs_are_rebuilt_by_two_processes_where_two_cores_are_idle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: int, cores: set[int], load: float, begun: list[int]
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
@@ -142,7 +142,7 @@ async def test_large_logs_are_remade_by_two_processes_where_two_cores_are_idle(
     assert differences(before, tables_of(url)) == []
 
 
-async def test_workers_that_are_killed_are_started_again_and_the_tables_are_the_same(
+async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
@@ -164,7 +164,7 @@ async def test_workers_that_are_killed_are_started_again_and_the_tables_are_the_
     assert differences(before, tables_of(url)) == []
 
 
-async def test_tables_that_nobody_ever_made_are_made(database_url: str) -> None:
+async def test_missing_tables_are_made(database_url: str) -> None:
     await store(database_url, [*TYPES, *picking(1).records, *parking(2).records], folded=False)
     done = await rebuild_memory(database_url)
     assert (done.generation, done.events, done.episodes) == (1, 19, 2)
@@ -174,20 +174,20 @@ async def test_tables_that_nobody_ever_made_are_made(database_url: str) -> None:
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_what_is_folded_beside_rebuilds_is_in_the_tables_and_no_reader_misses_anything(
+async def test_events_folded_beside_rebuilds_are_in_the_tables_and_no_reader_misses_anything(
     database_url: str, tmp_path: Path
 ) -> None:
-    await beside(database_url, tmp_path, rebuilds=2)
+    await fold_beside(database_url, tmp_path, rebuilds=2)
 
 
 @pytest.mark.soak
-async def test_what_is_folded_beside_many_rebuilds_is_in_the_tables(
+async def test_events_folded_beside_many_rebuilds_are_in_the_tables(
     database_url: str, tmp_path: Path, in_turn: bool
 ) -> None:
-    await beside(database_url, tmp_path, rebuilds=8 if in_turn else 50)
+    await fold_beside(database_url, tmp_path, rebuilds=8 if in_turn else 50)
 
 
-async def beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
+async def fold_beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
     await store(database_url, [*TYPES, *(each for number in range(1, 30) for each in picking(number).records)])
     over = asyncio.Event()
     seen: list[tuple[int, ...]] = []
@@ -198,7 +198,8 @@ async def beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
         await projector.open()
         number = 30
         while not over.is_set():
-            # In pieces, so that an episode is switched in its middle; a type that is new while tables are made.
+            # Record in pieces, so that an episode is switched in its middle, with a type that is declared during the
+            # rebuild.
             records = whispering(number) if number == 40 else picking(number).records
             for place in range(0, len(records), 4):
                 assert await log.append(records[place : place + 4]) == {}
@@ -235,20 +236,20 @@ async def beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
     assert traces(database_url) == []
 
 
-async def test_what_is_shown_while_the_new_tables_are_put_in_place_is_in_them(
+async def test_events_folded_while_the_new_tables_are_published_are_in_them(
     database_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     projector = Projector(log)
     await projector.open()
-    # As many episodes as are looked up at once, and some more, of one event each.
+    # A few more episodes of one event each than one lookup takes.
     monkeypatch.setattr(steps, "_LATE_EVENTS_MAX", 10)
     original, done = Rebuild._show_if_complete, 0
 
-    async def late(self: Rebuild) -> bool:
+    async def fold_late(self: Rebuild) -> bool:
         nonlocal done
-        if done < 3:  # after the last look, before everybody is stopped
+        if done < 3:  # after the last lookup, before the other processes are stopped
             first = 100 * done
             done += 1
             count = (13, 11, 3)[done - 1]
@@ -257,13 +258,13 @@ async def test_what_is_shown_while_the_new_tables_are_put_in_place_is_in_them(
             await projector.catch_up()
         return await original(self)
 
-    monkeypatch.setattr(Rebuild, "_show_if_complete", late)
+    monkeypatch.setattr(Rebuild, "_show_if_complete", fold_late)
     await rebuild_memory(database_url)
     assert done == 3
     assert ask(database_url, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
     assert ask(database_url, "SELECT count(*) FROM process_metadata") == [(1 + 13 + 11 + 3,)]
     assert differences(tables_of(database_url), await folded_elsewhere(database_url, tmp_path)) == []
-    # And who folded before goes on in the new ones.
+    # A process that folded before continues in the new tables.
     assert await log.append(picking(999).records) == {}
     await projector.catch_up()
     assert ask(database_url, "SELECT count(*) FROM process_metadata") == [(29,)]
@@ -271,10 +272,10 @@ async def test_what_is_shown_while_the_new_tables_are_put_in_place_is_in_them(
 
 
 class EndedError(Exception):
-    """Whatever may end it."""
+    """Raised in place of whatever may end the rebuild."""
 
 
-async def test_interrupted_it_is_taken_up_where_it_was(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 40)
     await store(database_url, [*TYPES, *(each for number in range(1, 21) for each in picking(number).records)])
     before = tables_of(database_url)
@@ -286,19 +287,19 @@ async def test_interrupted_it_is_taken_up_where_it_was(database_url: str, monkey
     with pytest.raises(EndedError):
         await rebuild_memory(database_url, report_progress=interrupted)
     assert differences(before, tables_of(database_url)) == []
-    told: list[int] = []
-    done = await rebuild_memory(database_url, report_progress=lambda _what, done, _total: told.append(done))
-    assert told[0] > 150
+    progress: list[int] = []
+    done = await rebuild_memory(database_url, report_progress=lambda _what, done, _total: progress.append(done))
+    assert progress[0] > 150
     assert done.generation == 2
     assert differences(before, tables_of(database_url)) == []
     assert traces(database_url) == []
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_however_small_its_batches_are_it_makes_the_same(
+async def test_the_size_of_batches_does_not_change_the_tables(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    await some_of_everything(database_url, tmp_path / "spool")
+    await every_kind_of_episode(database_url, tmp_path / "spool")
     before, stopped = tables_of(database_url), ask(database_url, STOPPED)
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 7)
     done = await rebuild_memory(database_url)
@@ -309,7 +310,7 @@ async def test_however_small_its_batches_are_it_makes_the_same(
 
 @pytest.mark.soak_on("postgresql")
 async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an episode that is longer than a batch the next one begins where that ends which is being written."""
+    """The next batch of an episode longer than one batch begins where the batch that is being written ends."""
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 10)
     await store(database_url, [*TYPES, *picking(1, nodes=100).records, *picking(2).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
@@ -324,11 +325,11 @@ async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.M
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_cancelled_at_any_moment_it_is_taken_up_where_it_was(
+async def test_a_rebuild_cancelled_at_any_moment_is_continued(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 9)
-    await some_of_everything(database_url, tmp_path / "spool")
+    await every_kind_of_episode(database_url, tmp_path / "spool")
     before, stopped = tables_of(database_url), ask(database_url, STOPPED)
     moments = random.Random(1)
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
@@ -355,7 +356,7 @@ async def test_cancelled_at_any_moment_it_is_taken_up_where_it_was(
 # --- bad input ------------------------------------------------------------------------------------------------------
 
 
-async def test_only_one_rebuilds_at_a_time(database_url: str) -> None:
+async def test_only_one_process_rebuilds_at_a_time(database_url: str) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     async with claimed(log):
@@ -365,7 +366,7 @@ async def test_only_one_rebuilds_at_a_time(database_url: str) -> None:
     assert (await rebuild_memory(database_url)).generation == 2
 
 
-async def test_tables_of_a_newer_version_are_left_alone(database_url: str) -> None:
+async def test_tables_of_a_newer_version_are_refused_unchanged(database_url: str) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
     at = "memory_tables." if database_url.startswith("postgresql:") else ""
     ask_to_change(database_url, f"UPDATE {at}pycrorm_generation SET version = 999, layout = '[]'")
@@ -386,7 +387,7 @@ async def test_tables_of_an_older_version_are_replaced(database_url: str) -> Non
     assert traces(database_url) == []
 
 
-async def test_what_is_no_memory_is_left_as_it_is(tmp_path: Path, server: Server) -> None:
+async def test_a_database_without_a_memory_is_left_unchanged(tmp_path: Path, server: Server) -> None:
     with pytest.raises(DatabaseUnavailable, match=r"none\.db does not exist"):
         await rebuild_memory(f"sqlite:///{tmp_path}/none.db")
     assert list(tmp_path.iterdir()) == []
@@ -399,7 +400,7 @@ async def test_what_is_no_memory_is_left_as_it_is(tmp_path: Path, server: Server
         await rebuild_memory(server.new_database())
 
 
-async def test_an_event_that_is_gone_from_the_log_is_damage_and_ends_it(tmp_path: Path) -> None:
+async def test_an_event_missing_from_the_log_is_damage_and_ends_the_rebuild(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     await store(url, [*TYPES, *picking(1).records, *picking(2).records])
     before = tables_of(url)
@@ -410,10 +411,10 @@ async def test_an_event_that_is_gone_from_the_log_is_damage_and_ends_it(tmp_path
     assert differences(before, tables_of(url)) == []
 
 
-# --- what only PostgreSQL knows -------------------------------------------------------------------------------------
+# --- PostgreSQL alone -------------------------------------------------------------------------------------------------
 
 
-async def test_a_reader_in_a_transaction_goes_on_and_the_next_rebuild_drops_what_it_reads(server: Server) -> None:
+async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_its_tables(server: Server) -> None:
     url = server.new_database()
     await store(url, [*TYPES, *picking(1).records])
     before = tables_of(url)
@@ -429,7 +430,7 @@ async def test_a_reader_in_a_transaction_goes_on_and_the_next_rebuild_drops_what
     assert traces(url) == []
 
 
-async def test_a_view_of_somebody_on_ours_keeps_what_it_stands_on_and_that_is_told(server: Server) -> None:
+async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: Server) -> None:
     url = server.new_database()
     await store(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE VIEW public.mine AS SELECT id FROM memory.pick_up_action")
@@ -441,7 +442,7 @@ async def test_a_view_of_somebody_on_ours_keeps_what_it_stands_on_and_that_is_to
     assert traces(url) == []
 
 
-async def test_a_table_of_somebody_in_the_schema_of_the_views_is_one_line_and_stays(server: Server) -> None:
+async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_line_and_stays(server: Server) -> None:
     url = server.new_database()
     await store(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE TABLE memory.mine (a int)")
@@ -457,8 +458,8 @@ async def test_a_table_of_somebody_in_the_schema_of_the_views_is_one_line_and_st
     assert traces(url) == []
 
 
-async def test_a_batch_gives_way_to_others_also_when_all_its_episodes_are_short() -> None:
-    class Nothing:
+async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short() -> None:
+    class NothingToDo:
         def fold(self, event: StoredEvent) -> None: ...
 
         async def ready(self, engine: AsyncEngine, generation: int) -> None: ...
@@ -475,7 +476,7 @@ async def test_a_batch_gives_way_to_others_also_when_all_its_episodes_are_short(
             await asyncio.sleep(0)
 
     task = asyncio.create_task(other())
-    far, _ = await _fold_all([Span(number, 0, 20) for number in range(1, 101)], events, Nothing())
+    far, _ = await _fold_all([Span(number, 0, 20) for number in range(1, 101)], events, NothingToDo())
     task.cancel()
     assert far == [(number, 0, 20) for number in range(1, 101)]
     assert turns >= 10

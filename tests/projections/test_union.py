@@ -1,4 +1,4 @@
-"""Declarations of one type unite; what contradicts is refused whole, and nothing else."""
+"""Unite declarations of one type; a contradicting declaration is refused whole, and nothing else."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_field_added_later_joins_the_earlier_ones() -> None:
     assert (united.accepted, united.refused) == ({name_of(TEXT): TEXT, name_of(ENUM): ENUM}, {})
 
 
-def test_a_declaration_that_contradicts_is_refused_with_all_its_fields() -> None:
+def test_a_contradicting_declaration_is_refused_with_all_its_fields() -> None:
     united = unite(Layout(), bytes_of(TEXT, NUMBER))
     assert united.layout.leaves == {"note_action": {"text": "text"}}
     assert united.accepted == {name_of(TEXT): TEXT}
@@ -36,7 +36,7 @@ def test_a_declaration_that_contradicts_is_refused_with_all_its_fields() -> None
     }
 
 
-def test_what_was_accepted_once_is_accepted_again_and_what_was_refused_is_refused_again() -> None:
+def test_accepted_declarations_stay_accepted_and_refused_ones_stay_refused() -> None:
     payloads = bytes_of(TEXT, NUMBER, ENUM)
     united = unite(Layout(), payloads)
     assert set(united.refused) == {name_of(NUMBER)}

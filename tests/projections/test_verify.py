@@ -1,4 +1,4 @@
-"""Verify finds every change of every table and nothing else, whatever the log and the parts it is read in."""
+"""Verify finds every change of every table and nothing else, whatever the log and the size of its parts."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from tests.projections.verify_cases import (
     TYPES,
     another,
     assert_clean,
-    at_once,
     delete,
     event_of,
     findings,
     fold_in_batches,
     full,
+    in_own_loop,
     in_parts,
     insert,
     look,
@@ -43,46 +43,46 @@ from tests.projections.verify_cases import (
     rows_of,
     running,
     set_columns,
-    shown,
+    visible_tables,
 )
 from tests.promises.test_random_plans import play
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 
 @pytest.fixture
 async def log(database_url: str) -> AsyncIterator[EventLog]:
-    """On each kind of database, with episodes of every kind of end; the third is only thought through."""
-    made = await opened(database_url)
+    """Open a log on each kind of database, with episodes of every kind of end; the third is a simulation."""
+    log_of_episodes = await opened(database_url)
     scripts = [full(1), full(2), full(3, simulated=True), lost(4), running(5), parked(6), full(7)]
-    await fold_in_batches(made, scripts, 10_000)
-    yield made
-    await made.close()
+    await fold_in_batches(log_of_episodes, scripts, 10_000)
+    yield log_of_episodes
+    await log_of_episodes.close()
 
 
-# --- nothing is found where nothing is -----------------------------------------------------------------------------
+# --- no differences ---------------------------------------------------------------------------------------------------
 
 
-async def test_random_plans_with_failures_are_as_they_should_be(
+async def test_verify_finds_nothing_in_random_plans_with_failures(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         for seed in range(25):
             await play(seed, memory)
     log = await opened(database_url)
-    found = await look(log)
-    assert_clean(found)
-    assert (found.episodes, found.behind) == (25, 0)
-    assert found.events == ask(database_url, "SELECT count(*) FROM event")[0][0]
-    assert found.rows == sum(len(rows_of(database_url, table)) for table in shown(database_url))
+    result = await look(log)
+    assert_clean(result)
+    assert (result.episodes, result.behind) == (25, 0)
+    assert result.events == ask(database_url, "SELECT count(*) FROM event")[0][0]
+    assert result.rows == sum(len(rows_of(database_url, table)) for table in visible_tables(database_url))
     for events in (60, 400):
-        assert findings(await in_parts(log, events, monkeypatch)) == findings(found)
+        assert findings(await in_parts(log, events, monkeypatch)) == findings(result)
     await log.close()
 
 
 @pytest.mark.parametrize("batch", [1, 3])
-async def test_batches_that_part_starts_from_ends_are_as_they_should_be(
+async def test_verify_finds_nothing_in_batches_that_separate_starts_from_ends(
     database_url: str, batch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = await opened(database_url)
@@ -92,23 +92,23 @@ async def test_batches_that_part_starts_from_ends_are_as_they_should_be(
     await log.close()
 
 
-async def test_what_the_tables_do_not_show_yet_is_no_fault(log: EventLog, database_url: str) -> None:
-    found = await look(log)
-    assert_clean(found)
+async def test_unfolded_events_are_no_fault(log: EventLog, database_url: str) -> None:
+    result = await look(log)
+    assert_clean(result)
     head = len(full(1).records)
-    assert (found.episodes, found.behind, found.remarks) == (7, head - 10, 0)
+    assert (result.episodes, result.behind, result.remarks) == (7, head - 10, 0)
     await log.append(full(5).records)
     assert_clean(await look(log))
     assert (await look(log)).behind == 2 * head - 26
     assert_clean(await look(log, episode=5))
     assert (await look(log, episode=5)).behind == head - 16
     assert (await look(log, episode=3)).rows == sum(
-        event_of(table, row)[0] == 3 for table in shown(database_url) for row in rows_of(database_url, table)
+        event_of(table, row)[0] == 3 for table in visible_tables(database_url) for row in rows_of(database_url, table)
     )
 
 
 @pytest.mark.parametrize("events", [7, 25])
-async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault(
+async def test_a_fold_between_two_parts_is_no_fault(
     database_url: str, events: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = await opened(database_url)
@@ -126,11 +126,12 @@ async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault
         await other.close()
 
     while (await log.behind()) and looks < 50:
-        # Some is folded in the first parts of each look: the tables are behind what is read, or ahead of it.
+        # Fold some events during the first parts of each look, so that the tables are behind what is read, or ahead of
+        # it.
         left = iter([*range(3)])
         assert_clean(
             await verify(
-                log, report_progress=lambda *_, left=left: at_once(fold) if next(left, None) is not None else None
+                log, report_progress=lambda *_, left=left: in_own_loop(fold) if next(left, None) is not None else None
             )
         )
         looks += 1
@@ -139,25 +140,25 @@ async def test_tables_that_are_brought_up_to_date_between_two_parts_are_no_fault
     await log.close()
 
 
-async def test_tables_that_are_made_anew_between_two_parts_are_no_fault(
+async def test_a_rebuild_between_two_parts_is_no_fault(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parts, "_PART_EVENTS", 10)
-    told = 0
+    event = 0
 
     async def rebuild() -> None:
         other = await opened(database_url)
         await rebuilt(other)
         await other.close()
 
-    def tell(_done: int, _total: int) -> None:
-        nonlocal told
-        told += 1
-        if told in (2, 5, 6):
-            at_once(rebuild)
+    def record_once(_done: int, _total: int) -> None:
+        nonlocal event
+        event += 1
+        if event in (2, 5, 6):
+            in_own_loop(rebuild)
 
-    assert_clean(await verify(log, report_progress=tell))
-    assert {table.physical.rpartition("__")[2].strip('"') for table in shown(database_url)} == {"4"}
+    assert_clean(await verify(log, report_progress=record_once))
+    assert {table.physical.rpartition("__")[2].strip('"') for table in visible_tables(database_url)} == {"4"}
 
 
 async def test_an_episode_that_grows_between_two_parts_is_no_fault(
@@ -178,23 +179,23 @@ async def test_an_episode_that_grows_between_two_parts_is_no_fault(
         await projector.catch_up()
         await other.close()
 
-    def tell(_done: int, _total: int) -> None:
+    def record_once(_done: int, _total: int) -> None:
         nonlocal stored
-        at_once(record)
+        in_own_loop(record)
         stored += 6
 
-    found = await verify(log, report_progress=tell)
-    assert_clean(found)
-    assert (found.events, found.behind) == (len(whole.records), 0)
+    result = await verify(log, report_progress=record_once)
+    assert_clean(result)
+    assert (result.events, result.behind) == (len(whole.records), 0)
     await log.close()
 
 
-# --- every change is found -----------------------------------------------------------------------------------------
+# --- every change -----------------------------------------------------------------------------------------------------
 
 
-async def test_every_value_that_was_changed_is_told_and_nothing_else(log: EventLog, database_url: str) -> None:
+async def test_every_changed_value_is_reported_and_nothing_else(log: EventLog, database_url: str) -> None:
     filled = 0
-    for table in shown(database_url):
+    for table in visible_tables(database_url):
         rows = rows_of(database_url, table)
         if not rows:
             continue
@@ -204,21 +205,19 @@ async def test_every_value_that_was_changed_is_told_and_nothing_else(log: EventL
         if not values:
             continue
         set_columns(database_url, table, row, values)
-        found = await look(log)
+        result = await look(log)
         number, sequence = event_of(table, row)
-        assert found.differences == [
+        assert result.differences == [
             Difference(number, sequence, table.name, column, value, row[column]) for column, value in values.items()
         ]
-        assert (found.drift, found.damage) == (len(values), 0)
+        assert (result.drift, result.damage) == (len(values), 0)
         set_columns(database_url, table, row, {each: row[each] for each in values})
     assert filled == 17
     assert_clean(await look(log))
 
 
-async def test_a_single_value_is_enough_also_null_for_something_and_something_for_null(
-    log: EventLog, database_url: str
-) -> None:
-    for number_of_table, table in enumerate(shown(database_url)):
+async def test_a_single_changed_value_is_reported_including_from_and_to_null(log: EventLog, database_url: str) -> None:
+    for number_of_table, table in enumerate(visible_tables(database_url)):
         for row in rows_of(database_url, table)[:1]:
             for column in table.columns[number_of_table % 3 :: 3]:  # each kind of column in some table
                 if column in table.key:
@@ -232,8 +231,8 @@ async def test_a_single_value_is_enough_also_null_for_something_and_something_fo
     assert_clean(await look(log))
 
 
-async def test_a_row_that_was_deleted_is_told(log: EventLog, database_url: str) -> None:
-    for table in shown(database_url):
+async def test_a_deleted_row_is_reported(log: EventLog, database_url: str) -> None:
+    for table in visible_tables(database_url):
         for row in rows_of(database_url, table)[-1:]:
             delete(database_url, table, row)
             number, sequence = event_of(table, row)
@@ -248,11 +247,11 @@ async def test_a_row_that_was_deleted_is_told(log: EventLog, database_url: str) 
     [(1, 999), (6, 11), (8, 1), (2**22 - 1, 5), (0, 0), (0, 7), (2**22, 1), (-1, 3)],
     ids=["after its last event", "parked", "later", "last", "zero", "of nobody", "too large", "negative"],
 )
-async def test_a_row_that_no_event_makes_is_told_wherever_it_is(
+async def test_a_row_without_an_event_is_reported_in_every_table(
     log: EventLog, database_url: str, number: int, sequence: int
 ) -> None:
     expected = []
-    for table in shown(database_url):
+    for table in visible_tables(database_url):
         added: dict[str, Any] = dict.fromkeys(table.columns)
         added |= {each: "x" if "text" in table.kinds[each] else 0 for each in table.key}
         of_episode = table.name in ("process_metadata", "simulated_episode")
@@ -260,17 +259,17 @@ async def test_a_row_that_no_event_makes_is_told_wherever_it_is(
             continue
         added["id" if "id" in table.key else table.key[0]] = number if of_episode else number * 2**31 + sequence * 32
         insert(database_url, table, added)
-        told = (number, 1) if of_episode else (number, sequence)
-        expected.append(Difference(*told, table.name, None, tuple(added[each] for each in table.columns), None))
-    found = await look(log)
-    assert sorted(found.differences, key=repr) == sorted(expected, key=repr)
-    assert found.drift == len(expected) > 30
+        event = (number, 1) if of_episode else (number, sequence)
+        expected.append(Difference(*event, table.name, None, tuple(added[each] for each in table.columns), None))
+    result = await look(log)
+    assert sorted(result.differences, key=repr) == sorted(expected, key=repr)
+    assert result.drift == len(expected) > 30
     if number in (1, 6):
         assert (await look(log, episode=number)).drift == len(expected)
     assert (await look(log, episode=7)).drift == 0
 
 
-async def test_a_key_that_was_changed_is_a_row_that_lacks_and_one_too_many(log: EventLog, database_url: str) -> None:
+async def test_a_changed_key_is_reported_as_a_missing_row_and_a_surplus_one(log: EventLog, database_url: str) -> None:
     ask_to_change(
         database_url,
         f"UPDATE {named(database_url, 'joint_change')} SET joint = 'neck' WHERE id = 2147484000 AND joint = 'head'",
@@ -282,12 +281,12 @@ async def test_a_key_that_was_changed_is_a_row_that_lacks_and_one_too_many(log: 
 
 
 @pytest.mark.parametrize("events", [1, 7, 20])
-async def test_an_episode_in_many_parts_gives_what_it_gives_in_one(
+async def test_an_episode_read_in_many_parts_gives_the_same_findings_as_in_one(
     database_url: str, events: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = await opened(database_url)
     await fold_in_batches(log, [full(1), lost(2), full(3, simulated=True)], 10_000)
-    for place, table in enumerate(shown(database_url)):
+    for place, table in enumerate(visible_tables(database_url)):
         rows = rows_of(database_url, table)
         if table.name == "simulated_episode" or not rows:
             continue
@@ -295,13 +294,13 @@ async def test_an_episode_in_many_parts_gives_what_it_gives_in_one(
         changed = rows[(place + 1) % len(rows)]
         column = next(each for each in table.columns[1:] if each not in table.key)
         set_columns(database_url, table, changed, {column: another(changed[column], table.kinds[column])})
-    found = await look(log)
-    assert 20 < found.drift < 100
-    assert findings(await in_parts(log, events, monkeypatch)) == findings(found)
+    result = await look(log)
+    assert 20 < result.drift < 100
+    assert findings(await in_parts(log, events, monkeypatch)) == findings(result)
     await log.close()
 
 
-async def test_a_table_that_is_gone_is_told_in_a_line(log: EventLog, database_url: str) -> None:
+async def test_a_missing_table_is_reported_in_one_line(log: EventLog, database_url: str) -> None:
     ask_to_change(
         database_url,
         f"DROP TABLE {named(database_url, 'object_removal')} {'CASCADE' * database_url.startswith('postgresql:')}",
@@ -310,18 +309,18 @@ async def test_a_table_that_is_gone_is_told_in_a_line(log: EventLog, database_ur
         await look(log)
 
 
-# --- beside everything else ----------------------------------------------------------------------------------------
+# --- concurrency ------------------------------------------------------------------------------------------------------
 
 
-async def test_while_robots_record_and_tables_are_folded_and_made_anew_nothing_false_is_found(
+async def test_verify_finds_nothing_false_while_robots_record_and_tables_are_folded_and_rebuilt(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parts, "_PART_EVENTS", 60)
     done = asyncio.Event()
 
-    async def again_and_again(step: Callable[[], Awaitable[object]]) -> None:
+    async def fold_and_rebuild(step: Callable[[], Awaitable[object]]) -> None:
         while not done.is_set():
-            with contextlib.suppress(DatabaseUnavailable):  # others write: it is tried again, as everywhere
+            with contextlib.suppress(DatabaseUnavailable):  # other processes write, so that it is retried as everywhere
                 await step()
             await asyncio.sleep(0.05)
 
@@ -337,9 +336,9 @@ async def test_while_robots_record_and_tables_are_folded_and_made_anew_nothing_f
 
     batch: list[Record] = []
     reader = await EventLog.open(log.address, create=False)
-    async with asyncio.TaskGroup() as beside:
+    async with asyncio.TaskGroup() as tasks:
         for step in (record, projector.fold_next_batch, lambda: rebuilt(other)):
-            beside.create_task(again_and_again(step))
+            tasks.create_task(fold_and_rebuild(step))
         for _ in range(3):
             assert_clean(await look(reader))
         done.set()
@@ -348,13 +347,13 @@ async def test_while_robots_record_and_tables_are_folded_and_made_anew_nothing_f
     assert_clean(await look(log))
 
 
-async def test_an_end_that_was_lost_is_seen_in_the_tables_and_in_the_log(log: EventLog) -> None:
+async def test_a_lost_end_is_reported_in_the_tables_and_in_the_log(log: EventLog) -> None:
     script = Script(8)
     script.put(NodeStarted("root"))
     script.put(EpisodeEnded("SUCCEEDED"))
     await log.append(script.records)
-    found = await look(log)
-    assert [str(each) for each in found.damages] == [
+    result = await look(log)
+    assert [str(each) for each in result.damages] == [
         "episode 8, event 1: the episode has not started",
         "episode 8, event 2: the episode has not started",
     ]

@@ -1,4 +1,4 @@
-"""Memories to verify, what is changed in them by plain SQL, and a look at them in a thread of its own."""
+"""Memories to verify, changes of their tables by plain SQL, and a verification in a thread of its own."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ TYPES = declarations(NAVIGATE, PICK_UP, EVERY)
 
 
 def full(number: int, *, simulated: bool = False, rounds: int = 1) -> Script:
-    """Everything that can happen, so that every core table has rows; it ends well."""
+    """Return an episode with every kind of event, so that every core table has rows; it succeeds."""
     script = Script(number)
     put = script.put
     thought_by = NodeReference("00000000-0000-7000-8000-000000000001", 2) if simulated else None
@@ -95,8 +95,8 @@ def _round(script: Script, root: int, robot: int, *, simulated: bool) -> None:
         SeenValue("jug?", "JUG", pose(3), confidence=0.25, source="stereo"),
     )
     put(ObjectDetected("camera", "MILK", seen, root))
-    given = {"object_designator": it, "arm": "LEFT", "grasp": "TOP"}
-    pick = put(NodeStarted("action", root, name_of(PICK_UP), given, state, simulated=simulated))
+    parameters = {"object_designator": it, "arm": "LEFT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", root, name_of(PICK_UP), parameters, state, simulated=simulated))
     put(JointsMoved(ObjectReference(robot, moved), {"torso": 0.2, "head": -0.5}, pick))
     put(StateSampled(ObjectReference(robot, moved), {"base.x": 0.1, "torso": 0.2}, pick))
     put(ObjectAttached(ObjectReference(robot, moved), it, "tool", pick))
@@ -119,7 +119,7 @@ def _round(script: Script, root: int, robot: int, *, simulated: bool) -> None:
 
 
 def lost(number: int) -> Script:
-    """The same until a machine lost its power in the middle; recovery has ended it."""
+    """Return the same episode up to a power cut in the middle; recovery has ended it."""
     script = Script(number)
     script.records = full(number).records[:15]
     script.put_payload(EpisodeEnded.__name__, LOST)
@@ -127,32 +127,32 @@ def lost(number: int) -> Script:
 
 
 def running(number: int) -> Script:
-    """The same, and it goes on."""
+    """Return the same episode, still running."""
     script = Script(number)
     script.records = full(number).records[:16]
     return script
 
 
 def parked(number: int) -> Script:
-    """What a newer version of this program has recorded."""
+    """Return an episode recorded by a newer version of the program."""
     script = full(number)
     script.records[10] = script.records[10]._replace(type="RobotDanced", payload=b"{}")
     return script
 
 
-# --- looking ----------------------------------------------------------------------------------------------------
+# --- verification -----------------------------------------------------------------------------------------------------
 
 
 async def look(log: EventLog, *, episode: int | None = None) -> VerifyResult:
-    """At all of it, or at one episode."""
+    """Verify everything, or one episode."""
     rows = {each.number: each for each in await log.episodes()}
     return await verify(log, episode=None if episode is None else rows[episode])
 
 
-def findings(found: VerifyResult) -> tuple[Any, ...]:
-    """In an order that does not depend on the parts in which the log was read."""
-    whole = replace(found, damages=[], differences=[])
-    return (whole, sorted(found.damages, key=repr), sorted(found.differences, key=repr))
+def findings(result: VerifyResult) -> tuple[Any, ...]:
+    """Sort the findings, so that they do not depend on the parts in which the log was read."""
+    whole = replace(result, damages=[], differences=[])
+    return (whole, sorted(result.damages, key=repr), sorted(result.differences, key=repr))
 
 
 async def in_parts(log: EventLog, events: int, monkeypatch: pytest.MonkeyPatch) -> VerifyResult:
@@ -161,13 +161,13 @@ async def in_parts(log: EventLog, events: int, monkeypatch: pytest.MonkeyPatch) 
         return await look(log)
 
 
-def assert_clean(found: VerifyResult) -> None:
-    assert (found.damages, found.differences) == ([], [])
-    assert (found.damage, found.drift) == (0, 0)
+def assert_clean(result: VerifyResult) -> None:
+    assert (result.damages, result.differences) == ([], [])
+    assert (result.damage, result.drift) == (0, 0)
 
 
-def at_once(call: Callable[[], Awaitable[None]]) -> None:
-    """In a thread and a loop of its own, from where nothing can be awaited."""
+def in_own_loop(call: Callable[[], Awaitable[None]]) -> None:
+    """Run it in a thread with a loop of its own, because Hypothesis cannot await."""
     faults: list[BaseException] = []
 
     async def awaited() -> None:
@@ -200,17 +200,17 @@ async def opened(url: str) -> EventLog:
 
 
 async def fold_in_batches(log: EventLog, scripts: Sequence[Script], events: int) -> None:
-    """Stored at once, and folded so many events at a time."""
+    """Store them at once, and fold this many events at a time."""
     projector = Projector(log, batch_events=events)
     await projector.open()
     await log.append([*TYPES, *(each for script in scripts for each in script.records)])
     await projector.catch_up()
 
 
-# --- changing ---------------------------------------------------------------------------------------------------
+# --- changes ----------------------------------------------------------------------------------------------------------
 
 
-class Shown(NamedTuple):
+class VisibleTable(NamedTuple):
     """A table as it is in the database."""
 
     name: str
@@ -220,8 +220,8 @@ class Shown(NamedTuple):
     kinds: dict[str, str]
 
 
-def shown(url: str) -> list[Shown]:
-    """Every table that people see, asked of the database itself."""
+def visible_tables(url: str) -> list[VisibleTable]:
+    """Return every table that readers see, queried from the database itself."""
     on_server = url.startswith("postgresql:")
     schema = "memory_tables." if on_server else ""
     if on_server:
@@ -241,12 +241,12 @@ def shown(url: str) -> list[Shown]:
             "SELECT each.name, part.name, part.type, part.pk > 0 FROM sqlite_master AS each"
             " JOIN pragma_table_info(each.name) AS part WHERE each.type = 'table' ORDER BY each.name, part.cid",
         )
-    tables: dict[str, Shown] = {}
+    tables: dict[str, VisibleTable] = {}
     for physical, column, kind, is_key in listed:
         name, mark, generation = physical.rpartition("__")
         if not mark or generation != str(number) or name.startswith("pycrorm_"):
             continue
-        table = tables.setdefault(name, Shown(name, f'{schema}"{physical}"', [], [], {}))
+        table = tables.setdefault(name, VisibleTable(name, f'{schema}"{physical}"', [], [], {}))
         table.columns.append(column)
         table.kinds[column] = kind.lower()
         if is_key:
@@ -255,12 +255,12 @@ def shown(url: str) -> list[Shown]:
 
 
 def named(url: str, table: str) -> str:
-    """The table that people see under this name, in SQL."""
-    return next(each.physical for each in shown(url) if each.name == table)
+    """Return the table behind this visible name in SQL."""
+    return next(each.physical for each in visible_tables(url) if each.name == table)
 
 
 def literal(value: Any, kind: str) -> str:
-    """As SQL text."""
+    """Return the value as SQL text."""
     if value is None:
         return "NULL"
     if kind == "boolean":
@@ -271,7 +271,7 @@ def literal(value: Any, kind: str) -> str:
 
 
 def another(value: Any, kind: str) -> Any:
-    """A value that the column could have too."""
+    """Return another value that the column could have."""
     if kind == "boolean":
         return not value
     if kind == "text":
@@ -279,35 +279,35 @@ def another(value: Any, kind: str) -> Any:
     return (value or 0) + (0.5 if "double" in kind else 1)
 
 
-def where(table: Shown, row: dict[str, Any]) -> str:
+def where(table: VisibleTable, row: dict[str, Any]) -> str:
     return " AND ".join(f'"{each}" = {literal(row[each], table.kinds[each])}' for each in table.key)
 
 
-def rows_of(url: str, table: Shown) -> list[dict[str, Any]]:
+def rows_of(url: str, table: VisibleTable) -> list[dict[str, Any]]:
     listed = ", ".join(f'"{each}"' for each in table.columns)
     order = ", ".join(f'"{each}"' for each in table.key)
-    found = ask(url, f"SELECT {listed} FROM {table.physical} ORDER BY {order}")
-    return [dict(zip(table.columns, row, strict=True)) for row in found]
+    result = ask(url, f"SELECT {listed} FROM {table.physical} ORDER BY {order}")
+    return [dict(zip(table.columns, row, strict=True)) for row in result]
 
 
-def event_of(table: Shown, row: dict[str, Any]) -> tuple[int, int]:
-    """Episode and event that a row says it is of: 22 bits, 26 bits, 5 bits."""
+def event_of(table: VisibleTable, row: dict[str, Any]) -> tuple[int, int]:
+    """Return the episode and event in the key of a row: 22 bits, 26 bits, 5 bits of slot."""
     key = row[table.key[0]] if "id" not in table.key else row["id"]
     if table.name in ("process_metadata", "simulated_episode"):
         return key, 1
     return key // 2**31, key // 2**5 % 2**26
 
 
-def insert(url: str, table: Shown, row: dict[str, Any]) -> None:
+def insert(url: str, table: VisibleTable, row: dict[str, Any]) -> None:
     names = ", ".join(f'"{each}"' for each in table.columns)
     values = ", ".join(literal(row[each], table.kinds[each]) for each in table.columns)
     ask_to_change(url, f"INSERT INTO {table.physical} ({names}) VALUES ({values})")
 
 
-def set_columns(url: str, table: Shown, row: dict[str, Any], values: dict[str, Any]) -> None:
+def set_columns(url: str, table: VisibleTable, row: dict[str, Any], values: dict[str, Any]) -> None:
     changes = ", ".join(f'"{each}" = {literal(value, table.kinds[each])}' for each, value in values.items())
     ask_to_change(url, f"UPDATE {table.physical} SET {changes} WHERE {where(table, row)}")
 
 
-def delete(url: str, table: Shown, row: dict[str, Any]) -> None:
+def delete(url: str, table: VisibleTable, row: dict[str, Any]) -> None:
     ask_to_change(url, f"DELETE FROM {table.physical} WHERE {where(table, row)}")

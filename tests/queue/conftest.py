@@ -1,4 +1,4 @@
-"""One small live queue for a test, let go of afterwards."""
+"""Provide one small live queue to a test, released afterwards."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +16,6 @@ def spool(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def queue(spool: Path) -> Iterator[RecorderQueue]:
-    made = make(spool)
-    yield made
-    made.release()
+    queue = make(spool)
+    yield queue
+    queue.release()

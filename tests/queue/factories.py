@@ -1,4 +1,4 @@
-"""What the tests of the queue write with: names, a clock that stands still, small files, and what a crash leaves."""
+"""Factories for the tests of the queue: ids, headings, records, a frozen clock, small files, and crashed folders."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ RECORDER = episode_id(1_700_000_000_000_000_000, b"recorder..")
 
 
 def episode(number: int) -> EpisodeId:
-    """The n-th episode's id; ids sort by number."""
+    """Return the n-th episode's id; ids sort by number."""
     return episode_id(1_700_000_000_000_000_000 + number * 1_000_000, b"an episode")
 
 
@@ -52,12 +52,12 @@ DECLARED = Heading(None, "DesignatorTypeDeclared", 1)
 
 
 def record(position: int, heading: Heading, sequence: int, payload: bytes) -> Record:
-    """The record that a queue with the clock that stands still makes of a heading."""
+    """Return the record that a queue with the frozen clock makes of a heading."""
     return Record(position, heading.episode, sequence, *heading[1:], WALL_NS, MONOTONIC_NS, payload)
 
 
 def lost(position: int, number: int, sequence: int) -> Record:
-    """The computed end of an episode."""
+    """Return the computed end of an episode."""
     return record(position, ended(number), sequence, b'{"status":"LOST"}')
 
 
@@ -65,18 +65,18 @@ def make(spool: Path, *, settings: Settings = SMALL, clock: Clock = STILL, offer
     return RecorderQueue.create(spool, settings=settings, clock=clock, recorder=RECORDER, offered=offered)
 
 
-def as_left_by_a_kill(queue: RecorderQueue, spool: Path) -> Path:
-    """The folder as `kill -9` would leave it now: its files, unlocked, in another spool."""
+def crashed_copy(queue: RecorderQueue, spool: Path) -> Path:
+    """Copy the folder as `kill -9` would leave it now: its files, unlocked, in another spool."""
     return copy_beside_recording(queue.folder, spool / episode_text(RECORDER))
 
 
 def copy_beside_recording(source: Path, target: Path) -> Path:
-    """Copy a folder of a queue that is at work, without files that its sync thread is making and may rename."""
+    """Copy the folder of a queue that records, without files that its sync thread is preparing and may rename."""
     return Path(shutil.copytree(source, target, ignore=shutil.ignore_patterns(f"*{MAKING}")))
 
 
 async def drain(queue: RecorderQueue | DeadSource | LiveSource, *, events_max: int = 10_000) -> list[Record]:
-    """All that is left, without acknowledging; a live queue must be closed."""
+    """Return all remaining records without acknowledging them; a live queue must be closed."""
     records: list[Record] = []
     while batch := await queue.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0):
         records += batch
@@ -84,7 +84,7 @@ async def drain(queue: RecorderQueue | DeadSource | LiveSource, *, events_max: i
 
 
 async def recover(folder: Path) -> list[Record]:
-    """All that recovery gives, the folder left as it is."""
+    """Return all records that recovery supplies, and leave the folder as it is."""
     recovered = open_dead(folder)
     assert recovered is not None
     try:
@@ -93,11 +93,11 @@ async def recover(folder: Path) -> list[Record]:
         recovered.release()
 
 
-class Author:
-    """Writes a folder step by step, with no thread that syncs: each step of a sync is the test's own.
+class FolderWriter:
+    """Write a recorder's folder step by step without a sync thread: the test calls each step of a sync.
 
-    `records` is what was put, and the declarations that a segment begins with; `places` where each stands: (file,
-    offset, size).
+    `records` is what was put, including the declarations that begin a segment; `places` gives the (file, offset, size)
+    of each.
     """
 
     def __init__(self, spool: Path, *, settings: Settings = SMALL, recorder: EpisodeId = RECORDER) -> None:
@@ -144,12 +144,12 @@ class Author:
 
     @property
     def end(self) -> int:
-        """Where the next frame goes in the last segment."""
+        """The offset of the next frame in the last segment."""
         return self.appender._offset
 
 
 def second_frame(payload: bytes, *, sequence: int = 2, salt: int = salt_of(RECORDER, 1)) -> bytes:
-    """The frame of a node at position 2 of the first segment, as a forger or an elder file would leave it."""
+    """Return the frame of a node at position 2 of the first segment, as a forger or an older file would leave it."""
     return encode(Frame(EVENT, 1, 2, sequence, WALL_NS, 1, episode(1), b"NodeStarted", payload), salt)
 
 

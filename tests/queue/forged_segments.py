@@ -1,4 +1,4 @@
-"""Change a field of a real segment and make every checksum right again, so that what lies behind them is reached."""
+"""Change a field of a real segment and correct every checksum, so that a reader reaches the checks behind them."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from pycrorm_async.queue.files.segment import decode_header, header_bytes, salt_
 __all__ = ["NAMES", "change_a_frame", "change_the_header", "rewritten"]
 
 NAMES = (b"\xff\xfe", b"\xed\xa0\x80", b"Node\0", b"", b"x" * 255, b"\xc3\x84", b"EpisodeEnded", b"EpisodeStarted")
-"""Names of event types: no UTF-8, a lone surrogate, a zero, none at all, unknown ones, those that open and close."""
+"""Names of event types: invalid UTF-8, a lone surrogate, a zero, empty, unknown, and those that open or close an
+episode.
+"""
 _NUMBERS = (0, 1, 2, 2**26, 2**31, 2**62, 2**63 - 1)
 _PAYLOADS = (b"", b"\xff", b"\0", b"null", b"[" * 5000, b'{"type":[]}', b"1e999", b'{"wall_ns":' + b"9" * 400 + b"}")
 
 
 def rewritten(path: Path, frames: list[Frame], start: int, salt: int) -> None:
-    """The segment with these frames, those of commits made to fit the records before them."""
+    """Return the segment with these frames, and with commit frames that match the records before them."""
     unsaid: list[int] = []
     content = path.read_bytes()
     parts = [content[:start]]
@@ -38,7 +40,7 @@ def rewritten(path: Path, frames: list[Frame], start: int, salt: int) -> None:
 
 
 def change_a_frame(path: Path, rng: random.Random, *, fitting: bool = True, name: bytes | None = None) -> int:
-    """Change one record; its position. Without `fitting`, commit frames stay as they were."""
+    """Change one record and return its position. Without `fitting`, commit frames stay as they were."""
     content = path.read_bytes()
     header = decode_header(content)
     assert header is not None
@@ -68,14 +70,14 @@ def change_a_frame(path: Path, rng: random.Random, *, fitting: bool = True, name
 
 
 def change_the_header(path: Path, rng: random.Random) -> None:
-    """Change one field of the header."""
+    """Change one field of the segment header."""
     content = bytearray(path.read_bytes())
     header = decode_header(bytes(content))
     assert header is not None
     end = header_bytes(len(header.open))
-    places = [(16, 16), (32, 8), (40, 8)]  # the recorder, the number, the base
+    places = [(16, 16), (32, 8), (40, 8)]  # the recorder, the segment's number, the base
     if header.open:
-        places += [(56, 16), (72, 8)]  # an open episode, and its sequence
+        places += [(56, 16), (72, 8)]  # an open episode and its sequence
     offset, size = rng.choice(places)
     content[offset : offset + size] = rng.choice((bytes(size), b"\xff" * size, rng.randbytes(size)))
     content[52:56] = crc32(content[:52], crc32(content[56:end])).to_bytes(4, "little")

@@ -1,4 +1,6 @@
-"""The spool remembers how far each episode was stored: what one process noted another reads, whole lines only."""
+"""Checks for the file in the spool that notes how far each episode was stored: other processes read only whole
+lines.
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,12 @@ def read(folder: Path) -> AcknowledgedHeads:
     return heads
 
 
-def test_nothing_is_known_before_anything_was_noted(tmp_path: Path) -> None:
+def test_a_spool_without_notes_has_no_heads(tmp_path: Path) -> None:
     heads = read(tmp_path / "none")
     assert (heads.all, heads.last, heads.number_max, heads.faults) == ({}, None, 0, 0)
 
 
-def test_what_one_process_notes_another_reads_and_the_last_line_counts(tmp_path: Path) -> None:
+def test_one_process_reads_what_another_noted_and_the_last_line_counts(tmp_path: Path) -> None:
     one, other = heads_in(tmp_path), heads_in(tmp_path)
     one.note({episode(1): (7, 100), episode(2): (9, 5)})
     other.refresh()
@@ -42,7 +44,7 @@ def test_what_one_process_notes_another_reads_and_the_last_line_counts(tmp_path:
 
 
 @pytest.mark.parametrize("cut", range(0, 61, 5))
-def test_a_line_that_is_torn_is_left_out_and_the_next_one_counts(tmp_path: Path, cut: int) -> None:
+def test_a_torn_line_is_ignored_and_the_next_one_counts(tmp_path: Path, cut: int) -> None:
     heads_in(tmp_path).note({episode(1): (1, 10)})
     file = tmp_path / "heads"
     whole = file.read_bytes()
@@ -53,7 +55,7 @@ def test_a_line_that_is_torn_is_left_out_and_the_next_one_counts(tmp_path: Path,
     assert (read(tmp_path).last, read(tmp_path).number_max) == ((episode(3), 30), 3)
 
 
-def test_a_line_with_any_one_bit_flipped_is_left_out(tmp_path: Path) -> None:
+def test_a_line_with_any_one_bit_flipped_is_ignored(tmp_path: Path) -> None:
     heads_in(tmp_path).note({episode(1): (1, 10)})
     file = tmp_path / "heads"
     whole = file.read_bytes()
@@ -61,11 +63,11 @@ def test_a_line_with_any_one_bit_flipped_is_left_out(tmp_path: Path) -> None:
         content = bytearray(whole)
         content[bit // 8] ^= 1 << bit % 8
         file.write_bytes(content)
-        known = read(tmp_path).all
-        assert known == {} or {(*each[:2],) for each in known.values()} == {(1, 10)}
+        heads = read(tmp_path).all
+        assert heads == {} or {(*each[:2],) for each in heads.values()} == {(1, 10)}
 
 
-def test_a_large_file_is_compacted_and_no_line_of_another_process_is_lost(
+def test_compacting_a_large_file_loses_no_line_of_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 4_000)
@@ -81,28 +83,28 @@ def test_a_large_file_is_compacted_and_no_line_of_another_process_is_lost(
         each.start()
     for each in threads:
         each.join()
-    known = read(tmp_path)
-    assert {each: known.all[each].head for each in known.all} == {episode(number): 199 for number in (1, 2, 3)}
+    heads = read(tmp_path)
+    assert {each: heads.all[each].head for each in heads.all} == {episode(number): 199 for number in (1, 2, 3)}
     assert (tmp_path / "heads").stat().st_size < 8_000
-    assert known.faults == 0
+    assert heads.faults == 0
 
 
-def test_a_file_with_the_inode_of_the_one_it_replaced_is_read_from_its_beginning(
+def test_a_replacement_with_the_same_inode_is_read_from_its_beginning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mine, other = heads_in(tmp_path), heads_in(tmp_path)
     for head in range(3):
         mine.note({episode(1): (1, head)})
     mine.refresh()
-    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 0)  # each note compacts
+    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 0)  # each note compacts the file
     for number in range(2, 6):
         other.note({episode(number): (number, 1)})
-    mine._inode = (tmp_path / "heads").stat().st_ino  # as ext4 gives it, sooner or later
+    mine._inode = (tmp_path / "heads").stat().st_ino  # ext4 reuses inodes sooner or later
     mine.refresh()
     assert set(mine.all) == {episode(each) for each in range(1, 6)}
 
 
-def test_what_is_too_old_or_too_much_is_forgotten_but_for_the_highest_number(
+def test_heads_that_are_too_old_or_too_many_are_forgotten_except_for_the_highest_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 1_000)
@@ -119,16 +121,16 @@ def test_what_is_too_old_or_too_much_is_forgotten_but_for_the_highest_number(
     assert len(fresh.all) < 15
 
 
-def test_a_head_is_lowered_only_where_that_is_meant(tmp_path: Path) -> None:
+def test_a_head_is_lowered_only_on_request(tmp_path: Path) -> None:
     heads = heads_in(tmp_path)
     heads.note({episode(1): (1, 50)})
-    heads.note({episode(1): (1, 40)})  # a line that compacting put behind a later one
+    heads.note({episode(1): (1, 40)})  # a line that compacting wrote after a later one
     assert read(tmp_path).last == (episode(1), 50)
     heads.note({episode(1): (1, 30)}, lowered=True)
     assert read(tmp_path).last == (episode(1), 30)
 
 
-def test_a_folder_that_cannot_be_written_is_counted_and_stops_nobody(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_counted_and_stops_no_process(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     heads = heads_in(tmp_path / "file")
     heads.note({episode(1): (1, 1)})

@@ -22,7 +22,7 @@ from pycrorm_async.queue.retention.stored_segments import kept_segments
 from tests.queue.factories import (
     RECORDER,
     SMALL,
-    as_left_by_a_kill,
+    crashed_copy,
     drain,
     ended,
     episode,
@@ -198,7 +198,7 @@ async def test_a_killed_recorders_blobs_are_kept_with_its_last_segment(bound: Pa
     queue = make(bound)
     queue.put_nowait(started(), b"{}")
     put_referring(queue)
-    left = as_left_by_a_kill(queue, tmp_path / "left")
+    left = crashed_copy(queue, tmp_path / "left")
     queue.put_nowait(ended(), b"{}")
     queue.release()
     source = open_dead(left, stored=queue._stored_segments)
@@ -221,7 +221,7 @@ async def test_an_unsynced_record_whose_blob_a_power_cut_took_belongs_to_the_tor
     queue.put_nowait(node(), b"{}")
     put_referring(queue)
     queue.put_nowait(node(), b"{}")
-    left = as_left_by_a_kill(queue, tmp_path / "left")
+    left = crashed_copy(queue, tmp_path / "left")
     blob = left / "blobs" / NAME
     if spoiled == "missing":
         blob.unlink()
@@ -245,7 +245,7 @@ async def test_a_synced_record_stays_although_its_blob_was_deleted(spool: Path, 
     queue.put_nowait(started(), b"{}")
     put_referring(queue)
     await queue.synced_to()
-    left = as_left_by_a_kill(queue, tmp_path / "left")
+    left = crashed_copy(queue, tmp_path / "left")
     (left / "blobs" / NAME).unlink()
     source = open_dead(left)
     assert source is not None
@@ -282,7 +282,7 @@ async def test_a_repaired_folder_and_the_damaged_one_both_have_the_blobs(spool: 
     queue.put_nowait(started(), b"{}")
     put_referring(queue)
     await queue.synced_to()
-    left = as_left_by_a_kill(queue, tmp_path / "left")
+    left = crashed_copy(queue, tmp_path / "left")
     queue.put_nowait(ended(), b"{}")
     queue.release()
     overwrite(left / "00000001.segment", 56 + 20, b"!")

@@ -1,4 +1,4 @@
-"""What may be put: never more files than allowed, and the reserve is there for those it is kept for."""
+"""Admission to the queue: files never exceed the limit, and the reserve is kept for reserved records."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def test_ordinary_records_leave_the_reserve_free_in_the_last_segment() -> None:
     assert not SMALL.admits(601, offset=256, spare=0, episodes=0, reserved=True)
 
 
-def test_a_frame_that_does_not_fit_here_needs_a_whole_segment_of_its_own() -> None:
+def test_a_frame_that_does_not_fit_needs_a_segment_of_its_own() -> None:
     assert SMALL.admits(700, offset=800, spare=1, episodes=0, reserved=True)
     assert not SMALL.admits(700, offset=800, spare=0, episodes=0, reserved=True)
     assert not SMALL.admits(801, offset=800, spare=1, episodes=0, reserved=True)
@@ -36,7 +36,7 @@ def test_a_frame_that_does_not_fit_here_needs_a_whole_segment_of_its_own() -> No
 
 @pytest.mark.slow
 @given(st.integers(1, 2000), st.integers(56, 856), st.integers(0, 5), st.integers(0, 10), st.integers(1, 100))
-def test_what_is_admitted_ordinarily_is_admitted_reserved_and_with_more_room(
+def test_an_admitted_ordinary_record_is_also_admitted_as_reserved_and_with_more_space(
     frame_bytes: int, offset: int, spare: int, episodes: int, more: int
 ) -> None:
     if SMALL.admits(frame_bytes, offset=offset, spare=spare, episodes=episodes, reserved=False):
@@ -44,18 +44,18 @@ def test_what_is_admitted_ordinarily_is_admitted_reserved_and_with_more_room(
         assert SMALL.admits(frame_bytes, offset=offset, spare=spare + more, episodes=episodes, reserved=False)
 
 
-def test_settings_with_which_a_full_queue_could_never_be_emptied_are_refused() -> None:
+def test_settings_under_which_a_full_queue_could_never_be_emptied_are_refused() -> None:
     with pytest.raises(CallerError, match="three segments"):
         Capacity.of(Settings(segment_bytes=1000, spool_bytes_max=4000, spool_reserve_bytes=1001))
 
 
-# The largest record: a header of 64 bytes, a type's name of 255, the payload, padding; two commits of 72 behind it,
-# and before it the segment's header, 56 bytes and 40 for each open episode.
+# The largest record: a header of 64 bytes, a type name of 255, the payload and padding; two commits of 72 after it; and
+# before it the segment header, 56 bytes and 40 for each open episode.
 LARGEST_OF_1000 = 64 + 1256
 BESIDE_16_EPISODES = LARGEST_OF_1000 + 2 * 72 + 56 + 16 * 40
 
 
-def test_the_largest_record_fits_into_a_segment_beside_sixteen_open_episodes_or_the_settings_are_refused() -> None:
+def test_the_largest_record_fits_beside_sixteen_open_episodes_or_the_settings_are_refused() -> None:
     enough = Settings(segment_bytes=BESIDE_16_EPISODES, record_bytes_max=1000)
     assert Capacity.of(enough).episodes_max == 16
     assert Capacity.of(enough).frame_bytes_max(episodes=16) == LARGEST_OF_1000
@@ -68,7 +68,7 @@ def test_the_largest_record_fits_into_a_segment_beside_sixteen_open_episodes_or_
         Capacity.of(Settings(segment_bytes=2**18))
 
 
-def test_with_the_default_settings_episodes_run_out_last() -> None:
+def test_with_the_default_settings_the_limit_on_episodes_is_reached_last() -> None:
     episodes = (8 * 2**20 - 2 * 72 - 56 - 64 - (2**20 + 256)) // 40
     assert Capacity.of(Settings()) == Capacity(8 * 2**20, 512, 16 * 2**20, episodes)
     assert episodes > 180_000

@@ -1,4 +1,6 @@
-"""What the database refused is kept beside its recorder's folder: durable, once, and offered again as of the dead."""
+"""Dead letters: records that the database refused are kept beside the recorder's folder, durably, once, and
+recoverable.
+"""
 
 import shutil
 from pathlib import Path
@@ -15,7 +17,7 @@ from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
-    Author,
+    FolderWriter,
     ended,
     episode,
     lost,
@@ -29,7 +31,7 @@ from tests.queue.factories import (
 
 @pytest.fixture
 def own(spool: Path) -> Path:
-    """The recorder's own folder, empty but for its lock."""
+    """Return the recorder's own folder, which holds only its lock."""
     folder = spool / episode_text(RECORDER)
     folder.mkdir(parents=True)
     (folder / "alive").touch()
@@ -41,7 +43,7 @@ def kept_in(own: Path, number: int = 1) -> Path:
 
 
 def some(first: int, last: int, number: int = 1) -> list[Record]:
-    """Events of an episode, at positions far from where they will be."""
+    """Return events of an episode at positions that differ from their places in the dead letters."""
     return [record(1000 + each, node(number), each, b'{"n":%d}' % each) for each in range(first, last + 1)]
 
 
@@ -54,25 +56,25 @@ def placed(records: list[Record]) -> list[Record]:
 
 
 def put(own: Path, *batches: list[Record]) -> None:
-    """By a process of its own."""
+    """Put in a process of its own."""
     refused = DeadLetters(own)
     for batch in batches:
         refused.put(batch)
     refused.release()
 
 
-async def test_what_is_put_is_recovered_when_the_recorders_own_folder_is_gone(own: Path) -> None:
+async def test_dead_letters_are_recovered_after_the_recorders_own_folder_is_deleted(own: Path) -> None:
     put(own, some(5, 7), some(8, 8), [*some(9, 9), end(10)])
     assert open_dead(kept_in(own)) is None
-    mended = own.with_name(f"{own.name}.mended.making")  # a repair that was killed before it gave the folder its name
-    own.rename(mended)
+    unfinished = own.with_name(f"{own.name}.mended.making")  # a repair that was killed before it renamed the folder
+    own.rename(unfinished)
     assert open_dead(kept_in(own)) is None
-    shutil.rmtree(mended)
-    own.mkdir()  # killed in the last step of its removal
+    shutil.rmtree(unfinished)
+    own.mkdir()  # a removal that was killed in its last step
     assert await recover(kept_in(own)) == placed([*some(5, 9), end(10)])
 
 
-async def test_each_episode_has_a_folder_and_a_broken_off_one_is_lost(own: Path) -> None:
+async def test_each_episode_has_a_folder_of_its_own_and_an_incomplete_one_ends_as_lost(own: Path) -> None:
     first = [record(7, started(1), 1, b"{}"), *some(2, 3)]
     put(own, [*first[:2], *some(4, 4, 2), first[2], *some(5, 5, 2)])
     shutil.rmtree(own)
@@ -80,7 +82,7 @@ async def test_each_episode_has_a_folder_and_a_broken_off_one_is_lost(own: Path)
     assert await recover(kept_in(own, 2)) == [*placed(some(4, 5, 2)), lost(3, 2, 6)]
 
 
-async def test_what_is_put_again_by_the_next_process_is_kept_once(own: Path) -> None:
+async def test_records_that_the_next_process_puts_again_are_kept_once(own: Path) -> None:
     put(own, some(5, 7))
     put(own, some(3, 6))
     put(own, some(6, 9))
@@ -96,7 +98,7 @@ async def test_what_is_put_again_by_the_next_process_is_kept_once(own: Path) -> 
 
 
 @pytest.mark.slow
-async def test_a_put_that_was_cut_anywhere_is_put_again_and_nothing_is_damaged(own: Path, tmp_path: Path) -> None:
+async def test_a_put_that_was_cut_at_any_byte_is_repeated_without_damage(own: Path, tmp_path: Path) -> None:
     put(own, some(5, 6))
     segment = kept_in(own) / "00000001.segment"
     before = segment.stat().st_size
@@ -124,7 +126,7 @@ async def test_a_file_that_has_grown_large_is_followed_by_another(own: Path) -> 
     assert (await recover(kept_in(own)))[:-1] == placed(large)
 
 
-def test_an_event_that_does_not_follow_what_is_kept_is_refused_and_named(own: Path) -> None:
+def test_an_event_that_does_not_continue_the_kept_ones_is_refused_by_name(own: Path) -> None:
     refused = DeadLetters(own)
     refused.put(some(5, 7))
     with pytest.raises(SpoolUnavailable, match=r"\.refused: holds events up to 7, and event 9 leaves a gap$"):
@@ -135,7 +137,7 @@ def test_an_event_that_does_not_follow_what_is_kept_is_refused_and_named(own: Pa
     assert LiveSource.take(kept_in(own)) is None
 
 
-async def test_what_is_refused_again_stays_where_it_is_and_a_part_that_is_stored_goes(own: Path) -> None:
+async def test_records_that_are_refused_again_stay_in_place_and_stored_ones_are_deleted(own: Path) -> None:
     put(own, some(5, 7))
     put(own, some(8, 9))
     shutil.rmtree(own)
@@ -152,11 +154,13 @@ async def test_what_is_refused_again_stays_where_it_is_and_a_part_that_is_stored
     assert await recover(kept_in(own)) == [*placed(some(5, 9))[3:], lost(6, 1, 10)]
 
 
-async def test_a_dead_recorders_refused_events_and_computed_end_go_aside_and_its_folder_goes(spool: Path) -> None:
-    author = Author(spool)
+async def test_a_dead_recorders_refused_events_and_computed_end_become_dead_letters_and_its_folder_is_deleted(
+    spool: Path,
+) -> None:
+    author = FolderWriter(spool)
     for heading in (DECLARED, started(1), node(1), node(1)):
         author.put(heading)
-    for _ in range(2):  # killed after the first time
+    for _ in range(2):  # a kill after the first recovery
         recovered = open_dead(author.folder)
         assert recovered is not None
         batch = await recovered.get_batch(events_max=99, bytes_max=2**20, age_s_max=0.0)
@@ -170,14 +174,14 @@ async def test_a_dead_recorders_refused_events_and_computed_end_go_aside_and_its
     assert await recover(kept_in(author.folder)) == [*placed(author.records[1:]), lost(4, 1, 4)]
 
 
-# --- told and mended --------------------------------------------------------------------------------------------
+# --- inspection and repair --------------------------------------------------------------------------------------------
 
 
-def test_it_is_told_in_the_spool_and_is_no_stranger(own: Path) -> None:
+def test_inspection_reports_dead_letters_and_no_foreign_file(own: Path) -> None:
     Spool(own.parent).bind("the-log")
     put(own, some(5, 7))
     shutil.rmtree(own)
-    kept_in(own, 2).mkdir()  # killed before it was locked
+    kept_in(own, 2).mkdir()  # a process that was killed before it locked the folder
     report = inspect_spool(own.parent)
     [one] = report.recorders
     assert (one.name, one.first, one.last, one.types) == (kept_in(own).name, 1, 3, {"NodeStarted": 3})
@@ -190,7 +194,7 @@ def test_it_is_told_in_the_spool_and_is_no_stranger(own: Path) -> None:
     assert len(inspect_spool(own.parent).strangers) == 2
 
 
-async def test_damage_in_it_is_told_and_mended(own: Path) -> None:
+async def test_damage_in_dead_letters_is_reported_and_repaired(own: Path) -> None:
     put(own, some(5, 7))
     put(own, some(8, 9))
     folder = kept_in(own)
@@ -209,12 +213,12 @@ async def test_damage_in_it_is_told_and_mended(own: Path) -> None:
     assert inspect_spool(own.parent).set_aside == (f"{folder.name}.damaged",)
     folder.rename(folder.with_name(f"{folder.name}.mended.making"))
     assert finish_repairs(own.parent) == [folder]
-    refused.put(some(7, 9))  # where they are still in the recorder's own folder
+    refused.put(some(7, 9))  # the records are still in the recorder's own folder
     refused.release()
     shutil.rmtree(own)
     assert await recover(folder) == [*placed(some(5, 9)), lost(6, 1, 10)]
 
 
-def test_only_episodes_are_refused(own: Path) -> None:
+def test_only_records_of_an_episode_become_dead_letters(own: Path) -> None:
     with pytest.raises(AssertionError):
         DeadLetters(own).put([record(1, Heading(None, "DesignatorTypeDeclared", 1), 0, b"{}")])

@@ -1,4 +1,4 @@
-"""What is whole is given, what is torn is left out, and what was safe and is missing is damage."""
+"""Dead recorders' folders: whole records are supplied, torn ones are ignored, and lost synced ones are damage."""
 
 import errno
 import os
@@ -17,7 +17,7 @@ from pycrorm_async.queue.files.segment import salt_of
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
-    Author,
+    FolderWriter,
     drain,
     ended,
     lost,
@@ -31,17 +31,19 @@ from tests.queue.factories import (
 
 
 @pytest.fixture
-def author(spool: Path) -> Author:
-    return Author(spool)
+def author(spool: Path) -> FolderWriter:
+    return FolderWriter(spool)
 
 
-async def test_records_come_back_in_order_and_open_episodes_end_lost_in_the_order_of_their_ids(author: Author) -> None:
+async def test_records_come_back_in_order_and_open_episodes_end_lost_in_the_order_of_their_ids(
+    author: FolderWriter,
+) -> None:
     for heading in (DECLARED, started(2), started(1), started(3), node(1), ended(3), node(1)):
         author.put(heading, heading.type.encode())
     assert await recover(author.folder) == [*author.records, lost(8, 1, 4), lost(9, 2, 2)]
 
 
-async def test_recovering_twice_gives_the_same_and_writes_nothing(author: Author) -> None:
+async def test_recovering_twice_gives_the_same_records_and_writes_nothing(author: FolderWriter) -> None:
     author.put(started())
     author.sync()
     author.put(node(), b"unsynced")
@@ -51,7 +53,7 @@ async def test_recovering_twice_gives_the_same_and_writes_nothing(author: Author
     assert sorted(path.name for path in author.folder.iterdir()) == ["00000001.segment", "alive", "drain"]
 
 
-async def test_a_recorder_that_lived_without_a_record_leaves_nothing(author: Author) -> None:
+async def test_a_recorder_that_recorded_nothing_leaves_no_folder(author: FolderWriter) -> None:
     recovered = open_dead(author.folder)
     assert recovered is not None
     assert await drain(recovered) == []
@@ -60,7 +62,7 @@ async def test_a_recorder_that_lived_without_a_record_leaves_nothing(author: Aut
     assert not author.folder.exists()
 
 
-def test_the_living_and_the_drained_are_not_opened(spool: Path) -> None:
+def test_the_folder_of_a_recorder_that_is_alive_or_drained_is_not_opened(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     assert open_dead(queue.folder) is None
@@ -79,7 +81,7 @@ def test_the_living_and_the_drained_are_not_opened(spool: Path) -> None:
     assert open_dead(spool / "gone") is None
 
 
-async def test_batches_keep_to_their_limits_computed_ends_included(author: Author) -> None:
+async def test_batches_keep_to_their_limits_including_computed_ends(author: FolderWriter) -> None:
     for number in (1, 2, 3):
         author.put(started(number), b"x" * 100)
     recovered = open_dead(author.folder)
@@ -96,8 +98,8 @@ async def test_batches_keep_to_their_limits_computed_ends_included(author: Autho
 
 @pytest.mark.slow
 @pytest.mark.parametrize("filling", [b"\0", b"\xff", b"\x01"])
-async def test_torn_at_any_byte_of_what_was_not_synced_keeps_all_whole_records_before(
-    author: Author, filling: bytes
+async def test_a_tail_torn_at_any_unsynced_byte_keeps_all_whole_records_before_it(
+    author: FolderWriter, filling: bytes
 ) -> None:
     author.put(started())
     author.put(node(), b"synced")
@@ -108,17 +110,17 @@ async def test_torn_at_any_byte_of_what_was_not_synced_keeps_all_whole_records_b
     path, whole = author.segments[0], author.segments[0].read_bytes()
     for cut in range(safe_end, author.end + 1):
         path.write_bytes(whole[:cut] + filling * (len(whole) - cut))
-        kept = sum(1 for _, offset, size in author.places if torn_end(whole, offset, size, filling) <= cut)
-        assert kept >= 2
-        assert await recover(author.folder) == [*author.records[:kept], lost(kept + 1, 1, kept + 1)], cut
+        result = sum(1 for _, offset, size in author.places if torn_end(whole, offset, size, filling) <= cut)
+        assert result >= 2
+        assert await recover(author.folder) == [*author.records[:result], lost(result + 1, 1, result + 1)], cut
 
 
 def torn_end(whole: bytes, offset: int, size: int, filling: bytes) -> int:
-    """A record ends, for this purpose, where the filling cannot be told from its own last bytes."""
+    """The end of a record here: after the last byte that differs from the zeros that fill the file."""
     return offset + len(whole[offset : offset + size].rstrip(filling))
 
 
-async def test_a_file_cut_short_keeps_all_whole_records_before(author: Author) -> None:
+async def test_a_shortened_file_keeps_all_whole_records_before_the_cut(author: FolderWriter) -> None:
     author.put(started())
     author.sync()
     safe_end = author.end
@@ -131,7 +133,7 @@ async def test_a_file_cut_short_keeps_all_whole_records_before(author: Author) -
     assert await recover(author.folder) == [*author.records, lost(3, 1, 3)]
 
 
-async def test_a_record_that_reached_the_disk_before_an_earlier_one_is_a_legal_tail(author: Author) -> None:
+async def test_a_record_that_reached_the_disk_before_an_earlier_one_is_a_legal_tail(author: FolderWriter) -> None:
     author.put(started())
     author.sync()
     author.put(node(), b"never reached the disk")
@@ -146,8 +148,8 @@ async def test_a_record_that_reached_the_disk_before_an_earlier_one_is_a_legal_t
     assert tail
 
 
-async def test_a_later_segment_that_reached_the_disk_before_the_end_of_the_one_before_is_a_legal_tail(
-    author: Author,
+async def test_a_later_segment_that_reached_the_disk_before_the_end_of_its_predecessor_is_a_legal_tail(
+    author: FolderWriter,
 ) -> None:
     author.put(started())
     author.sync()
@@ -159,7 +161,7 @@ async def test_a_later_segment_that_reached_the_disk_before_the_end_of_the_one_b
     assert await recover(author.folder) == [*author.records[:3], lost(4, 1, 4)]
 
 
-async def test_a_segment_whose_header_did_not_reach_the_disk_is_a_legal_tail(author: Author) -> None:
+async def test_a_segment_whose_header_did_not_reach_the_disk_is_a_legal_tail(author: FolderWriter) -> None:
     author.put(started())
     for _ in range(3):
         author.put(node(), b"x" * 900)
@@ -169,13 +171,13 @@ async def test_a_segment_whose_header_did_not_reach_the_disk_is_a_legal_tail(aut
     assert await recover(author.folder) == [*author.records[:4], lost(5, 1, 5)]
 
 
-async def test_nothing_of_a_first_segment_that_was_never_synced_need_be_there(author: Author) -> None:
+async def test_nothing_of_a_first_segment_that_was_never_synced_must_be_on_the_disk(author: FolderWriter) -> None:
     author.put(started())
     overwrite(author.segments[0], 0, bytes(40))
     assert await recover(author.folder) == []
 
 
-async def test_a_record_of_another_file_left_on_the_same_blocks_does_not_come_back_to_life(author: Author) -> None:
+async def test_a_record_of_another_file_that_reused_blocks_still_hold_is_not_read(author: FolderWriter) -> None:
     author.put(started())
     author.sync()
     stale = second_frame(b"stale", salt=salt_of(episode_id(1, b"an elder.."), 1))
@@ -190,7 +192,9 @@ async def test_a_record_of_another_file_left_on_the_same_blocks_does_not_come_ba
 
 
 @pytest.mark.slow
-def test_any_one_bit_flipped_is_damage_where_it_was_safe_and_never_costs_a_synced_record(author: Author) -> None:
+def test_any_one_bit_flipped_is_damage_where_it_was_synced_and_never_costs_a_synced_record(
+    author: FolderWriter,
+) -> None:
     author.put(started())
     author.put(node(), b"ab")
     author.sync()
@@ -208,7 +212,7 @@ def test_any_one_bit_flipped_is_damage_where_it_was_safe_and_never_costs_a_synce
             assert scan(author.folder, RECORDER).cut.position == (2 if bit // 8 < author.end else 3), bit
 
 
-async def test_damage_is_told_with_file_and_offset_and_changes_nothing(author: Author) -> None:
+async def test_damage_is_reported_with_file_and_offset_and_changes_nothing(author: FolderWriter) -> None:
     for heading in (started(), node(), node()):
         author.put(heading)
     author.sync()
@@ -224,7 +228,7 @@ async def test_damage_is_told_with_file_and_offset_and_changes_nothing(author: A
     assert [each.alive for each in Spool(author.folder.parent).recorders()] == [False]
 
 
-async def test_a_commit_in_a_later_segment_proves_damage_in_an_earlier_one(author: Author) -> None:
+async def test_a_commit_in_a_later_segment_proves_damage_in_an_earlier_one(author: FolderWriter) -> None:
     author.put(started())
     for _ in range(5):
         author.put(node(), b"x" * 900)
@@ -236,7 +240,7 @@ async def test_a_commit_in_a_later_segment_proves_damage_in_an_earlier_one(autho
     assert (damage.value.path, damage.value.offset) == (path, offset)
 
 
-async def test_a_segment_missing_in_the_middle_of_what_was_safe_is_damage(author: Author) -> None:
+async def test_a_missing_segment_among_synced_ones_is_damage(author: FolderWriter) -> None:
     author.put(started())
     for _ in range(8):
         author.put(node(), b"x" * 900)
@@ -247,7 +251,7 @@ async def test_a_segment_missing_in_the_middle_of_what_was_safe_is_damage(author
         open_dead(author.folder)
 
 
-async def test_an_unreadable_header_is_damage_when_the_segments_before_are_gone(author: Author) -> None:
+async def test_an_unreadable_header_is_damage_when_the_segments_before_it_are_deleted(author: FolderWriter) -> None:
     author.put(started())
     for _ in range(4):
         author.put(node(), b"x" * 900)
@@ -257,7 +261,7 @@ async def test_an_unreadable_header_is_damage_when_the_segments_before_are_gone(
         open_dead(author.folder)
 
 
-async def test_other_records_than_those_that_were_safe_are_damage(author: Author) -> None:
+async def test_a_record_that_differs_from_the_synced_one_is_damage(author: FolderWriter) -> None:
     author.put(started())
     author.put(node(), b"was written")
     author.sync()
@@ -268,7 +272,7 @@ async def test_other_records_than_those_that_were_safe_are_damage(author: Author
         open_dead(author.folder)
 
 
-async def test_a_gap_in_an_episode_is_damage(author: Author) -> None:
+async def test_a_gap_in_the_sequence_of_an_episode_is_damage(author: FolderWriter) -> None:
     author.put(started())
     forged = second_frame(b"{}", sequence=3)
     overwrite(author.segments[0], author.end, forged)
@@ -279,14 +283,14 @@ async def test_a_gap_in_an_episode_is_damage(author: Author) -> None:
 # --- foreign ---------------------------------------------------------------------------------------------------
 
 
-def test_a_newer_format_is_refused_by_name(author: Author) -> None:
+def test_a_newer_format_is_refused_by_name(author: FolderWriter) -> None:
     author.put(started())
     overwrite(author.segments[0], 8, b"\x02")
     with pytest.raises(SpoolForeign, match=r"1\.segment is in format 2 of a newer program; this one reads format 1"):
         open_dead(author.folder)
 
 
-def test_a_segment_of_another_recorder_is_refused_by_name(author: Author, tmp_path: Path) -> None:
+def test_a_segment_of_another_recorder_is_refused_by_name(author: FolderWriter, tmp_path: Path) -> None:
     author.put(started())
     other = author.folder.with_name(episode_text(episode_id(1, b"an elder..")))
     author.folder.rename(other)
@@ -294,7 +298,7 @@ def test_a_segment_of_another_recorder_is_refused_by_name(author: Author, tmp_pa
         open_dead(other)
 
 
-async def test_foreign_files_in_a_folder_are_left_alone_also_when_it_is_deleted(author: Author) -> None:
+async def test_foreign_files_in_a_folder_are_never_deleted(author: FolderWriter) -> None:
     author.put(started())
     (author.folder / "notes.txt").write_text("mine")
     recovered = open_dead(author.folder)
@@ -306,7 +310,7 @@ async def test_foreign_files_in_a_folder_are_left_alone_also_when_it_is_deleted(
     assert Spool(author.folder.parent).recorders() == []
 
 
-def test_a_folder_that_cannot_be_read_is_one_clear_line(author: Author) -> None:
+def test_a_folder_that_cannot_be_read_is_reported_in_one_clear_line(author: FolderWriter) -> None:
     author.put(started())
     author.segments[0].unlink()
     author.segments[0].mkdir()
@@ -315,8 +319,8 @@ def test_a_folder_that_cannot_be_read_is_one_clear_line(author: Author) -> None:
     assert "00000001.segment: Is a directory" in str(refused.value)
 
 
-async def test_a_disk_that_does_not_keep_what_is_left_is_told_before_anything_is_given(
-    author: Author, monkeypatch: pytest.MonkeyPatch
+async def test_a_disk_that_does_not_sync_a_dead_recorders_records_is_reported_before_any_is_supplied(
+    author: FolderWriter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for heading in (started(), *[node()] * 4):
         author.put(heading, b"x" * 900)
@@ -335,10 +339,10 @@ async def test_a_disk_that_does_not_keep_what_is_left_is_told_before_anything_is
     assert await recover(author.folder) == [*author.records, lost(6, 1, 6)]
 
 
-# --- acknowledging and removing --------------------------------------------------------------------------------
+# --- acknowledging and deleting ---------------------------------------------------------------------------------------
 
 
-def test_a_segment_may_only_go_when_the_header_after_it_is_safe(author: Author) -> None:
+def test_a_segment_may_be_deleted_only_when_the_header_after_it_is_synced(author: FolderWriter) -> None:
     author.put(started())
     for _ in range(4):
         author.put(node(), b"x" * 900)
@@ -348,7 +352,7 @@ def test_a_segment_may_only_go_when_the_header_after_it_is_safe(author: Author) 
     assert [each.number for each in author.appender.trimmable(stored=5, safe_number=2)] == [1]
 
 
-async def test_stored_segments_go_and_the_ends_are_the_same_from_the_header_of_the_next(author: Author) -> None:
+async def test_after_stored_segments_are_deleted_the_next_header_gives_the_same_ends(author: FolderWriter) -> None:
     author.put(started(1))
     author.put(started(2))
     for _ in range(7):
@@ -372,7 +376,7 @@ async def test_stored_segments_go_and_the_ends_are_the_same_from_the_header_of_t
     assert not author.folder.exists()
 
 
-async def test_a_commit_that_covers_only_records_that_are_stored_and_gone_is_no_damage(author: Author) -> None:
+async def test_a_commit_that_covers_only_stored_and_deleted_records_is_no_damage(author: FolderWriter) -> None:
     author.put(started(), b"x" * 900)
     author.put(node(), b"x" * 900)
     span = author.appender.begin_sync()
@@ -386,8 +390,8 @@ async def test_a_commit_that_covers_only_records_that_are_stored_and_gone_is_no_
     assert await recover(author.folder) == [*author.records[3:], lost(8, 1, 8)]
 
 
-async def test_the_end_of_an_episode_whose_records_are_all_gone_has_the_times_of_its_last_record(
-    author: Author,
+async def test_the_end_of_an_episode_whose_records_are_all_deleted_has_the_times_of_its_last_record(
+    author: FolderWriter,
 ) -> None:
     author.put(started())
     for _ in range(4):
@@ -398,7 +402,7 @@ async def test_the_end_of_an_episode_whose_records_are_all_gone_has_the_times_of
     assert await recover(author.folder) == [lost(5, 1, 5)]
 
 
-async def test_a_removal_that_was_killed_anywhere_leaves_the_same_records_or_nothing(author: Author) -> None:
+async def test_a_deletion_killed_anywhere_leaves_the_same_records_or_nothing(author: FolderWriter) -> None:
     author.put(started())
     for _ in range(4):
         author.put(node(), b"x" * 900)
@@ -420,7 +424,9 @@ async def test_a_removal_that_was_killed_anywhere_leaves_the_same_records_or_not
 # --- sealing ---------------------------------------------------------------------------------------------------
 
 
-async def test_sealing_copies_the_tail_aside_cuts_it_and_gives_the_same_records_twice(author: Author) -> None:
+async def test_sealing_copies_the_tail_aside_and_cuts_it_and_supplies_the_same_records_again(
+    author: FolderWriter,
+) -> None:
     author.put(started())
     author.sync()
     for _ in range(5):
@@ -437,7 +443,7 @@ async def test_sealing_copies_the_tail_aside_cuts_it_and_gives_the_same_records_
         assert [path.with_name(f"{path.name}.tail").read_bytes() for path in (first, second)] == tails
 
 
-async def test_a_sealing_that_was_killed_anywhere_can_be_done_again(author: Author) -> None:
+async def test_a_sealing_that_was_killed_anywhere_can_be_repeated(author: FolderWriter) -> None:
     author.put(started())
     author.put(node(), b"torn")
     path, offset, _ = author.places[1]
@@ -451,7 +457,7 @@ async def test_a_sealing_that_was_killed_anywhere_can_be_done_again(author: Auth
     assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
 
 
-async def test_a_live_queue_that_was_let_go_has_no_tail(spool: Path) -> None:
+async def test_a_released_live_queue_has_no_tail(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     queue.release()
@@ -459,5 +465,5 @@ async def test_a_live_queue_that_was_let_go_has_no_tail(spool: Path) -> None:
     assert recovered is not None
     assert len(await drain(recovered)) == 2
     recovered.release()
-    kept = scan(queue.folder, parse_folder_name(queue.name).recorder)
-    assert [tail for _, tail in tails(queue.folder, kept) if tail] == []
+    result = scan(queue.folder, parse_folder_name(queue.name).recorder)
+    assert [tail for _, tail in tails(queue.folder, result) if tail] == []

@@ -1,4 +1,4 @@
-"""What is found of a dead recorder's folder is given while the rest is looked at, and only what may be."""
+"""Records of a dead recorder are supplied while the rest of its folder is still being scanned, if that is safe."""
 
 import shutil
 from collections.abc import Collection
@@ -11,16 +11,18 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue import open_dead
 from pycrorm_async.queue.files.segment import segment_numbers
 from pycrorm_async.queue.maintenance.repair import repair_folder
-from tests.queue.factories import Author, lost, node, overwrite, recover, started
+from tests.queue.factories import FolderWriter, lost, node, overwrite, recover, started
 
 RECORDS, SYNCED_EVERY, SEGMENTS = 20, 3, 4
 
 
 def long_folder(
     spool: Path, *, synced: Collection[int] = range(0, RECORDS, SYNCED_EVERY), letter: bytes = b"x"
-) -> Author:
-    """A commit frame after every third record, wherever segments begin, and two records that were never synced."""
-    author = Author(spool)
+) -> FolderWriter:
+    """A folder with a commit frame after every third record, across segments, and two records that were never
+    synced.
+    """
+    author = FolderWriter(spool)
     author.put(started())
     for number in range(2, RECORDS + 1):
         author.put(node(), b'"%d %s"' % (number, letter * 600))
@@ -30,8 +32,8 @@ def long_folder(
     return author
 
 
-async def given_before_damage(folder: Path, *, events_max: int = 10_000) -> list[Record]:
-    """All that is given and acknowledged before damage is met, here or while the folder is opened."""
+async def supplied_before_damage(folder: Path, *, events_max: int = 10_000) -> list[Record]:
+    """Return all records that are supplied and acknowledged before the scan or the opening meets damage."""
     records: list[Record] = []
     try:
         recovered = open_dead(folder)
@@ -46,7 +48,7 @@ async def given_before_damage(folder: Path, *, events_max: int = 10_000) -> list
                 records += batch
                 await recovered.acknowledge(batch[-1].position)
                 assert not recovered.all_stored
-        with pytest.raises(SpoolDamaged):  # and it stays so
+        with pytest.raises(SpoolDamaged):  # the source repeats the error
             await recovered.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0)
         assert not recovered.lost
     finally:
@@ -57,7 +59,7 @@ async def given_before_damage(folder: Path, *, events_max: int = 10_000) -> list
 
 
 @pytest.mark.parametrize("events_max", [1, 2, 5, 100])
-async def test_what_is_whole_is_given_and_forgotten_before_all_was_looked_at(spool: Path, events_max: int) -> None:
+async def test_whole_files_are_supplied_and_deleted_before_the_scan_has_ended(spool: Path, events_max: int) -> None:
     author = long_folder(spool)
     recovered = open_dead(author.folder)
     assert recovered is not None
@@ -67,7 +69,7 @@ async def test_what_is_whole_is_given_and_forgotten_before_all_was_looked_at(spo
         records += batch
         await recovered.acknowledge(batch[-1].position)
         begun = sum(path in {place[0] for place in author.places[len(records) :]} for path in author.segments)
-        # Each file goes when the next one is in order and nothing in it is needed; the last one stays.
+        # Each file is deleted when the next one is in order and nothing in the file is needed; the last file stays.
         assert max(1, begun) <= len(segment_numbers(author.folder)) <= max(1, begun) + 1
         if events_max == 1 and len(records) == 10:
             assert (len(segment_numbers(author.folder)) < SEGMENTS, recovered.lost) == (True, ())
@@ -80,54 +82,58 @@ async def test_what_is_whole_is_given_and_forgotten_before_all_was_looked_at(spo
 
 @pytest.mark.parametrize("events_max", [2, 10_000])
 @pytest.mark.parametrize("changed", range(RECORDS - RECORDS % SYNCED_EVERY))
-async def test_of_a_damaged_folder_what_was_safe_before_the_damage_is_given(
+async def test_a_damaged_folder_supplies_what_was_synced_before_the_damage(
     spool: Path, changed: int, events_max: int
 ) -> None:
     author = long_folder(spool)
     path, offset, _ = author.places[changed]
     overwrite(path, offset + 68, b"#")
-    given = await given_before_damage(author.folder, events_max=events_max)
+    supplied = await supplied_before_damage(author.folder, events_max=events_max)
     safe = changed - changed % SYNCED_EVERY
-    assert given == author.records[: len(given)]
-    assert len(given) <= safe
+    assert supplied == author.records[: len(supplied)]
+    assert len(supplied) <= safe
     in_segments_before = [place[0] for place in author.places].index(path)
-    assert len(given) >= (in_segments_before - 1) // SYNCED_EVERY * SYNCED_EVERY  # the commit frame is there too
-    again = await given_before_damage(author.folder)
-    assert again == given[len(given) - len(again) :]  # what was forgotten is not there any more, and nothing else
+    assert (
+        len(supplied) >= (in_segments_before - 1) // SYNCED_EVERY * SYNCED_EVERY
+    )  # the commit frame is on the disk too
+    again = await supplied_before_damage(author.folder)
+    assert again == supplied[len(supplied) - len(again) :]  # only the deleted records are missing
 
     repair_folder(author.folder)
-    mended = await recover(author.folder)
-    whole = given + [each for each in mended if each.position > len(given)]
-    assert whole[:-1] == author.records[:changed]  # where the gap is the episode has its end
+    repaired = await recover(author.folder)
+    whole = supplied + [each for each in repaired if each.position > len(supplied)]
+    assert whole[:-1] == author.records[:changed]  # an episode ends where the gap is
     assert whole[-1:] == ([lost(changed + 1, 1, changed + 1)] if changed else [])
 
 
 @pytest.mark.parametrize("number", range(2, SEGMENTS + 1))
-async def test_a_damaged_header_costs_nothing_although_the_files_before_it_were_forgotten(
+async def test_a_damaged_header_costs_nothing_although_the_files_before_it_were_deleted(
     spool: Path, number: int
 ) -> None:
     author = long_folder(spool)
     overwrite(author.segments[number - 1], 60, b"#")
-    given = await given_before_damage(author.folder, events_max=2)
-    assert given == author.records[: len(given)]
+    supplied = await supplied_before_damage(author.folder, events_max=2)
+    assert supplied == author.records[: len(supplied)]
     assert len(segment_numbers(author.folder)) <= SEGMENTS - max(0, number - 3)
     report = repair_folder(author.folder)
     assert report is not None
     assert report.complete
-    mended = await recover(author.folder)
-    whole = given + [each for each in mended if each.position > len(given)]
+    repaired = await recover(author.folder)
+    whole = supplied + [each for each in repaired if each.position > len(supplied)]
     assert whole == [*author.records, lost(RECORDS + 1, 1, RECORDS + 1)]
 
 
 @pytest.mark.parametrize("first", [0, 3])
-async def test_records_that_a_later_commit_frame_denies_are_not_given(spool: Path, tmp_path: Path, first: int) -> None:
+async def test_records_that_a_later_commit_frame_contradicts_are_not_supplied(
+    spool: Path, tmp_path: Path, first: int
+) -> None:
     author = long_folder(spool, synced=[first, 18])
     other = long_folder(tmp_path / "other", synced=[first, 18], letter=b"y")
-    shutil.copyfile(other.segments[1], author.segments[1])  # whole frames, of the same recorder and segment
-    assert await given_before_damage(author.folder) == author.records[:first]
+    shutil.copyfile(other.segments[1], author.segments[1])  # whole frames of the same recorder and segment
+    assert await supplied_before_damage(author.folder) == author.records[:first]
 
 
-async def test_who_opens_it_next_is_given_again_what_was_not_forgotten(spool: Path) -> None:
+async def test_the_next_source_supplies_again_what_was_not_deleted(spool: Path) -> None:
     author = long_folder(spool)
     for count in (3, 9):
         recovered = open_dead(author.folder)

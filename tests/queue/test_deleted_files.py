@@ -1,4 +1,6 @@
-"""Files that were deleted or replaced under a queue: never acknowledged, never silent, and recording goes on."""
+"""Files deleted or replaced under a queue: their records are never acknowledged, losses are reported, recording
+continues.
+"""
 
 import asyncio
 import logging
@@ -26,14 +28,14 @@ GONE = "was deleted or replaced while the queue wrote to it"
 
 
 def delete(folder: Path) -> None:
-    """All at once, while files may be made in it."""
+    """Delete the folder at once, although the queue may make files in it."""
     trash = Path(tempfile.mkdtemp(dir=queue_root(folder)))
     folder.rename(trash / "trash")
     shutil.rmtree(trash)
 
 
 def queue_root(folder: Path) -> Path:
-    """Outside the spool, on the same file system."""
+    """A folder outside the spool on the same file system."""
     return folder.parent if folder.name == "spool" else folder.parent.parent
 
 
@@ -86,18 +88,18 @@ def events(records: list[Record]) -> list[tuple[int, int]]:
 
 
 def killed(queue: RecorderQueue, tmp_path: Path) -> Path:
-    """The spool as `kill -9` would leave it now."""
+    """Return the spool as `kill -9` would leave it now."""
     return copy_beside_recording(queue.folder.parent, tmp_path / "killed")
 
 
 async def recovered(spool: Path) -> list[tuple[int, int]]:
-    """What recovery of every folder gives, in the order in which they are recovered."""
+    """Return what recovery supplies of every folder, in the order of recovery."""
     return [each for folder in Spool(spool).recorders() for each in events(await recover(folder.path))]
 
 
 @contextmanager
 def suppress_all_but_losses() -> Iterator[None]:
-    """A sync that meets the deletion raises before it is known what is lost by it."""
+    """A sync that meets the deletion raises before the loss is known."""
     try:
         yield
     except SpoolUnavailable as error:
@@ -107,7 +109,7 @@ def suppress_all_but_losses() -> Iterator[None]:
 
 @pytest.mark.parametrize("displace", DELETIONS)
 @pytest.mark.parametrize("asked", ["with news", "without news"])
-async def test_a_sync_is_refused_once_and_all_that_was_mapped_is_found_after_a_kill(
+async def test_a_sync_is_refused_once_and_a_kill_leaves_all_that_was_mapped(
     tmp_path: Path, displace: Callable[[RecorderQueue], None], asked: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     queue = make(tmp_path / "spool", settings=SLOW)
@@ -137,7 +139,7 @@ async def test_a_sync_is_refused_once_and_all_that_was_mapped_is_found_after_a_k
     queue.release()
 
 
-async def test_what_was_only_in_deleted_segments_is_named_and_the_rest_goes_on_behind_it(tmp_path: Path) -> None:
+async def test_what_was_only_in_deleted_segments_is_reported_and_recording_continues_behind_it(tmp_path: Path) -> None:
     queue = make(tmp_path / "spool", settings=ROOMY)
     queue.put_nowait(started(), b"{}")
     while len(queue._appender.begun) < 4:
@@ -161,12 +163,12 @@ async def test_what_was_only_in_deleted_segments_is_named_and_the_rest_goes_on_b
     assert queue.setback is not None
     assert queue.lost[0] in queue.setback
     queue.close()
-    given = await drain(queue)
-    assert events([*batch, *given]) == [(n, n) for n in (*range(1, 6), *range(base, queue.written + 1))]
+    supplied = await drain(queue)
+    assert events([*batch, *supplied]) == [(n, n) for n in (*range(1, 6), *range(base, queue.written + 1))]
     queue.release()
 
 
-async def test_losses_are_named_also_when_the_new_folder_goes_before_it_has_its_name(
+async def test_losses_are_reported_even_when_the_new_folder_is_deleted_before_its_rename(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue = make(tmp_path / "spool", settings=ROOMY)
@@ -202,7 +204,7 @@ async def test_losses_are_named_also_when_the_new_folder_goes_before_it_has_its_
     queue.release()
 
 
-async def test_segments_that_can_be_read_are_carried_and_no_copy_is_left(tmp_path: Path) -> None:
+async def test_readable_segments_are_copied_and_no_second_copy_is_left(tmp_path: Path) -> None:
     queue = make(tmp_path / "spool", settings=ROOMY)
     queue.put_nowait(started(), b"{}")
     while len(queue._appender.begun) < 4:
@@ -218,7 +220,9 @@ async def test_segments_that_can_be_read_are_carried_and_no_copy_is_left(tmp_pat
     queue.release()
 
 
-async def test_a_plan_goes_on_while_no_folder_can_be_made_and_all_of_it_is_there_when_one_can(tmp_path: Path) -> None:
+async def test_a_plan_continues_while_no_folder_can_be_made_and_all_of_it_is_stored_in_the_next_one(
+    tmp_path: Path,
+) -> None:
     spool = tmp_path / "spool"
     queue = make(spool, settings=replace(SLOW, sync_interval_ms=5))
     queue.put_nowait(started(), b"{}")
@@ -246,7 +250,7 @@ async def test_a_plan_goes_on_while_no_folder_can_be_made_and_all_of_it_is_there
     queue.release()
 
 
-async def test_a_queue_that_is_closed_while_no_folder_can_be_made_ends_and_says_why(tmp_path: Path) -> None:
+async def test_a_queue_that_is_closed_while_no_folder_can_be_made_ends_with_the_reason(tmp_path: Path) -> None:
     queue = make(tmp_path / "spool", settings=SLOW)
     queue.put_nowait(started(), b"{}")
     delete_the_spool(queue)
@@ -260,7 +264,7 @@ async def test_a_queue_that_is_closed_while_no_folder_can_be_made_ends_and_says_
 
 
 @pytest.mark.slow
-async def test_threads_that_put_meanwhile_leave_no_gap_but_what_is_named(tmp_path: Path) -> None:
+async def test_threads_that_put_meanwhile_leave_no_gap_that_is_not_reported(tmp_path: Path) -> None:
     queue = make(tmp_path / "spool", settings=replace(ROOMY, sync_interval_ms=1, spool_bytes_max=2**23))
     begin = threading.Barrier(3)
 
@@ -284,20 +288,20 @@ async def test_threads_that_put_meanwhile_leave_no_gap_but_what_is_named(tmp_pat
 
     for thread in (*threads, closing := threading.Thread(target=close_behind_them)):
         thread.start()
-    given: list[Record] = []
+    supplied: list[Record] = []
     folders = {queue.folder}
     deletions = cycle(DELETIONS)
     while batch := await queue.get_batch(events_max=200, bytes_max=2**20, age_s_max=0.0):
-        given += batch
+        supplied += batch
         if len(folders) < 9 and queue.folder in folders:
-            with suppress(OSError):  # it has moved on meanwhile
+            with suppress(OSError):  # the queue has already moved on
                 next(deletions)(queue)
         folders.add(queue.folder)
     closing.join()
     assert len(folders) > 1
     assert queue.failure is None
     queue.release()
-    positions = [each.position for each in given]
+    positions = [each.position for each in supplied]
     named = [range(int(words[1]), int(words[3].rstrip(":")) + 1) for words in map(str.split, queue.lost)]
     missing = set(range(1, queue.written + 1)) - set(positions)
     assert positions == sorted(set(positions))
@@ -306,7 +310,7 @@ async def test_threads_that_put_meanwhile_leave_no_gap_but_what_is_named(tmp_pat
 
 
 @pytest.mark.parametrize("displace", DELETIONS)
-async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_the_new_one(
+async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_drains_the_new_one(
     tmp_path: Path, displace: Callable[[RecorderQueue], None]
 ) -> None:
     queue = make(tmp_path / "spool", settings=SLOW, offered=True)
@@ -324,9 +328,9 @@ async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_t
     await queue.synced_to()
     assert await first.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0) == []
     first.release()
-    [found] = [each for each in Spool(tmp_path / "spool").recorders() if each.alive]
-    assert open_dead(found.path) is None
-    second = LiveSource.take(found.path)
+    [recorder] = [each for each in Spool(tmp_path / "spool").recorders() if each.alive]
+    assert open_dead(recorder.path) is None
+    second = LiveSource.take(recorder.path)
     assert second is not None
     again = await second.get_batch(events_max=10, bytes_max=2**20, age_s_max=0.0)
     assert events(again) == [(1, 1), (2, 2), (3, 3)]
@@ -341,7 +345,7 @@ async def test_a_drainer_in_another_process_ends_with_the_old_folder_and_finds_t
     queue.release()
 
 
-async def test_a_folder_that_was_taken_away_is_alive_until_the_process_ends(tmp_path: Path) -> None:
+async def test_a_folder_that_was_moved_away_stays_alive_until_the_process_ends(tmp_path: Path) -> None:
     queue = make(tmp_path / "spool", settings=SLOW)
     queue.put_nowait(started(), b"{}")
     before, name = queue.folder, queue.name

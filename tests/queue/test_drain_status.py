@@ -1,4 +1,4 @@
-"""The file `progress`: what one side says the other reads whole, or not at all."""
+"""The file `progress`: each side reads the other's note whole or not at all."""
 
 import os
 from pathlib import Path
@@ -11,13 +11,13 @@ SAID = DrainStatus(7, 5, DrainNote(failure="refused", unavailable="locked", stop
 
 
 def both(folder: Path) -> tuple[Progress, Progress]:
-    made = Progress.make(folder)
+    progress = Progress.make(folder)
     opened = Progress.open(folder, writing=True)
     assert opened is not None
-    return made, opened
+    return progress, opened
 
 
-def test_each_side_reads_what_the_other_said_last(tmp_path: Path) -> None:
+def test_each_side_reads_the_latest_note_of_the_other(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(0, closed=False), DrainStatus(0, 0, DrainNote()))
     recorder.write_recorder_status(RecorderStatus(2**63, closed=True))
@@ -28,7 +28,7 @@ def test_each_side_reads_what_the_other_said_last(tmp_path: Path) -> None:
     assert recorder.drained() == DrainStatus(8, 8, DrainNote())
 
 
-def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_path: Path) -> None:
+def test_a_side_cut_at_any_byte_leaves_the_note_that_was_read_before(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     recorder.write_recorder_status(RecorderStatus(1000, closed=False))
     drainer.write_drain_status(SAID)
@@ -55,7 +55,7 @@ def test_of_a_half_written_side_what_was_read_before_stands_at_every_byte(tmp_pa
     assert (drainer.recorded(), recorder.drained()) == (RecorderStatus(1000), SAID)
 
 
-def test_a_file_that_is_cut_while_both_use_it_kills_nobody(tmp_path: Path) -> None:
+def test_a_file_that_is_cut_while_both_use_it_kills_neither_process(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     recorder.write_recorder_status(RecorderStatus(3))
     drainer.write_drain_status(SAID)
@@ -67,7 +67,7 @@ def test_a_file_that_is_cut_while_both_use_it_kills_nobody(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("size", [0, 8, 16, 100, 4095])
-def test_a_short_file_and_one_of_another_format_are_as_good_as_none(tmp_path: Path, size: int) -> None:
+def test_a_short_file_and_one_of_another_format_are_ignored(tmp_path: Path, size: int) -> None:
     assert Progress.open(tmp_path, writing=True) is None
     Progress.make(tmp_path).close()
     whole = (tmp_path / "progress").read_bytes()
@@ -78,15 +78,15 @@ def test_a_short_file_and_one_of_another_format_are_as_good_as_none(tmp_path: Pa
     assert Progress.open(tmp_path, writing=True) is None
 
 
-def test_a_note_that_is_too_long_is_cut_and_the_numbers_are_said(tmp_path: Path) -> None:
+def test_a_note_that_is_too_long_is_cut_and_its_numbers_are_kept(tmp_path: Path) -> None:
     recorder, drainer = both(tmp_path)
     stopped = {f"episode {number}": "é" * 10_000 for number in range(1000)}
     drainer.write_drain_status(DrainStatus(9, 8, DrainNote(failure="ü" * 10_000, stopped=stopped)))
-    said = recorder.drained()
-    assert (said.stored, said.folded) == (9, 8)
-    assert said.note.failure == "ü" * 300
-    assert said.note.stopped
-    assert set(said.note.stopped.values()) == {"é" * 300}
+    status = recorder.drained()
+    assert (status.stored, status.folded) == (9, 8)
+    assert status.note.failure == "ü" * 300
+    assert status.note.stopped
+    assert set(status.note.stopped.values()) == {"é" * 300}
     drainer.write_drain_status(
         DrainStatus(9, 8, DrainNote(failure="\U0001f916" * 10_000, unavailable="\U0001f916" * 10_000))
     )

@@ -1,4 +1,4 @@
-"""A spool and a SQLite database are for their owner alone, or for a group, whatever the umask."""
+"""The files of a spool and a SQLite database belong to their owner alone, or to a group, whatever the umask."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def umask(mask: int) -> Iterator[None]:
 
 
 def modes(*paths: Path) -> dict[str, int]:
-    """By kind, the only mode of all folders and of all files at and below these paths."""
+    """Return the only mode of all folders, and that of all files, at and below these paths."""
     every = [each for path in paths for each in (path, *path.rglob("*"))]
     seen = {(each.is_dir(), each.stat().st_mode & 0o7777) for each in every}
     assert len(seen) == 2, {each.name: oct(each.stat().st_mode) for each in every}
@@ -44,7 +44,7 @@ def modes(*paths: Path) -> dict[str, int]:
 
 @pytest.mark.parametrize("mask", [0o000, 0o022, 0o377])
 @pytest.mark.parametrize(("access", "folders", "files"), [("owner", 0o700, 0o600), ("group", 0o2770, 0o660)])
-async def test_every_file_has_the_mode_that_was_chosen(
+async def test_every_file_has_the_chosen_mode(
     tmp_path: Path, mask: int, access: FileAccess, folders: int, files: int
 ) -> None:
     settings = Settings(file_access=access, segment_bytes=2**16, record_bytes_max=2**12, spool_reserve_bytes=2**16)
@@ -70,7 +70,7 @@ async def test_every_file_has_the_mode_that_was_chosen(
             assert not segment.exists()
 
 
-async def test_an_older_spool_works_on_and_what_is_new_in_it_is_for_its_owner(tmp_path: Path) -> None:
+async def test_an_older_spool_still_works_and_its_new_files_are_for_its_owner(tmp_path: Path) -> None:
     spool = tmp_path / "memory.db.spool"
     spool.mkdir()
     spool.chmod(0o775)

@@ -1,4 +1,4 @@
-"""The file that a live queue writes, byte by byte, against bytes packed here from the package docstring's tables."""
+"""The file that a live queue writes, byte by byte, against bytes packed from the tables in the package docstring."""
 
 import struct
 import zlib
@@ -13,7 +13,7 @@ MOMENT = struct.pack("<q", WALL_NS) + struct.pack("<q", MONOTONIC_NS)
 
 
 def header() -> bytes:
-    """Of segment 1, which no episode was open before."""
+    """Return the header of segment 1, before which no episode was open."""
     fixed = b"PYCRQSEG" + struct.pack("<II", 1, SALT) + RECORDER + struct.pack("<QQI", 1, 1, 0)
     return fixed + struct.pack("<I", zlib.crc32(fixed))
 
@@ -27,7 +27,7 @@ def frame(kind: int, version: int, position: int, sequence: int, owner: bytes, n
     return head + struct.pack("<I", zlib.crc32(body + head)) + body
 
 
-def test_a_live_queue_writes_what_its_tables_say(tmp_path: Path) -> None:
+def test_a_live_queue_writes_the_documented_bytes(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=replace(SMALL, sync_interval_ms=3_600_000))
     put = (
         (DECLARED, b'{"kind":"action"}', 2, 1, 0),

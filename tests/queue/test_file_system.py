@@ -1,4 +1,4 @@
-"""A spool is refused, in one line and before anything is made, where a full disk would kill the plan."""
+"""A spool on a file system where a full disk would kill the plan is refused in one line before anything is made."""
 
 import shutil
 import subprocess
@@ -19,7 +19,7 @@ BTRFS = 0x9123683E
 
 @pytest.fixture(params=["mounted", "simulated"])
 def btrfs(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A btrfs of its own, and a folder that is said to be one, for machines that cannot make or mount one."""
+    """A btrfs that the test mounts, and a simulated one for machines that cannot make or mount one."""
     disk, image = tmp_path / "disk", tmp_path / "disk.img"
     disk.mkdir()
     if request.param == "mounted" and shutil.which("mkfs.btrfs"):
@@ -28,18 +28,18 @@ def btrfs(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
         mount = ["mount", "-o", "loop", str(image), str(disk)]
         if subprocess.run(mount, capture_output=True, check=False).returncode == 0:
             yield disk
-            subprocess.run(["umount", "--lazy", str(disk)], check=True)  # also where a failed test left a queue open
+            subprocess.run(["umount", "--lazy", str(disk)], check=True)  # a failed test may have left a queue open
             return
 
-    def said_to_be(path: Path) -> int:
+    def simulated_btrfs(path: Path) -> int:
         return BTRFS if path.is_relative_to(disk) else file_system_type(path)
 
-    monkeypatch.setattr(file_system, "file_system_type", said_to_be)
+    monkeypatch.setattr(file_system, "file_system_type", simulated_btrfs)
     yield disk
 
 
 @pytest.mark.slow
-async def test_a_spool_on_btrfs_is_refused_in_one_line_that_says_where_it_may_lie(btrfs: Path, tmp_path: Path) -> None:
+async def test_a_spool_on_btrfs_is_refused_in_one_line_that_names_suitable_places(btrfs: Path, tmp_path: Path) -> None:
     url = f"sqlite:///{btrfs / 'memory.db'}"
     for spool in (btrfs / "spool", btrfs / "not" / "there"):
         with pytest.raises(
@@ -57,7 +57,7 @@ async def test_a_spool_on_btrfs_is_refused_in_one_line_that_says_where_it_may_li
         assert await texts(memory) == ["a"]
 
 
-def test_the_file_systems_of_robots_are_not_refused(tmp_path: Path) -> None:
+def test_the_file_systems_of_robots_are_accepted(tmp_path: Path) -> None:
     for place in (tmp_path, Path("/dev/shm"), Path("/"), tmp_path / "not" / "there"):
         check_file_system(place)
     assert file_system_type(Path("/dev/shm")) == 0x01021994  # tmpfs
@@ -65,7 +65,7 @@ def test_the_file_systems_of_robots_are_not_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("kind", "name"), [(0x6969, "NFS"), (0xFF534D42, "CIFS"), (0x2FC12FC1, "ZFS")])
-def test_others_are_refused_by_their_name(
+def test_other_file_systems_are_refused_by_their_name(
     tmp_path: Path, kind: int, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(file_system, "file_system_type", lambda _: kind)

@@ -1,4 +1,4 @@
-"""Whatever one folder holds concerns that folder alone: it is damage with a file and an offset, and nothing else."""
+"""Forged segments: an error in one folder concerns that folder alone and names a file and an offset."""
 
 import os
 import random
@@ -26,12 +26,12 @@ from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, read_segment, s
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.maintenance.inspection import inspect_recorder, inspect_spool
 from pycrorm_async.queue.maintenance.repair import repair_folder
-from tests.queue.factories import DECLARED, RECORDER, SMALL, Author, node, recover, started
+from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, node, recover, started
 from tests.queue.forged_segments import change_a_frame, change_the_header
 
 
-def journal(spool: Path) -> Author:
-    author = Author(spool)
+def journal(spool: Path) -> FolderWriter:
+    author = FolderWriter(spool)
     author.put(DECLARED, b'{"name":"X"}')
     for number in (1, 2):
         author.put(started(number))
@@ -44,7 +44,7 @@ def journal(spool: Path) -> Author:
 
 
 @pytest.mark.parametrize("name", [b"\xff\xfe", b"\xed\xa0\x80", b"Node\0Started", b""])
-async def test_a_name_that_no_recorder_writes_is_damage_at_its_frame_and_a_repair_keeps_the_rest(
+async def test_a_type_name_that_no_recorder_writes_is_damage_at_its_frame_and_a_repair_keeps_the_rest(
     tmp_path: Path, name: bytes
 ) -> None:
     author = journal(tmp_path)
@@ -65,9 +65,9 @@ async def test_a_name_that_no_recorder_writes_is_damage_at_its_frame_and_a_repai
     assert [each[1:] for each in again] == [each[1:] for each in kept]
 
 
-def test_a_declaration_that_no_database_takes_is_damage_and_not_a_folder_that_is_stuck(tmp_path: Path) -> None:
+def test_a_declaration_that_no_database_accepts_is_damage_and_the_folder_can_be_repaired(tmp_path: Path) -> None:
     for payload, reason in ((b"\xff", "not valid UTF-8"), (b"\0", "not valid UTF-8")):
-        author = Author(tmp_path / payload.hex())
+        author = FolderWriter(tmp_path / payload.hex())
         author.put(DECLARED, payload)
         author.sync()
         with pytest.raises(SpoolDamaged, match=reason):
@@ -77,7 +77,7 @@ def test_a_declaration_that_no_database_takes_is_damage_and_not_a_folder_that_is
 
 
 async def recovered(folder: Path) -> tuple[list[Record], PycrormError | None]:
-    """What recovery gives, or why it gives nothing: an error that names the folder."""
+    """Return the recovered records, or an error that names the folder."""
     try:
         return await recover(folder), None
     except (DamageError, FilesError) as refusal:
@@ -99,8 +99,8 @@ async def test_a_crafted_folder_is_recovered_or_refused_with_its_file_and_a_repa
     else:
         safe = change_a_frame(path, rng, fitting=rng.random() < 0.7) - 1
     sure = [each[1:] for each in author.records[:safe]]
-    given, refusal = await recovered(author.folder)
-    assert refusal is not None or [each[1:] for each in given[:safe]] == sure
+    supplied, refusal = await recovered(author.folder)
+    assert refusal is not None or [each[1:] for each in supplied[:safe]] == sure
     report = inspect_recorder(Spool(tmp_path).recorders()[0])
     assert (refusal is None) == (report.damage is None and report.refused is None)
     if isinstance(refusal, SpoolForeign):
@@ -110,7 +110,7 @@ async def test_a_crafted_folder_is_recovered_or_refused_with_its_file_and_a_repa
     repair_folder(author.folder)
     kept = await recover(author.folder)
     following = iter([each[1:] for each in kept])
-    assert all(each in following for each in sure)  # in this order
+    assert all(each in following for each in sure)  # the order of the checks
 
 
 # --- files --------------------------------------------------------------------------------------------------------
@@ -137,16 +137,16 @@ def as_a_huge_file(path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["00000001.segment", "alive", "drain"])
 @pytest.mark.parametrize("change", [as_a_folder, as_a_loop, as_a_pipe])
-async def test_what_is_no_file_where_one_should_be_is_one_error_that_names_its_folder(
+async def test_what_is_no_regular_file_is_one_error_that_names_its_folder(
     tmp_path: Path, name: str, change: Callable[[Path], None]
 ) -> None:
     author = journal(tmp_path)
     change(author.folder / name)
-    [found] = Spool(tmp_path).recorders()
-    given, refusal = await recovered(found.path)
-    assert given == [] or name != "00000001.segment"
-    assert refusal is None or str(found.path) in str(refusal)
-    report = inspect_recorder(found)
+    [recorder] = Spool(tmp_path).recorders()
+    supplied, refusal = await recovered(recorder.path)
+    assert supplied == [] or name != "00000001.segment"
+    assert refusal is None or str(recorder.path) in str(refusal)
+    report = inspect_recorder(recorder)
     assert (report.refused is not None) == (name == "00000001.segment" or (name, change) == ("drain", as_a_loop))
 
 
@@ -159,7 +159,7 @@ async def test_a_file_larger_than_any_segment_is_damage_and_is_not_read(tmp_path
         Capacity.of(SMALL.__class__(segment_bytes=SEGMENT_BYTES_MAX + 1, spool_bytes_max=2**40))
 
 
-async def test_numbers_that_no_segment_has_are_not_ours(tmp_path: Path) -> None:
+async def test_segment_numbers_out_of_range_are_foreign_files(tmp_path: Path) -> None:
     author = journal(tmp_path)
     for stem in ("0" * 8, "9" * 40, "000000001", "\N{ARABIC-INDIC DIGIT ONE}" * 8):
         (author.folder / f"{stem}.segment").write_bytes(b"x")
@@ -169,7 +169,7 @@ async def test_numbers_that_no_segment_has_are_not_ours(tmp_path: Path) -> None:
         read_segment(author.folder / "gone")
 
 
-def test_a_hint_of_garbage_is_no_hint(tmp_path: Path) -> None:
+def test_an_unreadable_hint_is_ignored(tmp_path: Path) -> None:
     progress = Progress.make(tmp_path)
     progress.close()
     whole = (tmp_path / PROGRESS).read_bytes()
@@ -181,7 +181,7 @@ def test_a_hint_of_garbage_is_no_hint(tmp_path: Path) -> None:
         opened.close()
 
 
-def test_a_note_of_the_database_that_is_no_text_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_database_note_that_is_no_text_is_reported_in_one_clear_line(tmp_path: Path) -> None:
     (tmp_path / "log").write_bytes(b"\xff\xfe")
     with pytest.raises(SpoolUnavailable, match="does not contain the id of a log"):
         Spool(tmp_path).bind(episode_text(RECORDER))

@@ -1,4 +1,4 @@
-"""A forked child has no queue: it can neither write into the parent's files nor keep or free its locks."""
+"""Forked children: they can neither write to the parent's files nor keep or release its locks."""
 
 import asyncio
 import gc
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 
 
 def in_child(work: Callable[[], object]) -> int:
-    """The exit status of a forked child: 0 if the work was done, 17 if it raised `SpoolClosed`."""
+    """Return the exit status of a forked child: 0 if the work succeeded, 17 if it raised `SpoolClosed`."""
     child = os.fork()
     if child == 0:
         try:
@@ -39,7 +39,7 @@ def test_a_child_cannot_put(queue: RecorderQueue) -> None:
     assert queue.put_nowait(node(), b"from the parent") == 2
 
 
-def test_a_child_can_neither_read_nor_wait_and_nothing_hangs_there(queue: RecorderQueue) -> None:
+def test_a_child_can_neither_read_nor_wait_and_does_not_hang(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
     limits = {"events_max": 1, "bytes_max": 1, "age_s_max": 0.0}
     assert in_child(lambda: asyncio.run(queue.get_batch(**limits))) == 17  # type: ignore[arg-type]  # int and float
@@ -70,7 +70,7 @@ def test_the_collector_runs_in_a_child_that_was_forked_while_another_thread_was_
     queue.release()
 
 
-async def test_a_child_that_lets_go_takes_nothing_from_the_parent(queue: RecorderQueue) -> None:
+async def test_a_child_that_releases_its_queue_takes_nothing_from_the_parent(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
 
     def release_folder() -> None:
@@ -84,7 +84,7 @@ async def test_a_child_that_lets_go_takes_nothing_from_the_parent(queue: Recorde
     assert await drain(queue) == [record(1, started(), 1, b"{}"), record(2, ended(), 2, b"{}")]
 
 
-def test_a_child_that_lives_on_does_not_keep_the_parents_folder_alive(spool: Path) -> None:
+def test_a_child_that_outlives_the_parent_does_not_keep_the_parents_folder_alive(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     begin_read, begin_write = os.pipe()
@@ -105,8 +105,8 @@ def test_a_child_that_lives_on_does_not_keep_the_parents_folder_alive(spool: Pat
         os.close(begin_write)
 
 
-async def test_a_recorder_killed_while_its_child_lives_is_dead_all_the_same(spool: Path) -> None:
-    """The recorder is a child of this test; it forks a worker that outlives it."""
+async def test_a_recorder_killed_while_its_child_lives_counts_as_dead(spool: Path) -> None:
+    """The recorder is a child of this test and forks a worker that outlives it."""
     done_read, done_write = os.pipe()
     begin_read, begin_write = os.pipe()
     recorder = os.fork()

@@ -1,4 +1,4 @@
-"""A frame is read whole and unchanged, or not at all; the golden bytes are reckoned here by hand."""
+"""Frames are read whole and unchanged, or not at all; the golden bytes are computed here independently."""
 
 import mmap
 import struct
@@ -35,7 +35,7 @@ GOLDEN = {
 
 
 def by_hand(head: bytes, body: bytes) -> bytes:
-    """60 bytes of header, their checksum with that of the body, the body."""
+    """Pack 60 bytes of header, the checksum of header and body, and the body."""
     assert len(head) == 60
     assert len(body) % 8 == 0
     return head + struct.pack("<I", zlib.crc32(body + head)) + body
@@ -63,7 +63,7 @@ def event(payload: bytes = b'{"a":"\xc3\xa4"}', *, position: int = 42) -> bytes:
     return encode(Frame(EVENT, 3, position, 7, WALL_NS, MONOTONIC_NS, EPISODE, b"NodeStarted", payload), SALT)
 
 
-def test_an_event_has_its_golden_bytes_and_means_what_was_written() -> None:
+def test_an_event_has_its_golden_bytes_and_decodes_to_what_was_written() -> None:
     assert event() == EVENT_BY_HAND == GOLDEN["event"]
     checksum = zlib.crc32(EVENT_BY_HAND[64:] + EVENT_BY_HAND[:60])
     assert decode(GOLDEN["event"], 0, SALT) == Frame(
@@ -71,7 +71,7 @@ def test_an_event_has_its_golden_bytes_and_means_what_was_written() -> None:
     )
 
 
-def test_a_declaration_has_its_golden_bytes_and_means_what_was_written() -> None:
+def test_a_declaration_has_its_golden_bytes_and_decodes_to_what_was_written() -> None:
     frame = decode(GOLDEN["declaration"], 0, SALT)
     assert GOLDEN["declaration"] == DECLARATION_BY_HAND
     assert frame is not None
@@ -79,7 +79,7 @@ def test_a_declaration_has_its_golden_bytes_and_means_what_was_written() -> None
     assert (frame.type, frame.payload, frame.size) == (b"DesignatorTypeDeclared", b"{}", 88)
 
 
-def test_a_commit_has_its_golden_bytes_and_means_what_was_written() -> None:
+def test_a_commit_has_its_golden_bytes_and_decodes_to_what_was_written() -> None:
     encoded = encode_commit(
         position=43, count=2, checksum=0xDEADBEEF, wall_ns=WALL_NS, monotonic_ns=MONOTONIC_NS, salt=SALT
     )
@@ -96,22 +96,22 @@ def test_a_commit_has_its_golden_bytes_and_means_what_was_written() -> None:
 
 
 @pytest.mark.parametrize("name", ["event", "declaration", "commit"])
-def test_a_frame_cut_at_any_byte_is_none(name: str) -> None:
+def test_a_frame_cut_at_any_byte_is_not_read(name: str) -> None:
     for end in range(len(GOLDEN[name])):
         assert decode(GOLDEN[name][:end], 0, SALT) is None, end
 
 
 @pytest.mark.parametrize("name", ["event", "declaration", "commit"])
-def test_a_frame_of_which_only_the_first_bytes_reached_zeros_is_none(name: str) -> None:
+def test_a_frame_whose_last_bytes_are_still_zeros_is_not_read(name: str) -> None:
     whole = GOLDEN[name]
     for end in range(len(whole)):
         torn = whole[:end] + bytes(len(whole) - end + 64)
-        if torn[: len(whole)] != whole:  # the padding is zeros anyway
+        if torn[: len(whole)] != whole:  # the padding consists of zeros anyway
             assert decode(torn, 0, SALT) is None, end
 
 
 @pytest.mark.parametrize("name", ["event", "declaration", "commit"])
-def test_a_frame_with_any_one_bit_flipped_is_none(name: str) -> None:
+def test_a_frame_with_any_one_bit_flipped_is_not_read(name: str) -> None:
     for bit in range(len(GOLDEN[name]) * 8):
         changed = bytearray(GOLDEN[name])
         changed[bit // 8] ^= 1 << bit % 8
@@ -119,30 +119,32 @@ def test_a_frame_with_any_one_bit_flipped_is_none(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["event", "declaration", "commit"])
-def test_what_stands_before_and_after_a_frame_does_not_matter(name: str) -> None:
+def test_bytes_before_and_after_a_frame_do_not_matter(name: str) -> None:
     whole = GOLDEN[name]
-    alone = decode(whole, 0, SALT)
-    assert alone is not None
+    frame_alone = decode(whole, 0, SALT)
+    assert frame_alone is not None
     for around in (b"\0" * 8, b"\xff" * 8, whole):
-        assert decode(around + whole + around, len(around), SALT) == alone
+        assert decode(around + whole + around, len(around), SALT) == frame_alone
 
 
-def test_a_frame_of_another_segment_is_none() -> None:
+def test_a_frame_of_another_segment_is_not_read() -> None:
     assert decode(GOLDEN["event"], 0, SALT + 1) is None
 
 
-def test_space_made_ahead_is_no_frame() -> None:
+def test_preallocated_space_holds_no_frame() -> None:
     assert decode(bytes(4096), 0, SALT) is None
     assert decode(bytes(4096), 0, 0) is None
 
 
-def test_a_length_beyond_the_end_is_none_and_reads_nothing() -> None:
+def test_a_length_beyond_the_end_is_no_frame_and_reads_nothing() -> None:
     head = struct.pack("<BBHIQQqq", 1, 255, 1, 2**32 - 1, 1, 1, 0, 0) + EPISODE + struct.pack("<I", SALT)
     assert decode(head + bytes(4096), 0, SALT) is None
 
 
 @given(st.binary(max_size=300), st.integers(min_value=1, max_value=2**64 - 1), st.binary(max_size=16))
-def test_any_payload_comes_back_and_frames_end_at_multiples_of_8(payload: bytes, position: int, after: bytes) -> None:
+def test_any_payload_is_decoded_unchanged_and_frames_end_at_multiples_of_8(
+    payload: bytes, position: int, after: bytes
+) -> None:
     encoded = event(payload, position=position)
     frame = decode(encoded + after, 0, SALT)
     assert frame is not None
@@ -154,7 +156,7 @@ ROW = (GOLDEN["event"], GOLDEN["declaration"], GOLDEN["commit"], event(b""))
 OFFSETS = (0, 88, 176, 248)
 
 
-def test_frames_that_follow_one_another_come_as_each_decodes_alone() -> None:
+def test_consecutive_frames_decode_as_each_does_alone() -> None:
     row = b"".join(ROW)
     each = list(decode_each(b"12345678" + row + bytes(64), 8, SALT))
     assert each == [decode(row, offset, SALT) for offset in OFFSETS]
@@ -162,7 +164,7 @@ def test_frames_that_follow_one_another_come_as_each_decodes_alone() -> None:
     assert list(decode_each(row, len(row), SALT)) == []
 
 
-def test_frames_end_before_the_first_that_is_cut_at_any_byte() -> None:
+def test_reading_stops_before_the_first_frame_that_is_cut_at_any_byte() -> None:
     row = b"".join(ROW)
     whole = list(decode_each(row, 0, SALT))
     for end in range(len(row)):
@@ -170,7 +172,7 @@ def test_frames_end_before_the_first_that_is_cut_at_any_byte() -> None:
         assert list(decode_each(row[:end], 0, SALT)) == whole[:count], end
 
 
-def test_no_frame_comes_after_one_with_any_one_bit_flipped() -> None:
+def test_reading_stops_after_a_frame_with_any_one_bit_flipped() -> None:
     row = b"".join(ROW)
     whole = list(decode_each(row, 0, SALT))
     for bit in range(88 * 8, 176 * 8):
@@ -179,7 +181,7 @@ def test_no_frame_comes_after_one_with_any_one_bit_flipped() -> None:
         assert list(decode_each(bytes(changed), 0, SALT)) == whole[:1], bit
 
 
-def test_a_frame_is_looked_at_when_it_is_asked_for_and_not_before() -> None:
+def test_a_frame_is_decoded_only_when_it_is_requested() -> None:
     with mmap.mmap(-1, 4096) as buffer:
         buffer[:88] = GOLDEN["event"]
         each = decode_each(buffer, 0, SALT)
@@ -190,7 +192,7 @@ def test_a_frame_is_looked_at_when_it_is_asked_for_and_not_before() -> None:
 
 
 @given(st.lists(st.integers(min_value=0, max_value=2**32 - 1), max_size=50))
-def test_the_checksum_of_a_span_is_that_of_its_records_one_after_the_other(checksums: list[int]) -> None:
+def test_the_checksum_of_a_span_is_that_of_its_records_in_sequence(checksums: list[int]) -> None:
     span = 0
     for checksum in checksums:
         span = zlib.crc32(struct.pack("<I", checksum), span)

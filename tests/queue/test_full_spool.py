@@ -1,4 +1,4 @@
-"""A full spool: ordinary records stop at the reserve, reserved ones at the end, and room wakes who waits."""
+"""A full spool: ordinary records stop at the reserve, reserved ones at the end, and freed space wakes the producers."""
 
 import asyncio
 import contextlib
@@ -15,10 +15,10 @@ from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.queue.files.segment import Segment
 from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
-from tests.queue.factories import DECLARED, SMALL, Author, drain, make, node, started
+from tests.queue.factories import DECLARED, SMALL, FolderWriter, drain, make, node, started
 
-# Every node takes 976 bytes. The first segment holds the start and 3 of them, each other one 3: 24 in 8 segments.
-# Kept free are 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, and these hold 3.
+# Every node takes 976 bytes. The first segment holds the start and 3 nodes, each other segment 3: 24 in 8 segments. The
+# reserve is 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, which hold 3 nodes.
 ORDINARY, ALL = 18, 24
 PAYLOAD = b"x" * 900
 
@@ -46,14 +46,14 @@ async def drain_all(queue: RecorderQueue) -> None:
     await queue.acknowledge(records[-1].position)
 
 
-def test_the_files_never_hold_more_than_allowed_however_much_is_put(filled: RecorderQueue) -> None:
+def test_the_files_never_exceed_the_limit_however_much_is_put(filled: RecorderQueue) -> None:
     assert fill(filled, reserved=True) == ALL - ORDINARY
     assert sum(path.stat().st_size for path in filled.folder.glob("*.segment")) == SMALL.spool_bytes_max
     assert filled.bytes_spooled <= SMALL.spool_bytes_max
     assert filled.written == 1 + ALL
 
 
-def test_what_is_refused_leaves_no_gap_and_smaller_records_may_still_fit(filled: RecorderQueue) -> None:
+def test_a_refused_record_leaves_no_gap_and_smaller_ones_may_still_fit(filled: RecorderQueue) -> None:
     assert filled.full
     with pytest.raises(SpoolFull, match="spool_bytes_max is reached"):
         filled.put_nowait(node(), PAYLOAD)
@@ -61,7 +61,7 @@ def test_what_is_refused_leaves_no_gap_and_smaller_records_may_still_fit(filled:
     assert filled.put_nowait(node(), PAYLOAD, reserved=True) == 3 + ORDINARY
 
 
-async def test_room_comes_when_records_are_stored_and_segments_go(filled: RecorderQueue) -> None:
+async def test_space_is_freed_when_records_are_stored_and_segments_deleted(filled: RecorderQueue) -> None:
     waiting = asyncio.ensure_future(filled.room())
     await asyncio.sleep(0)
     assert not waiting.done()
@@ -72,12 +72,12 @@ async def test_room_comes_when_records_are_stored_and_segments_go(filled: Record
     await asyncio.wait_for(filled.room(), 10)
 
 
-async def test_room_for_a_large_record_is_not_announced_while_only_a_small_one_fits(filled: RecorderQueue) -> None:
+async def test_space_for_a_large_record_is_not_announced_while_only_a_small_one_fits(filled: RecorderQueue) -> None:
     assert filled.put_nowait(node(), b"x") == 2 + ORDINARY
-    assert filled.full  # for what was refused
+    assert filled.full  # for the refused record
 
 
-async def test_a_blocked_thread_goes_on_when_records_are_stored(tmp_path: Path) -> None:
+async def test_a_blocked_thread_continues_when_records_are_stored(tmp_path: Path) -> None:
     queue = make(tmp_path, clock=SYSTEM_CLOCK)
     queue.put_nowait(started(), b"{}")
     fill(queue, reserved=True)
@@ -92,7 +92,7 @@ async def test_a_blocked_thread_goes_on_when_records_are_stored(tmp_path: Path) 
     queue.release()
 
 
-async def test_nobody_waits_for_room_in_a_closed_queue(filled: RecorderQueue) -> None:
+async def test_no_producer_waits_for_space_in_a_closed_queue(filled: RecorderQueue) -> None:
     waiting = asyncio.ensure_future(filled.room())
     blocked = asyncio.ensure_future(asyncio.to_thread(filled.block_until_room, 30.0))
     await asyncio.sleep(0.01)
@@ -102,7 +102,7 @@ async def test_nobody_waits_for_room_in_a_closed_queue(filled: RecorderQueue) ->
         filled.put_nowait(node(), b"{}")
 
 
-async def test_a_full_queue_gives_everything_away_and_goes_on(filled: RecorderQueue) -> None:
+async def test_a_full_queue_supplies_everything_and_then_accepts_records_again(filled: RecorderQueue) -> None:
     fill(filled, reserved=True)
     for _ in range(20):
         await drain_all(filled)
@@ -114,7 +114,7 @@ async def test_a_full_queue_gives_everything_away_and_goes_on(filled: RecorderQu
     assert filled.written == 1 + ALL + 20
 
 
-async def test_who_waits_for_room_in_a_queue_that_nobody_empties_is_told_why(filled: RecorderQueue) -> None:
+async def test_a_producer_that_waits_for_a_queue_that_is_not_drained_learns_why(filled: RecorderQueue) -> None:
     fill(filled, reserved=True)
     waiting = asyncio.ensure_future(filled.room())
     blocked = asyncio.ensure_future(asyncio.to_thread(filled.block_until_room, 1000.0))
@@ -133,7 +133,7 @@ async def test_who_waits_for_room_in_a_queue_that_nobody_empties_is_told_why(fil
         filled.put_nowait(node(), PAYLOAD, reserved=True)
 
 
-async def test_a_queue_that_nobody_empties_takes_what_it_has_room_for(queue: RecorderQueue) -> None:
+async def test_a_queue_that_is_not_drained_accepts_records_until_it_is_full(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
     queue.fail("the log is damaged")
     for _ in range(ORDINARY):
@@ -151,13 +151,13 @@ async def test_a_queue_that_nobody_empties_takes_what_it_has_room_for(queue: Rec
     assert len(await drain(queue)) == 1 + ALL
 
 
-def test_settings_that_cannot_work_are_refused_before_anything_is_made(tmp_path: Path) -> None:
+def test_settings_that_cannot_work_are_refused_before_any_file_is_made(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="three segments"):
         make(tmp_path / "spool", settings=replace(SMALL, spool_reserve_bytes=6 * 4096))
     assert not (tmp_path / "spool").exists()
 
 
-def test_recorder_level_records_count_too(queue: RecorderQueue) -> None:
+def test_records_without_an_episode_count_too(queue: RecorderQueue) -> None:
     assert not queue.full
     put = 0
     with contextlib.suppress(SpoolFull):
@@ -170,13 +170,13 @@ def test_recorder_level_records_count_too(queue: RecorderQueue) -> None:
 def test_a_disk_that_filled_up_while_a_segment_was_prepared_stays_full(
     spool: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    appender = Author(spool, settings=replace(SMALL, spool_bytes_max=2**20)).appender
+    appender = FolderWriter(spool, settings=replace(SMALL, spool_bytes_max=2**20)).appender
     resume = GcSafeLock.resume_gc
 
     def disk_is_full(*_: object, **__: object) -> Segment:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def fill_and_resume(lock: GcSafeLock) -> None:  # the sync thread has not noted yet that a segment is prepared
+    def fill_and_resume(lock: GcSafeLock) -> None:  # the sync thread has not noticed yet that a segment is prepared
         resume(lock)
         monkeypatch.undo()
         with monkeypatch.context() as patch:

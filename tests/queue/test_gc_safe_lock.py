@@ -1,4 +1,4 @@
-"""What the garbage collector closes may record at any moment, and no thread ever waits for itself."""
+"""Finalizers may record at any moment of a garbage collection, and no thread ever waits for itself."""
 
 import asyncio
 import gc
@@ -21,7 +21,7 @@ PATIENCE_S = 20.0
 
 
 class Dropped:
-    """A plan nobody awaits any more: only the collector finds it; closed, it does that, and leaves `again` others."""
+    """A plan in a reference cycle: the collector closes it, which calls a function and leaves `again` further ones."""
 
     def __init__(self, at_its_end: Callable[[], object], again: int = 0) -> None:
         self.itself = self
@@ -34,8 +34,8 @@ class Dropped:
             Dropped(self.at_its_end, self.again - 1)
 
 
-class Hooked:
-    """A clock that stands still, and does something when a queue asks it in the middle of its work."""
+class ClockWithHook:
+    """A frozen clock that calls a function when a queue reads it in the middle of its work."""
 
     def __init__(self) -> None:
         self.meanwhile: Callable[[], object] = lambda: None
@@ -52,7 +52,7 @@ class Hooked:
 
 @pytest.fixture
 def busy_collector() -> Iterator[None]:
-    """Collects at nearly every allocation."""
+    """Make the collector run at nearly every allocation."""
     before = gc.get_threshold()
     gc.collect()
     gc.set_threshold(1)
@@ -61,7 +61,7 @@ def busy_collector() -> Iterator[None]:
 
 
 def finishes(work: Callable[[], object]) -> bool:
-    """Whether this comes to its end in a thread of its own."""
+    """Return whether the work ends in a thread of its own."""
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     thread.join(PATIENCE_S)
@@ -70,13 +70,13 @@ def finishes(work: Callable[[], object]) -> bool:
 
 def leave_garbage(queue: RecorderQueue, count: int, *, payload: bytes = b"from a plan that was dropped") -> None:
     Dropped(lambda: queue.put_nowait(node(), payload, reserved=True), again=count - 1)
-    assert [[] for _ in range(10)]  # something the collector counts
+    assert [[] for _ in range(10)]  # objects that the collector counts
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("busy_collector")
-async def test_a_plan_that_is_collected_while_a_record_is_written_is_recorded_after_it(tmp_path: Path) -> None:
-    hooked = Hooked()
+async def test_a_finalizer_that_runs_during_a_put_records_after_it(tmp_path: Path) -> None:
+    hooked = ClockWithHook()
     queue = make(tmp_path, clock=hooked.clock)
     queue.put_nowait(started(), b"{}")
 
@@ -97,8 +97,8 @@ async def test_a_plan_that_is_collected_while_a_record_is_written_is_recorded_af
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("busy_collector")
-async def test_a_plan_that_is_collected_in_the_sync_thread_does_not_stop_it(tmp_path: Path) -> None:
-    hooked = Hooked()
+async def test_a_finalizer_that_runs_in_the_sync_thread_does_not_stop_it(tmp_path: Path) -> None:
+    hooked = ClockWithHook()
     queue = make(tmp_path, clock=hooked.clock)
     queue.put_nowait(started(), b"{}")
     await asyncio.wait_for(queue.synced_to(), PATIENCE_S)
@@ -121,19 +121,19 @@ async def test_a_plan_that_is_collected_in_the_sync_thread_does_not_stop_it(tmp_
 
 
 @pytest.mark.usefixtures("busy_collector")
-async def test_a_plan_that_is_collected_while_a_segment_is_made_may_need_that_segment(
+async def test_a_finalizer_that_runs_during_the_creation_of_a_segment_may_need_that_segment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     queue = make(tmp_path)
     queue.put_nowait(started(), b"{}")
     allocate = Segment.allocate
-    made: list[int] = []
+    reentered: list[int] = []
     third = threading.Event()
 
     def watched(folder: Path, *, number: int, size: int) -> Segment:
-        if not made:
+        if not reentered:
             leave_garbage(queue, 6, payload=b"x" * 900)  # more than one segment holds
-        made.append(number)
+        reentered.append(number)
         segment = allocate(folder, number=number, size=size)
         if number == 3:
             third.set()
@@ -148,7 +148,7 @@ async def test_a_plan_that_is_collected_while_a_segment_is_made_may_need_that_se
 
 
 @pytest.mark.usefixtures("busy_collector")
-def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
+def test_a_finalizer_that_runs_during_a_notification_may_wait_for_it() -> None:
     bell = Notifier()
     waits: list[bool] = []
 
@@ -162,11 +162,11 @@ def test_a_plan_that_is_collected_while_a_bell_rings_may_wait_for_it() -> None:
     assert waits
 
 
-def test_of_two_that_notify_the_same_waiter_at_once_one_wakes_it_and_neither_fails() -> None:
+def test_of_two_concurrent_notifications_one_wakes_the_waiter_and_neither_fails() -> None:
     notifier, both_have_copied = Notifier(), threading.Barrier(2)
 
     class Tickets(set[Future[None]]):
-        """Lets a thread go on from its copy of the tickets only when the other has its own."""
+        """Hold each thread after its copy of the tickets until the other thread has one too."""
 
         def __iter__(self) -> Iterator[Future[None]]:
             copy = list(super().__iter__())
@@ -186,7 +186,7 @@ def test_of_two_that_notify_the_same_waiter_at_once_one_wakes_it_and_neither_fai
 
 
 @pytest.mark.parametrize("running", [True, False])
-async def test_the_collector_is_left_as_it_was_found(tmp_path: Path, running: bool) -> None:
+async def test_the_collector_keeps_the_state_in_which_it_was(tmp_path: Path, running: bool) -> None:
     if not running:
         gc.disable()
     try:
@@ -203,8 +203,8 @@ async def test_the_collector_is_left_as_it_was_found(tmp_path: Path, running: bo
         gc.enable()
 
 
-async def test_a_record_inside_a_record_is_refused_and_both_threads_go_on(tmp_path: Path) -> None:
-    hooked = Hooked()
+async def test_a_record_inside_a_record_is_refused_and_both_threads_continue(tmp_path: Path) -> None:
+    hooked = ClockWithHook()
     queue = make(tmp_path, clock=hooked.clock)
     queue.put_nowait(started(), b"{}")
 
@@ -225,8 +225,8 @@ async def test_a_record_inside_a_record_is_refused_and_both_threads_go_on(tmp_pa
     queue.release()
 
 
-async def test_the_sync_thread_never_waits_for_the_room_it_makes(tmp_path: Path) -> None:
-    hooked = Hooked()
+async def test_the_sync_thread_never_waits_for_the_space_that_it_frees(tmp_path: Path) -> None:
+    hooked = ClockWithHook()
     queue = make(tmp_path, clock=hooked.clock)
     queue.put_nowait(started(), b"{}")
     with pytest.raises(SpoolFull):

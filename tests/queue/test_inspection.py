@@ -1,4 +1,4 @@
-"""What is in a spool is told as it is, and telling it changes nothing."""
+"""Inspection reports the content of a spool and changes nothing."""
 
 import threading
 from pathlib import Path
@@ -12,7 +12,7 @@ from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.maintenance.inspection import OpenEpisode, inspect_spool
 from pycrorm_async.queue.maintenance.repair import repair_folder
 from pycrorm_async.settings import Settings
-from tests.queue.factories import DECLARED, RECORDER, WALL_NS, Author, ended, episode, node, overwrite, started
+from tests.queue.factories import DECLARED, RECORDER, WALL_NS, FolderWriter, ended, episode, node, overwrite, started
 
 
 def everything_in(folder: Path) -> dict[str, bytes | None]:
@@ -20,11 +20,11 @@ def everything_in(folder: Path) -> dict[str, bytes | None]:
 
 
 @pytest.fixture
-def author(spool: Path) -> Author:
-    return Author(spool)
+def author(spool: Path) -> FolderWriter:
+    return FolderWriter(spool)
 
 
-def test_a_dead_recorders_folder_is_told_whole_and_left_as_it_is(author: Author) -> None:
+def test_a_dead_recorders_folder_is_reported_whole_and_left_as_it_is(author: FolderWriter) -> None:
     spool = author.folder.parent
     Spool(spool).bind("the-log")
     for heading in (DECLARED, started(1), node(1), started(2), ended(1), node(2)):
@@ -52,7 +52,7 @@ def test_a_dead_recorders_folder_is_told_whole_and_left_as_it_is(author: Author)
     assert (one.damage, one.refused, one.foreign, one.cut_off) == (None, None, (), ())
 
 
-def test_damage_is_told_with_its_place_and_what_stands_before_it(author: Author) -> None:
+def test_damage_is_reported_with_its_place_and_what_precedes_it(author: FolderWriter) -> None:
     for heading in (started(), node(), node()):
         author.put(heading)
     author.sync()
@@ -70,18 +70,18 @@ def test_damage_is_told_with_its_place_and_what_stands_before_it(author: Author)
     assert (after.recorders[0].damage, after.strangers) == (None, ())
 
 
-def test_who_holds_a_folder_is_told(author: Author) -> None:
+def test_the_holders_of_a_folder_are_reported(author: FolderWriter) -> None:
     author.put(started())
     recovered = open_dead(author.folder)
     assert recovered is not None
     [one] = inspect_spool(author.folder.parent).recorders
-    assert (one.alive, one.being_drained) == (True, True)  # who drains a dead one holds both
+    assert (one.alive, one.being_drained) == (True, True)  # the drainer of a dead folder holds both locks
     recovered.release()
     [one] = inspect_spool(author.folder.parent).recorders
     assert (one.alive, one.being_drained) == (False, False)
 
 
-async def test_a_living_recorder_that_writes_and_forgets_is_never_taken_for_damaged(spool: Path) -> None:
+async def test_a_live_recorder_that_writes_and_deletes_never_looks_damaged(spool: Path) -> None:
     settings = Settings(
         sync_interval_ms=1,
         segment_bytes=2**14,
@@ -116,7 +116,7 @@ async def test_a_living_recorder_that_writes_and_forgets_is_never_taken_for_dama
         over.set()
         thread.join()
     assert seen == sorted(seen)
-    assert seen[-1] > 1  # files went meanwhile
+    assert seen[-1] > 1  # the files were deleted meanwhile
     queue.close()
     queue.release()
 
@@ -124,7 +124,7 @@ async def test_a_living_recorder_that_writes_and_forgets_is_never_taken_for_dama
 # --- bad input --------------------------------------------------------------------------------------------------
 
 
-def test_what_is_no_spool_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_folder_that_is_no_spool_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "photo.jpg").touch()
@@ -139,7 +139,7 @@ def test_what_is_no_spool_is_refused_in_one_line(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "folder", "photo.jpg"]
 
 
-def test_a_foreign_file_and_a_stranger_are_named(author: Author) -> None:
+def test_a_foreign_file_and_a_foreign_recorder_are_named(author: FolderWriter) -> None:
     author.put(started())
     (author.folder / "notes.txt").touch()
     (author.folder / "00000001.segment.tail").touch()
@@ -155,7 +155,7 @@ def test_a_foreign_file_and_a_stranger_are_named(author: Author) -> None:
     assert report.recorders[0].records == 1
 
 
-def test_a_newer_format_and_an_unreadable_file_are_told_beside_the_others(author: Author) -> None:
+def test_a_newer_format_and_an_unreadable_file_are_reported_beside_the_others(author: FolderWriter) -> None:
     author.put(started())
     overwrite(author.segments[0], 8, b"\x02")
     [one] = inspect_spool(author.folder.parent).recorders

@@ -1,4 +1,4 @@
-"""A living recorder's folder drained by another: all that is synced, once, in order, and nothing deleted early."""
+"""Drain a live recorder's folder in another process: all synced records, once, in order, and nothing deleted early."""
 
 import asyncio
 import contextlib
@@ -39,19 +39,19 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def offered(spool: Path) -> Iterator[RecorderQueue]:
-    made = make(spool, clock=SYSTEM_CLOCK, offered=True)
-    yield made
-    made.release()
+    queue = make(spool, clock=SYSTEM_CLOCK, offered=True)
+    yield queue
+    queue.release()
 
 
-def taken(queue: RecorderQueue) -> LiveSource:
-    found = LiveSource.take(queue.folder)
-    assert found is not None
-    return found
+def take(queue: RecorderQueue) -> LiveSource:
+    source = LiveSource.take(queue.folder)
+    assert source is not None
+    return source
 
 
-async def some(source: LiveSource, *, events_max: int = 10_000, bytes_max: int = 2**22) -> list[int]:
-    """The positions of the next batch, which must come within a minute."""
+async def next_positions(source: LiveSource, *, events_max: int = 10_000, bytes_max: int = 2**22) -> list[int]:
+    """Return the positions of the next batch, which must arrive within a minute."""
     batch = await asyncio.wait_for(
         source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=0.05), timeout=60
     )
@@ -62,19 +62,19 @@ def segments(queue: RecorderQueue) -> list[str]:
     return sorted(path.name for path in queue.folder.glob("*.segment"))
 
 
-async def eventually(what: Callable[[], bool]) -> None:
-    """Waits until this function says so; a minute at most."""
+async def eventually(condition: Callable[[], bool]) -> None:
+    """Wait until the condition holds, for a minute at most."""
     async with asyncio.timeout(60):
-        while not what():  # noqa: ASYNC110 - what another thread or process does sets no event of ours
+        while not condition():  # noqa: ASYNC110 - what another thread or process does sets no event of ours
             await asyncio.sleep(0.005)
 
 
-# --- what is given ------------------------------------------------------------------------------------------------
+# --- supplied records -------------------------------------------------------------------------------------------------
 
 
-async def test_what_is_synced_is_given_whole_and_in_order_over_many_segments(spool: Path) -> None:
+async def test_synced_records_are_supplied_whole_and_in_order_over_many_segments(spool: Path) -> None:
     queue = make(spool, offered=True)
-    source = taken(queue)
+    source = take(queue)
     queue.put_nowait(DECLARED, b"{}")
     queue.put_nowait(started(), b"{}")
     for number in range(30):
@@ -85,7 +85,7 @@ async def test_what_is_synced_is_given_whole_and_in_order_over_many_segments(spo
     while not records or records[-1].type != "EpisodeEnded":
         records += await source.get_batch(events_max=7, bytes_max=2**22, age_s_max=0.05)
     assert [each.position for each in records] == list(range(1, queue.written + 1))
-    declarations = [each for each in records if each.episode is None]  # repeated where a segment begins
+    declarations = [each for each in records if each.episode is None]  # repeated at the beginning of a segment
     assert declarations == [record(each.position, DECLARED, 0, b"{}") for each in declarations]
     assert (declarations[0].position, len(declarations)) == (1, queue.written - 32)
     assert [each._replace(position=0) for each in records if each.episode is not None] == [
@@ -98,11 +98,11 @@ async def test_what_is_synced_is_given_whole_and_in_order_over_many_segments(spo
     queue.release()
 
 
-async def test_what_is_not_synced_is_not_given(spool: Path) -> None:
+async def test_records_that_are_not_synced_are_not_supplied(spool: Path) -> None:
     queue = make(spool, settings=replace(SMALL, sync_interval_ms=3_600_000), offered=True)
-    source = taken(queue)
+    source = take(queue)
     queue.put_nowait(started(), b"{}")
-    waiting = asyncio.ensure_future(some(source))
+    waiting = asyncio.ensure_future(next_positions(source))
     await asyncio.sleep(0.1)
     assert not waiting.done()
     await queue.synced_to()
@@ -112,47 +112,47 @@ async def test_what_is_not_synced_is_not_given(spool: Path) -> None:
 
 
 async def test_limits_of_a_batch_hold_and_a_larger_record_comes_alone(offered: RecorderQueue) -> None:
-    source = taken(offered)
+    source = take(offered)
     offered.put_nowait(started(), b"x" * 10)
     for size in (10, 10, 1000, 10):
         offered.put_nowait(node(), b"x" * size)
     await offered.synced_to()
-    assert await some(source, events_max=2) == [1, 2]
-    assert await some(source, bytes_max=500) == [3]
-    assert await some(source, bytes_max=500) == [4]
-    assert await some(source, bytes_max=500) == [5]
+    assert await next_positions(source, events_max=2) == [1, 2]
+    assert await next_positions(source, bytes_max=500) == [3]
+    assert await next_positions(source, bytes_max=500) == [4]
+    assert await next_positions(source, bytes_max=500) == [5]
     source.release()
 
 
-async def test_after_finish_only_what_was_synced_then_is_given(offered: RecorderQueue) -> None:
-    source = taken(offered)
+async def test_after_finish_only_records_that_were_synced_before_are_supplied(offered: RecorderQueue) -> None:
+    source = take(offered)
     offered.put_nowait(started(), b"{}")
     await offered.synced_to()
     await eventually(lambda: source._progress.recorded().synced == 1)
     source.finish()
     offered.put_nowait(node(), b"{}")
     await offered.synced_to()
-    assert await some(source) == [1]
-    assert await some(source) == []
-    assert await some(source) == []
+    assert await next_positions(source) == [1]
+    assert await next_positions(source) == []
+    assert await next_positions(source) == []
     source.release()
-    again = taken(offered)
-    assert await some(again) == [1, 2]
+    again = take(offered)
+    assert await next_positions(again) == [1, 2]
     again.release()
 
 
-# --- who may ------------------------------------------------------------------------------------------------------
+# --- permission to drain ----------------------------------------------------------------------------------------------
 
 
-async def test_a_folder_is_drained_by_one_only(offered: RecorderQueue) -> None:
+async def test_a_folder_is_drained_by_one_source_only(offered: RecorderQueue) -> None:
     assert not offered.is_drained
-    source = taken(offered)
+    source = take(offered)
     assert offered.is_drained
     assert LiveSource.take(offered.folder) is None
     source.release()
     source.release()
     assert not offered.is_drained
-    taken(offered).release()
+    take(offered).release()
 
 
 async def test_a_queue_that_its_own_process_drains_is_not_taken(queue: RecorderQueue) -> None:
@@ -166,7 +166,7 @@ async def test_a_queue_that_its_own_process_drains_is_not_taken(queue: RecorderQ
 
 
 @pytest.mark.parametrize("size", [0, 4095])
-async def test_a_folder_whose_progress_is_missing_or_short_is_not_taken(offered: RecorderQueue, size: int) -> None:
+async def test_a_folder_whose_progress_file_is_missing_or_short_is_not_taken(offered: RecorderQueue, size: int) -> None:
     os.truncate(offered.folder / "progress", size)
     assert LiveSource.take(offered.folder) is None
     (offered.folder / "progress").unlink()
@@ -174,26 +174,26 @@ async def test_a_folder_whose_progress_is_missing_or_short_is_not_taken(offered:
     assert not offered.is_drained
 
 
-async def test_a_folder_that_is_not_there_any_more_is_not_taken_and_not_made_again(spool: Path) -> None:
+async def test_a_deleted_folder_is_neither_taken_nor_made_again(spool: Path) -> None:
     queue = make(spool, offered=True)
     queue.release()
     assert LiveSource.take(queue.folder) is None
     assert not queue.folder.exists()
 
 
-# --- what is stored -----------------------------------------------------------------------------------------------
+# --- stored records ---------------------------------------------------------------------------------------------------
 
 
-async def test_segments_go_when_they_are_stored_and_not_before(offered: RecorderQueue) -> None:
-    source = taken(offered)
+async def test_segments_are_deleted_when_they_are_stored_and_not_before(offered: RecorderQueue) -> None:
+    source = take(offered)
     offered.put_nowait(started(), b"{}")
     fill(offered)
     await offered.synced_to()
     before = segments(offered)
-    assert await some(source) == list(range(1, 2 + ORDINARY))
+    assert await next_positions(source) == list(range(1, 2 + ORDINARY))
     await asyncio.sleep(0.2)
     assert segments(offered)[: len(before)] == before
-    assert len(segments(offered)) <= len(before) + 1  # the next one may have been made ready meanwhile
+    assert len(segments(offered)) <= len(before) + 1  # the next segment may already be prepared
     assert offered.stored == 0
     await source.acknowledge(4)  # the first segment holds four records
     await eventually(lambda: segments(offered)[0] == "00000002.segment")
@@ -201,34 +201,34 @@ async def test_segments_go_when_they_are_stored_and_not_before(offered: Recorder
     await source.acknowledge(1 + ORDINARY)
     await eventually(lambda: len(segments(offered)) <= 2)
     assert offered.stored == 1 + ORDINARY
-    # Draining goes on where the segments that are gone ended.
+    # Draining continues where the deleted segments ended.
     offered.put_nowait(ended(), b"{}")
-    assert await some(source) == [2 + ORDINARY]
+    assert await next_positions(source) == [2 + ORDINARY]
     source.release()
 
 
-async def test_another_drainer_goes_on_behind_what_is_stored(offered: RecorderQueue) -> None:
+async def test_another_drainer_continues_after_the_stored_records(offered: RecorderQueue) -> None:
     offered.put_nowait(started(), b"{}")
     fill(offered)
     await offered.synced_to()
     for events, first in ((5, 1), (3, 5), (4, 7), (7, 10)):
-        source = taken(offered)
-        positions = await some(source, events_max=events)
+        source = take(offered)
+        positions = await next_positions(source, events_max=events)
         assert positions == list(range(first, first + events))
-        await source.acknowledge(positions[-2])  # the last one was appended, and then it was killed
+        await source.acknowledge(positions[-2])  # appended by the last drainer, which was killed then
         source.release()
         await asyncio.sleep(0.06)
-    source = taken(offered)
-    assert await some(source) == [16, 17, 18, 19]
+    source = take(offered)
+    assert await next_positions(source) == [16, 17, 18, 19]
     await source.acknowledge(19)
     source.release()
-    source = taken(offered)
+    source = take(offered)
     offered.put_nowait(ended(), b"{}")
-    assert await some(source) == [20]
+    assert await next_positions(source) == [20]
     source.release()
 
 
-async def test_a_full_spool_that_is_emptied_from_outside_wakes_who_waits(offered: RecorderQueue) -> None:
+async def test_a_full_spool_that_another_process_drains_wakes_the_producers(offered: RecorderQueue) -> None:
     offered.put_nowait(started(), b"{}")
     assert fill(offered) == ORDINARY
     assert fill(offered, reserved=True) == ALL - ORDINARY
@@ -237,8 +237,8 @@ async def test_a_full_spool_that_is_emptied_from_outside_wakes_who_waits(offered
     blocked.start()
     await asyncio.sleep(0.15)
     assert not waiting.done()
-    source = taken(offered)
-    positions = await some(source)
+    source = take(offered)
+    positions = await next_positions(source)
     await source.acknowledge(positions[-1])
     await asyncio.wait_for(waiting, 30)
     await asyncio.to_thread(blocked.join, 30)
@@ -247,12 +247,12 @@ async def test_a_full_spool_that_is_emptied_from_outside_wakes_who_waits(offered
     source.release()
 
 
-async def test_who_waits_is_told_why_nothing_more_is_stored_and_waits_again_for_the_next_drainer(
+async def test_a_waiting_producer_learns_why_nothing_more_is_stored_and_waits_again_for_the_next_drainer(
     offered: RecorderQueue,
 ) -> None:
     offered.put_nowait(started(), b"{}")
     fill(offered)
-    source = taken(offered)
+    source = take(offered)
     waiting = asyncio.ensure_future(offered.room())
     await asyncio.sleep(0.1)
     source.fail("the episode was refused")
@@ -260,18 +260,18 @@ async def test_who_waits_is_told_why_nothing_more_is_stored_and_waits_again_for_
     with pytest.raises(SpoolStuck, match="cannot be emptied: the episode was refused"):
         await asyncio.wait_for(waiting, 30)
     source.release()
-    source = taken(offered)
+    source = take(offered)
     waiting = asyncio.ensure_future(offered.room())
     await eventually(lambda: offered._appender.stuck is None)
-    positions = await some(source)
+    positions = await next_positions(source)
     await source.acknowledge(positions[-1])
-    with contextlib.suppress(SpoolStuck):  # it may have begun to wait before the new one was seen
+    with contextlib.suppress(SpoolStuck):  # it may have begun to wait before it saw the new drainer
         await asyncio.wait_for(waiting, 30)
     await asyncio.wait_for(offered.room(), 30)
     source.release()
 
 
-async def test_what_cannot_be_true_is_not_believed(offered: RecorderQueue) -> None:
+async def test_impossible_progress_is_ignored(offered: RecorderQueue) -> None:
     offered.put_nowait(started(), b"{}")
     await offered.synced_to()
     lying = Progress.open(offered.folder, writing=True)
@@ -280,38 +280,38 @@ async def test_what_cannot_be_true_is_not_believed(offered: RecorderQueue) -> No
     assert (offered.stored, offered.external_drain_status) == (0, DrainStatus())
     lying.write_drain_status(DrainStatus(stored=1, folded=1))
     assert (offered.stored, offered.external_drain_status) == (1, DrainStatus(1, 1))
-    source = taken(offered)
+    source = take(offered)
     lying.write_recorder_status(RecorderStatus(synced=9))
     with pytest.raises(SpoolDamaged, match="position 2 is missing"):
-        await some(source)
+        await next_positions(source)
     source.release()
     lying.close()
 
 
-async def test_what_shows_and_what_stopped_is_heard_at_once(offered: RecorderQueue) -> None:
+async def test_visibility_and_stops_are_noticed_at_once(offered: RecorderQueue) -> None:
     offered.put_nowait(started(), b"{}")
     await offered.synced_to()
-    source = taken(offered)
-    assert await some(source) == [1]
+    source = take(offered)
+    assert await next_positions(source) == [1]
     source.mark_unavailable("locked")
     source.mark_visible(1, {"an episode": "parked"})
-    said = offered.external_drain_status
-    assert said is not None
-    assert (said.stored, said.folded) == (0, 1)
-    assert (said.note.unavailable, said.note.stopped) == ("locked", {"an episode": "parked"})
+    status = offered.external_drain_status
+    assert status is not None
+    assert (status.stored, status.folded) == (0, 1)
+    assert (status.note.unavailable, status.note.stopped) == ("locked", {"an episode": "parked"})
     source.mark_unavailable(None)
-    said = offered.external_drain_status
-    assert said is not None
-    assert said.note.unavailable is None
+    status = offered.external_drain_status
+    assert status is not None
+    assert status.note.unavailable is None
     source.release()
 
 
 # --- the end ------------------------------------------------------------------------------------------------------
 
 
-async def test_a_queue_that_is_closed_ends_and_deletes_itself_when_all_is_stored(spool: Path) -> None:
+async def test_a_closed_queue_ends_and_deletes_itself_when_all_is_stored(spool: Path) -> None:
     queue = make(spool, offered=True)
-    source = taken(queue)
+    source = take(queue)
     queue.put_nowait(started(), b"{}")
     queue.put_nowait(ended(), b"{}")
     queue.close()
@@ -321,29 +321,29 @@ async def test_a_queue_that_is_closed_ends_and_deletes_itself_when_all_is_stored
     assert LiveSource.take(queue.folder) is None
     queue.release()
     assert not queue.folder.exists()
-    source.mark_visible(2, {})  # said into a file that is gone, which is nobody's harm
+    source.mark_visible(2, {})  # written to a deleted file, which harms no process
     source.release()
 
 
-async def test_a_queue_that_leaves_before_all_is_stored_leaves_a_dead_folder(spool: Path) -> None:
+async def test_a_queue_that_is_released_before_all_is_stored_leaves_a_dead_folder(spool: Path) -> None:
     queue = make(spool, offered=True)
-    source = taken(queue)
+    source = take(queue)
     queue.put_nowait(started(), b"{}")
     queue.put_nowait(ended(), b"{}")
     await queue.synced_to()
-    assert await some(source, events_max=1) == [1]
+    assert await next_positions(source, events_max=1) == [1]
     await source.acknowledge(1)
     queue.release()
     async with asyncio.timeout(30):
         while await source.get_batch(events_max=1, bytes_max=2**20, age_s_max=0.0):
             pass
-    assert open_dead(queue.folder) is None  # while it is held
+    assert open_dead(queue.folder) is None  # while the source holds the folder
     source.release()
     assert LiveSource.take(queue.folder) is None
     assert await recover(queue.folder) == [record(1, started(), 1, b"{}"), record(2, ended(), 2, b"{}")]
 
 
-async def test_recovery_ignores_what_progress_says_and_removes_it(spool: Path) -> None:
+async def test_recovery_ignores_and_deletes_the_progress_file(spool: Path) -> None:
     queue = make(spool, offered=True)
     queue.put_nowait(started(), b"{}")
     await queue.synced_to()
@@ -357,7 +357,9 @@ async def test_recovery_ignores_what_progress_says_and_removes_it(spool: Path) -
     assert not queue.folder.exists()
 
 
-async def test_a_recorder_killed_while_it_is_drained_ends_the_source_and_recovery_gives_all_again(spool: Path) -> None:
+async def test_a_recorder_killed_while_it_is_drained_ends_the_source_and_recovery_supplies_all_again(
+    spool: Path,
+) -> None:
     script = (
         "import sys, threading\n"
         "from pathlib import Path\n"
@@ -378,22 +380,22 @@ async def test_a_recorder_killed_while_it_is_drained_ends_the_source_and_recover
         (folder,) = Spool(spool).recorders()
         source = LiveSource.take(folder.path)
         assert source is not None
-        given: list[Record] = []
-        while len(given) < 11:
-            given += await source.get_batch(events_max=4, bytes_max=2**20, age_s_max=0.0)
+        supplied: list[Record] = []
+        while len(supplied) < 11:
+            supplied += await source.get_batch(events_max=4, bytes_max=2**20, age_s_max=0.0)
         await source.acknowledge(6)
-        waiting = asyncio.ensure_future(some(source))
+        waiting = asyncio.ensure_future(next_positions(source))
         await asyncio.sleep(0.05)
         process.send_signal(signal.SIGKILL)
         assert await waiting == []
         assert not source.is_alive
         source.release()
-    assert given[0].episode == episode(1)
-    assert await recover(folder.path) == [*given, lost(12, 1, 12)]
+    assert supplied[0].episode == episode(1)
+    assert await recover(folder.path) == [*supplied, lost(12, 1, 12)]
 
 
-async def test_a_forked_child_says_nothing_in_the_name_of_its_parent(offered: RecorderQueue) -> None:
-    source = taken(offered)
+async def test_a_forked_child_writes_nothing_in_the_name_of_its_parent(offered: RecorderQueue) -> None:
+    source = take(offered)
     offered.put_nowait(started(), b"{}")
     await offered.synced_to()
     child = os.fork()
@@ -403,8 +405,8 @@ async def test_a_forked_child_says_nothing_in_the_name_of_its_parent(offered: Re
         os._exit(0)
     os.waitpid(child, 0)  # noqa: ASYNC222
     assert source._progress.recorded() == RecorderStatus(1, closed=False)
-    assert await some(source) == [1]
+    assert await next_positions(source) == [1]
     with contextlib.suppress(SpoolFull):
         offered.put_nowait(ended(), b"{}")
-    assert await some(source) == [2]
+    assert await next_positions(source) == [2]
     source.release()

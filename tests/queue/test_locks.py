@@ -1,4 +1,4 @@
-"""Locks: one holder at a time, gone with the holder, and a forked child holds none."""
+"""File locks: one holder at a time, released when the holder dies, and never held by a forked child."""
 
 import os
 import signal
@@ -11,7 +11,7 @@ import pytest
 from pycrorm_async.queue.files.locks import FileLock, is_locked
 
 
-def test_a_lock_has_one_holder_and_can_be_taken_when_it_was_let_go(tmp_path: Path) -> None:
+def test_a_lock_has_one_holder_and_can_be_taken_after_its_release(tmp_path: Path) -> None:
     path = tmp_path / "alive"
     assert is_locked(path) is False
     first = FileLock.take(path)
@@ -26,12 +26,12 @@ def test_a_lock_has_one_holder_and_can_be_taken_when_it_was_let_go(tmp_path: Pat
     second.release()
 
 
-def test_a_lock_that_is_not_there_is_not_made_unless_asked_for(tmp_path: Path) -> None:
+def test_a_missing_lock_file_is_made_only_on_request(tmp_path: Path) -> None:
     assert FileLock.take(tmp_path / "alive", create=False) is None
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_kernel_lets_go_when_the_holder_is_killed(tmp_path: Path) -> None:
+def test_the_kernel_releases_the_lock_of_a_killed_holder(tmp_path: Path) -> None:
     path = tmp_path / "alive"
     program = (
         "import sys, pathlib; from pycrorm_async.queue.files.locks import FileLock;"
@@ -50,14 +50,14 @@ def test_the_kernel_lets_go_when_the_holder_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_forked_child_neither_keeps_a_lock_nor_lets_it_go(tmp_path: Path) -> None:
+def test_a_forked_child_neither_keeps_nor_releases_a_lock(tmp_path: Path) -> None:
     path = tmp_path / "alive"
     lock = FileLock.take(path)
     assert lock is not None
     begin_read, begin_write = os.pipe()
     child = os.fork()
     if child == 0:
-        lock.release()  # closed already: must not unlock what the parent holds
+        lock.release()  # already closed: the child must not unlock what the parent holds
         os.read(begin_read, 1)
         os._exit(0)
     try:
@@ -72,7 +72,7 @@ def test_a_forked_child_neither_keeps_a_lock_nor_lets_it_go(tmp_path: Path) -> N
 
 
 def test_a_lock_whose_file_was_deleted_meanwhile_is_not_taken(tmp_path: Path) -> None:
-    """Between opening and locking the holder before may delete the file: the lock would be on nothing."""
+    """Between open and lock the previous holder may delete the file, so that the lock would protect nothing."""
     path = tmp_path / "alive"
     held = FileLock.take(path)
     assert held is not None

@@ -1,4 +1,4 @@
-"""The live queue: places and sequences, safety levels, batches, acknowledging, closing."""
+"""The live queue: positions and sequences, safety levels, batches, acknowledging and closing."""
 
 import asyncio
 import signal
@@ -21,7 +21,7 @@ from pycrorm_async.writer.ports import Source
 from tests.queue.factories import (
     DECLARED,
     SMALL,
-    as_left_by_a_kill,
+    crashed_copy,
     drain,
     ended,
     lost,
@@ -41,14 +41,14 @@ def batch_of(
     return asyncio.ensure_future(queue.get_batch(events_max=events, bytes_max=bytes_max, age_s_max=age_s))
 
 
-def test_it_is_what_the_hooks_and_the_writer_ask_for(queue: RecorderQueue) -> None:
+def test_a_recorder_queue_implements_the_ports_of_hooks_and_writer(queue: RecorderQueue) -> None:
     sink: EventSink = queue
     source: Source = queue
     assert sink.full is False
     assert source.name == queue.folder.name
 
 
-async def test_records_come_back_in_order_as_they_were_put(queue: RecorderQueue) -> None:
+async def test_records_come_back_in_the_order_of_their_puts(queue: RecorderQueue) -> None:
     assert queue.put_nowait(DECLARED, b'{"kind":"action"}') == 0
     assert queue.put_nowait(started(1), b"{}") == 1
     assert queue.put_nowait(started(2), b"{}") == 1
@@ -65,17 +65,17 @@ async def test_records_come_back_in_order_as_they_were_put(queue: RecorderQueue)
     ]
 
 
-async def test_what_was_written_is_there_after_a_kill_before_any_sync(tmp_path: Path) -> None:
+async def test_a_written_record_survives_a_kill_before_any_sync(tmp_path: Path) -> None:
     queue = make(tmp_path / "a", settings=Settings(sync_interval_ms=3_600_000))
     queue.put_nowait(started(), b"{}")
     queue.put_nowait(node(), b"1")
     assert queue.synced == 0
-    left = as_left_by_a_kill(queue, tmp_path / "b")
+    left = crashed_copy(queue, tmp_path / "b")
     queue.release()
     assert await recover(left) == [record(1, started(), 1, b"{}"), record(2, node(), 2, b"1"), lost(3, 1, 3)]
 
 
-async def test_only_synced_records_are_given_away(tmp_path: Path) -> None:
+async def test_only_synced_records_are_supplied(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
     queue.put_nowait(started(), b"{}")
     waiting = batch_of(queue, 10)
@@ -86,16 +86,16 @@ async def test_only_synced_records_are_given_away(tmp_path: Path) -> None:
     queue.release()
 
 
-async def test_a_sync_comes_by_itself_and_for_each_of_many_waiters_in_several_loops(queue: RecorderQueue) -> None:
+async def test_a_sync_happens_unasked_and_serves_many_waiters_in_several_loops(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
     others = [asyncio.to_thread(asyncio.run, queue.synced_to(1)) for _ in range(3)]
     await asyncio.gather(queue.synced_to(), queue.synced_to(1), *others)
     assert queue.synced == 1
     queue.put_nowait(node(), b"{}")
-    assert [each.position for each in await batch_of(queue, 2, age_s=LONG_S)] == [1, 2]  # nobody asked for this sync
+    assert [each.position for each in await batch_of(queue, 2, age_s=LONG_S)] == [1, 2]  # no caller requested this sync
 
 
-async def test_a_waiter_that_gives_up_leaves_the_others_waiting(tmp_path: Path) -> None:
+async def test_a_cancelled_waiter_leaves_the_others_waiting(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
     queue.put_nowait(started(), b"{}")
     waiting = batch_of(queue, 1)
@@ -109,7 +109,7 @@ async def test_a_waiter_that_gives_up_leaves_the_others_waiting(tmp_path: Path) 
     queue.release()
 
 
-async def test_sequences_of_many_threads_have_no_gaps_and_no_doubles(tmp_path: Path) -> None:
+async def test_sequences_of_many_threads_have_no_gaps_and_no_duplicates(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12))
     queue.put_nowait(started(0), b"{}")
     returned: list[tuple[int, int]] = []
@@ -161,7 +161,7 @@ async def test_a_record_that_no_segment_can_hold_is_refused_and_leaves_no_gap(qu
     assert [len(each.payload) for each in await drain(queue)] == [2, largest]
 
 
-async def test_as_many_episodes_are_open_as_leave_room_for_the_largest_record(queue: RecorderQueue) -> None:
+async def test_episodes_are_opened_while_there_is_space_for_the_largest_record(queue: RecorderQueue) -> None:
     most = (4096 - 2 * 72 - 56 - 64 - 2304) // 40
     for number in range(most):
         queue.put_nowait(started(number), b"{}")
@@ -175,7 +175,7 @@ async def test_as_many_episodes_are_open_as_leave_room_for_the_largest_record(qu
     assert len(await drain(queue)) == most + 5
 
 
-async def test_a_type_name_that_has_no_place_in_a_frame_is_refused(queue: RecorderQueue) -> None:
+async def test_a_type_name_too_long_for_a_frame_is_refused(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
     for name in ("", "x" * 256, "ä" * 128):
         with pytest.raises(InternalError, match="1 to 255 bytes"):
@@ -183,7 +183,7 @@ async def test_a_type_name_that_has_no_place_in_a_frame_is_refused(queue: Record
     assert queue.put_nowait(Heading(started().episode, "ä" * 127, 1), b"{}") == 2
 
 
-async def test_a_batch_closes_at_the_number_of_events(queue: RecorderQueue) -> None:
+async def test_a_batch_is_complete_at_the_limit_of_events(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
     for _ in range(5):
         queue.put_nowait(node(), b"{}")
@@ -192,7 +192,7 @@ async def test_a_batch_closes_at_the_number_of_events(queue: RecorderQueue) -> N
     assert [each.position for each in await batch_of(queue, 2, age_s=LONG_S)] == [5, 6]
 
 
-async def test_a_batch_closes_at_its_bytes_and_a_larger_record_comes_alone(queue: RecorderQueue) -> None:
+async def test_a_batch_is_complete_at_its_bytes_and_a_larger_record_comes_alone(queue: RecorderQueue) -> None:
     for payload in (started(), node(), node(), node(), node()):
         queue.put_nowait(payload, b"x" * 100)
     queue.put_nowait(node(), b"x" * 1000)
@@ -204,7 +204,7 @@ async def test_a_batch_closes_at_its_bytes_and_a_larger_record_comes_alone(queue
     assert [len(each.payload) for each in await batch_of(queue, 99, bytes_max=250)] == [1]
 
 
-async def test_a_batch_closes_at_its_age_and_takes_what_came_until_then(
+async def test_a_batch_is_complete_at_its_age_with_the_records_that_came_until_then(
     queue: RecorderQueue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop = asyncio.get_running_loop()
@@ -225,13 +225,13 @@ async def test_a_batch_closes_at_its_age_and_takes_what_came_until_then(
 
 
 async def steps(count: int) -> None:
-    """Whatever is ready in the loop takes its turn, so often, and the sync thread before it."""
+    """Run the ready callbacks of the loop this many times, and the sync thread before each."""
     for _ in range(count):
         time.sleep(0.005)  # noqa: ASYNC251  the loop's own clock stands still
         await asyncio.sleep(0)
 
 
-async def test_a_cancelled_batch_is_given_again(queue: RecorderQueue) -> None:
+async def test_a_cancelled_batch_is_supplied_again(queue: RecorderQueue) -> None:
     queue.put_nowait(started(), b"{}")
     await queue.synced_to()
     waiting = batch_of(queue, 2, age_s=LONG_S)
@@ -260,7 +260,7 @@ async def test_a_consumer_in_its_own_loop_and_thread_is_woken_by_producers(queue
     assert queue.stored == 21
 
 
-async def test_closing_refuses_puts_syncs_drains_and_ends_in_an_empty_batch(tmp_path: Path) -> None:
+async def test_closing_refuses_puts_syncs_drains_and_ends_with_an_empty_batch(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
     queue.put_nowait(started(), b"{}")
     queue.put_nowait(node(), b"{}")
@@ -275,21 +275,21 @@ async def test_closing_refuses_puts_syncs_drains_and_ends_in_an_empty_batch(tmp_
     queue.release()
 
 
-async def test_closing_wakes_who_waits_for_a_batch(queue: RecorderQueue) -> None:
+async def test_closing_wakes_a_consumer_that_waits_for_a_batch(queue: RecorderQueue) -> None:
     waiting = batch_of(queue, 1, age_s=LONG_S)
     await asyncio.sleep(0)
     queue.close()
     assert await waiting == []
 
 
-async def test_segments_roll_and_go_once_all_in_them_is_acknowledged(queue: RecorderQueue) -> None:
+async def test_segments_roll_over_and_are_deleted_once_all_their_records_are_acknowledged(queue: RecorderQueue) -> None:
     def files() -> list[str]:
         return sorted(path.name for path in queue.folder.glob("*.segment"))
 
     queue.put_nowait(started(), b"{}")
     for _ in range(8):
         queue.put_nowait(node(), b"x" * 900)
-    # The first of 80 bytes and three of 976 in the first segment, three in the next, the last two in the third.
+    # The first segment holds one record of 80 bytes and three of 976, the next three, the third the last two.
     await queue.synced_to()
     records = await batch_of(queue, 9)
     assert [each.position for each in records] == list(range(1, 10))
@@ -300,7 +300,7 @@ async def test_segments_roll_and_go_once_all_in_them_is_acknowledged(queue: Reco
     await until(lambda: files()[0] == "00000002.segment")
     await queue.acknowledge(9)
     await until(lambda: files()[0] == "00000003.segment")
-    assert (queue.stored, queue.synced, queue.written) == (9, 11, 11)  # the last two were put to settle
+    assert (queue.stored, queue.synced, queue.written) == (9, 11, 11)  # the last two were put by settle
 
 
 async def test_bytes_spooled_counts_headers_records_and_commits(tmp_path: Path) -> None:
@@ -318,7 +318,7 @@ async def test_bytes_spooled_counts_headers_records_and_commits(tmp_path: Path) 
 
 
 async def settle(queue: RecorderQueue) -> None:
-    """Two turns of the sync thread have passed."""
+    """Wait until the sync thread has had two turns."""
     for _ in range(2):
         queue.put_nowait(DECLARED, b"{}")
         await queue.synced_to()
@@ -330,7 +330,7 @@ async def until(reached: Callable[[], bool]) -> None:
             await asyncio.sleep(0.001)
 
 
-async def test_a_queue_of_which_all_is_stored_leaves_nothing_behind(spool: Path) -> None:
+async def test_a_queue_whose_records_are_all_stored_leaves_no_files(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     queue.put_nowait(ended(), b"{}")
@@ -353,7 +353,7 @@ async def test_a_queue_with_an_open_episode_leaves_its_folder_for_recovery(spool
     assert await recover(queue.folder) == [record(1, started(), 1, b"{}"), lost(2, 1, 2)]
 
 
-async def test_a_queue_that_is_let_go_undrained_leaves_all_of_it_synced(spool: Path) -> None:
+async def test_a_queue_that_is_released_undrained_leaves_all_of_it_synced(spool: Path) -> None:
     queue = make(spool, settings=Settings(sync_interval_ms=3_600_000))
     queue.put_nowait(started(), b"{}")
     queue.put_nowait(ended(), b"{}")
@@ -363,7 +363,7 @@ async def test_a_queue_that_is_let_go_undrained_leaves_all_of_it_synced(spool: P
     assert await recover(queue.folder) == [record(1, started(), 1, b"{}"), record(2, ended(), 2, b"{}")]
 
 
-async def test_a_folder_is_drained_by_one_only(queue: RecorderQueue) -> None:
+async def test_a_folder_is_drained_by_one_source_only(queue: RecorderQueue) -> None:
     drained_elsewhere = FileLock.take(queue.folder / "drain")
     assert drained_elsewhere is not None
     with pytest.raises(SpoolUnavailable, match="drained by another process"):
@@ -374,14 +374,14 @@ async def test_a_folder_is_drained_by_one_only(queue: RecorderQueue) -> None:
     assert FileLock.take(queue.folder / "drain") is None
 
 
-async def test_two_recorders_of_one_name_are_refused(queue: RecorderQueue, spool: Path) -> None:
+async def test_a_second_recorder_with_the_same_id_is_refused(queue: RecorderQueue, spool: Path) -> None:
     with pytest.raises(SpoolUnavailable):
         make(spool)
     assert queue.put_nowait(started(), b"{}") == 1
 
 
 @pytest.mark.parametrize("deep", [False, True])
-def test_a_spool_that_cannot_be_made_is_one_clear_line(tmp_path: Path, deep: bool) -> None:
+def test_a_spool_that_cannot_be_made_is_reported_in_one_clear_line(tmp_path: Path, deep: bool) -> None:
     blocking = tmp_path / "blocking"
     blocking.touch()
     with pytest.raises(SpoolUnavailable) as refused:
@@ -394,7 +394,7 @@ INTERRUPTS = 2_000
 
 
 @pytest.mark.slow
-async def test_an_interrupt_in_the_middle_of_putting_leaves_a_whole_queue(tmp_path: Path) -> None:
+async def test_an_interrupt_in_the_middle_of_a_put_leaves_a_whole_queue(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=Settings(segment_bytes=2**16, record_bytes_max=2**12), clock=SYSTEM_CLOCK)
     queue.put_nowait(started(), b"{}")
     returned = 0

@@ -1,4 +1,4 @@
-"""A damaged folder is mended: all that is whole can be drained, what is given up is told, nothing is overwritten."""
+"""Repair a damaged folder: all whole records can be drained, losses are reported, and nothing is overwritten."""
 
 import os
 import random
@@ -23,7 +23,7 @@ from tests.queue.factories import (
     DECLARED,
     RECORDER,
     SMALL,
-    Author,
+    FolderWriter,
     ended,
     episode,
     lost,
@@ -39,26 +39,28 @@ LOST = b'{"status":"LOST"}'
 
 
 @pytest.fixture
-def author(spool: Path) -> Author:
-    return Author(spool, settings=ROOMY)
+def author(spool: Path) -> FolderWriter:
+    return FolderWriter(spool, settings=ROOMY)
 
 
-def mended(folder: Path) -> RepairReport:
+def repair(folder: Path) -> RepairReport:
     report = repair_folder(folder)
     assert report is not None
     return report
 
 
-def spoil(author: Author, position: int) -> None:
+def damage(author: FolderWriter, position: int) -> None:
     path, offset, _ = author.places[position - 1]
     overwrite(path, offset + 70, b"#")
 
 
-def renumbered(records: list[Record]) -> list[Record]:
+def renumber(records: list[Record]) -> list[Record]:
     return [each._replace(position=index) for index, each in enumerate(records, start=1)]
 
 
-async def test_what_stands_behind_the_damage_is_saved_but_for_the_episode_that_misses_an_event(author: Author) -> None:
+async def test_records_behind_the_damage_are_kept_except_for_an_episode_that_misses_an_event(
+    author: FolderWriter,
+) -> None:
     for heading in (
         started(1),
         started(2),
@@ -74,26 +76,26 @@ async def test_what_stands_behind_the_damage_is_saved_but_for_the_episode_that_m
         author.put(heading)
     author.sync()
     author.put(node(3), b"never synced")
-    spoil(author, 5)
-    report = mended(author.folder)
+    damage(author, 5)
+    report = repair(author.folder)
     assert (report.kept, report.saved, report.unreadable, report.headless) == (4, 5, ((5, 5),), False)
     [given_up] = report.given_up
     assert (given_up.episode, given_up.kept_to) == (episode_text(episode(1)), 2)
     assert (given_up.sequences, given_up.positions) == (((4, 4),), ((9, 9),))
     assert not report.complete
-    kept = renumbered([each for each in author.records if each.position not in (5, 9)])
+    kept = renumber([each for each in author.records if each.position not in (5, 9)])
     assert await recover(author.folder) == [*kept, lost(10, 1, 3), lost(11, 3, 3)]
     assert repair_folder(author.folder) is None
 
 
-async def test_the_folder_as_it_was_is_put_aside_and_named(author: Author) -> None:
+async def test_the_original_folder_is_kept_and_named(author: FolderWriter) -> None:
     for heading in (started(), node(), node()):
         author.put(heading)
     author.sync()
-    spoil(author, 2)
+    damage(author, 2)
     (author.folder / "notes.txt").write_text("mine")
     before = {path.name: path.read_bytes() for path in author.folder.iterdir()}
-    report = mended(author.folder)
+    report = repair(author.folder)
     aside = author.folder.with_name(f"{author.folder.name}.damaged")
     assert report.set_aside == str(aside)
     assert {path.name: path.read_bytes() for path in aside.iterdir()} == before | {"drain": b""}
@@ -104,22 +106,22 @@ async def test_the_folder_as_it_was_is_put_aside_and_named(author: Author) -> No
         scan(aside, RECORDER)
 
 
-async def test_a_second_damage_is_put_aside_under_a_name_of_its_own(author: Author) -> None:
+async def test_a_second_damage_is_kept_under_a_name_of_its_own(author: FolderWriter) -> None:
     for heading in (started(1), started(2), *[node(1)] * 3, node(2)):
         author.put(heading)
     author.sync()
-    spoil(author, 4)
-    assert mended(author.folder).set_aside.endswith(".damaged")
+    damage(author, 4)
+    assert repair(author.folder).set_aside.endswith(".damaged")
     overwrite(author.folder / "00000001.segment", author.places[1][1] + 70, b"#")
-    again = mended(author.folder)
+    again = repair(author.folder)
     assert again.set_aside.endswith(".damaged.2")
     assert await recover(author.folder) == [
-        *renumbered([each for each in author.records if each.position in (1, 3)]),
+        *renumber([each for each in author.records if each.position in (1, 3)]),
         lost(3, 1, 3),
     ]
 
 
-async def test_a_missing_file_costs_what_was_in_it_and_no_more(author: Author) -> None:
+async def test_a_missing_file_costs_only_its_own_records(author: FolderWriter) -> None:
     author.put(started(1))
     for _ in range(3):
         author.put(node(1), b"x" * 900)
@@ -130,36 +132,36 @@ async def test_a_missing_file_costs_what_was_in_it_and_no_more(author: Author) -
     gone = author.segments[1]
     missing = [index for index, (path, _, _) in enumerate(author.places, start=1) if path == gone]
     gone.unlink()
-    report = mended(author.folder)
+    report = repair(author.folder)
     assert report.unreadable == ((missing[0], missing[-1]),)
     assert missing[0] == 6
     assert await recover(author.folder) == [*author.records[:5], lost(6, 1, 5), lost(7, 2, 2)]
     assert [each.sequences[-1][1] for each in report.given_up] == [7]
 
 
-async def test_records_that_are_whole_are_kept_when_only_their_commit_contradicts_them(author: Author) -> None:
+async def test_whole_records_are_kept_when_only_their_commit_contradicts_them(author: FolderWriter) -> None:
     author.put(started())
     author.put(node(), b"one")
     span = author.appender.begin_sync()
     author.appender.append_commit(span._replace(checksum=span.checksum ^ 1))
     author.put(node(), b"two")
-    report = mended(author.folder)
+    report = repair(author.folder)
     assert (report.kept, report.saved, report.complete) == (2, 1, True)
     assert await recover(author.folder) == [*author.records, lost(4, 1, 4)]
 
 
-async def test_the_first_files_header_unreadable_costs_nothing(author: Author) -> None:
+async def test_an_unreadable_header_of_the_first_file_costs_nothing(author: FolderWriter) -> None:
     for heading in (started(1), node(1), started(2), ended(1)):
         author.put(heading)
     author.sync()
     overwrite(author.segments[0], 20, b"#")
-    report = mended(author.folder)
+    report = repair(author.folder)
     assert (report.kept, report.saved, report.complete) == (0, 4, True)
     assert await recover(author.folder) == [*author.records, lost(5, 2, 2)]
 
 
-async def test_a_header_unreadable_when_the_files_before_are_stored_and_gone_costs_the_ends_it_alone_knew(
-    author: Author,
+async def test_an_unreadable_header_after_deleted_files_costs_only_the_ends_that_it_alone_held(
+    author: FolderWriter,
 ) -> None:
     author.put(started(1))
     author.put(started(2))
@@ -171,19 +173,19 @@ async def test_a_header_unreadable_when_the_files_before_are_stored_and_gone_cos
     ]
     author.segments[0].unlink()
     overwrite(author.segments[1], 60, b"#")
-    report = mended(author.folder)
+    report = repair(author.folder)
     assert (report.headless, report.unreadable, report.given_up, report.complete) == (True, (), (), False)
     records = await recover(author.folder)
     assert records[:-1] == left
     assert records[-1] == lost(9, 1, 8)
 
 
-async def test_a_repaired_folder_that_is_damaged_again_says_so(author: Author) -> None:
+async def test_a_repaired_folder_that_is_damaged_again_is_reported(author: FolderWriter) -> None:
     for heading in (started(1), started(2), *[node(1)] * 3, *[node(2)] * 3):
         author.put(heading)
     author.sync()
-    spoil(author, 3)
-    mended(author.folder)
+    damage(author, 3)
+    repair(author.folder)
     for number in (1, 2):
         path = author.folder / f"{number:08d}.segment"
         before = path.read_bytes()
@@ -196,7 +198,7 @@ async def test_a_repaired_folder_that_is_damaged_again_says_so(author: Author) -
 # --- refusals ---------------------------------------------------------------------------------------------------
 
 
-def test_a_whole_folder_is_left_as_it_is(author: Author) -> None:
+def test_an_intact_folder_is_left_as_it_is(author: FolderWriter) -> None:
     author.put(started())
     author.sync()
     author.put(node(), b"torn away")
@@ -207,7 +209,7 @@ def test_a_whole_folder_is_left_as_it_is(author: Author) -> None:
     assert [path.name for path in author.folder.parent.iterdir()] == [author.folder.name]
 
 
-def test_a_living_recorder_and_one_that_is_drained_are_refused(spool: Path) -> None:
+def test_the_folder_of_a_live_or_drained_recorder_is_refused(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     with pytest.raises(SpoolUnavailable, match="its recorder is alive"):
@@ -221,7 +223,7 @@ def test_a_living_recorder_and_one_that_is_drained_are_refused(spool: Path) -> N
     assert repair_folder(queue.folder) is None
 
 
-def test_a_newer_format_is_refused_and_nothing_is_changed(author: Author) -> None:
+def test_a_newer_format_is_refused_and_nothing_is_changed(author: FolderWriter) -> None:
     author.put(started())
     author.sync()
     overwrite(author.segments[0], 8, b"\x02")
@@ -231,8 +233,8 @@ def test_a_newer_format_is_refused_and_nothing_is_changed(author: Author) -> Non
 
 
 @pytest.fixture
-def nobody() -> Iterator[Path]:
-    """A folder that this process cannot write into while the test runs."""
+def no_writer_alive() -> Iterator[Path]:
+    """A folder that this process cannot write to during the test."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         root = os.geteuid() == 0
@@ -242,17 +244,17 @@ def nobody() -> Iterator[Path]:
         Path(folder).chmod(0o755)
 
 
-def test_a_folder_that_may_only_be_read_is_one_line_and_stays_as_it_is(nobody: Path) -> None:
-    author = Author(nobody)
+def test_a_folder_without_write_permission_is_reported_in_one_line_and_stays_as_it_is(no_writer_alive: Path) -> None:
+    author = FolderWriter(no_writer_alive)
     for heading in (started(), node(), node()):
         author.put(heading)
     author.sync()
-    spoil(author, 2)
+    damage(author, 2)
     before = author.segments[0].read_bytes()
     for path in (author.folder / "alive", *author.segments):
         path.chmod(0o666)
     author.folder.chmod(0o777)
-    nobody.chmod(0o555)
+    no_writer_alive.chmod(0o555)
     if os.geteuid() == 0:
         os.seteuid(65534)
     with pytest.raises(SpoolUnavailable, match="Permission denied") as refused:
@@ -261,12 +263,12 @@ def test_a_folder_that_may_only_be_read_is_one_line_and_stays_as_it_is(nobody: P
     assert author.segments[0].read_bytes() == before
 
 
-# --- killed -----------------------------------------------------------------------------------------------------
+# --- killed repairs ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("killed_at", range(40))
-async def test_a_repair_killed_at_any_step_is_done_by_the_next_one(
-    author: Author, killed_at: int, monkeypatch: pytest.MonkeyPatch
+async def test_a_repair_killed_at_any_step_is_completed_by_the_next_one(
+    author: FolderWriter, killed_at: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     author.put(started(1))
     author.put(started(2))
@@ -274,7 +276,7 @@ async def test_a_repair_killed_at_any_step_is_done_by_the_next_one(
         author.put(node(1), b"x" * 900)
         author.put(node(2), b"y" * 900)
     author.sync()
-    spoil(author, 6)
+    damage(author, 6)
     spool = author.folder.parent
     steps = 0
 
@@ -290,7 +292,7 @@ async def test_a_repair_killed_at_any_step_is_done_by_the_next_one(
 
     for of, name in ((os, "link"), (os, "fsync"), (os, "open"), (Path, "rename"), (Path, "replace"), (Path, "open")):
         monkeypatch.setattr(of, name, counted(getattr(of, name)))
-    # What a kill leaves is not tidied up.
+    # The remains of the killed repair stay as they are.
     monkeypatch.setattr(shutil, "rmtree", lambda *_, **__: None)
     done = False
     try:
@@ -301,19 +303,19 @@ async def test_a_repair_killed_at_any_step_is_done_by_the_next_one(
     monkeypatch.undo()
     finish_repairs(spool)
     repair_folder(author.folder)
-    kept = renumbered([each for each in author.records if each.position not in (6, 8, 10)])
+    kept = renumber([each for each in author.records if each.position not in (6, 8, 10)])
     assert await recover(author.folder) == [*kept, lost(8, 1, 6), lost(9, 2, 3)]
     assert sorted(path.name for path in spool.iterdir()) == [author.folder.name, f"{author.folder.name}.damaged"]
     assert done or killed_at < 39
 
 
-# --- anywhere ---------------------------------------------------------------------------------------------------
+# --- damage anywhere --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", [*range(60), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(60, 600))])
-async def test_whatever_is_spoilt_every_record_is_drained_or_told(tmp_path: Path, seed: int) -> None:
+async def test_whatever_is_damaged_every_record_is_drained_or_reported(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)
-    author = Author(tmp_path / "spool", settings=ROOMY)
+    author = FolderWriter(tmp_path / "spool", settings=ROOMY)
     open_now: set[int] = set()
     for number in range(1, rng.randrange(3, 7)):
         author.put(started(number))
@@ -331,28 +333,28 @@ async def test_whatever_is_spoilt_every_record_is_drained_or_told(tmp_path: Path
         path = rng.choice(author.segments)
         content = bytearray(path.read_bytes())
         at = rng.randrange(len(content.rstrip(b"\0")))
-        if at in range(8, 12):  # the format's number: that is another program's file, and refused
+        if at in range(8, 12):  # the number of the format: that is another program's file, which is refused
             continue
         content[at] ^= 1 << rng.randrange(8)
         path.write_bytes(content)
     report = repair_folder(author.folder)
     records = [each for each in await recover(author.folder) if each.payload != LOST]
-    if report is None:  # nothing was hit, or the last commit frame, which is no more than a torn tail then
+    if report is None:  # no record is hit, or only the last commit frame, which leaves a torn tail
         assert records == author.records[: len(records)]
         assert len(records) == len(author.records) or hits > 1
         return
-    # Told: every position is kept, unreadable, or given up by name.
+    # Reported: every position is kept, unreadable, or lost by name.
     unreadable = {position for first, last in report.unreadable for position in range(first, last + 1)}
     dropped = {
         position for each in report.given_up for first, last in each.positions for position in range(first, last + 1)
     }
     assert unreadable & dropped == set()
     kept = [each for each in author.records if each.position not in unreadable | dropped]
-    if hits > 1:  # records at the very end, and the only commit frame that spoke of them
+    if hits > 1:  # records at the very end, and the only commit frame that covered them
         kept = kept[: len(records)]
-    assert records == renumbered(kept)
+    assert records == renumber(kept)
     assert (report.kept + report.saved) == len(kept)
-    # Whatever of an episode is kept has no gap, and only an episode that misses an event gives something up.
+    # The kept records of an episode have no gap, and only an episode that misses an event loses something.
     sequences: defaultdict[bytes | None, list[int]] = defaultdict(list)
     for each in kept:
         sequences[each.episode].append(each.sequence)

@@ -1,4 +1,4 @@
-"""A segment's header is read whole or not at all, and a segment file has all its blocks before it is used."""
+"""A segment's header is read whole or not at all, and a segment file has all its blocks before its first use."""
 
 import struct
 import zlib
@@ -50,36 +50,36 @@ def test_a_header_has_its_golden_bytes() -> None:
     assert len(SEGMENT) == header_bytes(2) == 136
 
 
-def test_a_header_means_what_was_written_whatever_follows() -> None:
+def test_a_header_decodes_to_what_was_written_whatever_follows() -> None:
     assert decode_header(SEGMENT) == HEADER
     assert decode_header(SEGMENT + b"\xff" * 100) == HEADER
 
 
-def test_a_header_cut_at_any_byte_is_none() -> None:
+def test_a_header_cut_at_any_byte_is_not_read() -> None:
     for end in range(len(SEGMENT)):
         assert decode_header(SEGMENT[:end]) is None, end
 
 
-def test_a_header_with_any_one_bit_flipped_is_none() -> None:
+def test_a_header_with_any_one_bit_flipped_is_not_read() -> None:
     for bit in range(len(SEGMENT) * 8):
         changed = bytearray(SEGMENT)
         changed[bit // 8] ^= 1 << bit % 8
         assert decode_header(bytes(changed)) is None, bit
 
 
-def test_space_made_ahead_has_no_header_and_no_format() -> None:
+def test_preallocated_space_has_no_header_and_no_format() -> None:
     assert decode_header(bytes(4096)) is None
     assert format_of(bytes(4096)) is None
     assert format_of(b"") is None
 
 
-def test_a_newer_format_is_told_though_its_header_cannot_be_read() -> None:
+def test_a_newer_format_is_reported_though_its_header_cannot_be_read() -> None:
     newer = SEGMENT[:8] + struct.pack("<I", 2) + b"something else altogether" + bytes(100)
     assert format_of(newer) == 2
     assert decode_header(newer) is None
 
 
-def test_a_segment_made_ahead_is_zeros_with_blocks_of_its_own(tmp_path: Path) -> None:
+def test_a_preallocated_segment_consists_of_zeros_with_blocks_of_its_own(tmp_path: Path) -> None:
     segment = Segment.allocate(tmp_path, number=3, size=8192)
     segment.close()
     assert [path.name for path in tmp_path.iterdir()] == ["00000003.segment"]
@@ -87,12 +87,12 @@ def test_a_segment_made_ahead_is_zeros_with_blocks_of_its_own(tmp_path: Path) ->
     assert segment.path.stat().st_blocks * 512 >= 8192
 
 
-def test_allocating_in_a_folder_that_is_gone_is_an_error_of_the_system(tmp_path: Path) -> None:
+def test_allocating_in_a_deleted_folder_raises_the_error_of_the_system(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         Segment.allocate(tmp_path / "gone", number=1, size=4096)
 
 
-def test_files_of_other_names_are_not_segments(tmp_path: Path) -> None:
+def test_files_with_other_names_are_not_segments(tmp_path: Path) -> None:
     for name in (
         "00000002.segment",
         "100000001.segment",

@@ -1,4 +1,4 @@
-"""The contract of a source, held by a recorder's own queue, a living recorder's folder and a dead one's."""
+"""The contract of a source, for a recorder's own queue, a live recorder's folder, and a dead one's."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, Spool, op
 from pycrorm_async.queue.files.frame import EVENT
 from pycrorm_async.queue.files.scan import survey
 from pycrorm_async.queue.files.segment import read_segment, segment_path
-from tests.queue.factories import RECORDER, as_left_by_a_kill, ended, make, node, started
+from tests.queue.factories import RECORDER, crashed_copy, ended, make, node, started
 from tests.queue.test_full_spool import fill
 
 AnySource = RecorderQueue | LiveSource | DeadSource
 Opened = TypeVar("Opened")
 SIZES = [0, *[200] * 40, 0]
-"""Bytes of the payloads of one episode, over several segments."""
+"""Sizes of the payloads of one episode that spans several segments."""
 
 
-class Scene:
+class SourceCase:
     """A recorder, and the source of its records under test."""
 
     def __init__(self, kind: Literal["own", "living", "dead"], folder: Path) -> None:
@@ -42,7 +42,7 @@ class Scene:
         await self.queue.synced_to()
 
     def source(self) -> AnySource:
-        """The first source, and at each further call the next one."""
+        """Return the first source, and at each further call its successor."""
         for each in self._opened:
             each.release()
         self._opened.append(self._next())
@@ -54,7 +54,7 @@ class Scene:
         if self.kind == "living":
             return _present(LiveSource.take(self.queue.folder))
         if self.kind == "dead" and self._left is None:
-            self._left = as_left_by_a_kill(self.queue, self._other)
+            self._left = crashed_copy(self.queue, self._other)
         return _present(open_dead(self._left or self.queue.folder))
 
     @property
@@ -72,10 +72,10 @@ def _present(opened: Opened | None) -> Opened:
 
 
 @pytest.fixture(params=["own", "living", "dead"])
-def scene(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Scene]:
-    made = Scene(request.param, tmp_path)
-    yield made
-    made.end()
+def scene(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SourceCase]:
+    case = SourceCase(request.param, tmp_path)
+    yield case
+    case.end()
 
 
 async def batch(source: AnySource, *, events_max: int = 1000, bytes_max: int = 2**22) -> list[Record]:
@@ -84,7 +84,7 @@ async def batch(source: AnySource, *, events_max: int = 1000, bytes_max: int = 2
 
 
 async def rest(source: AnySource) -> list[Record]:
-    """All further records of a closed queue."""
+    """Return all further records of a closed queue."""
     records: list[Record] = []
     while some := await batch(source):
         records += some
@@ -97,7 +97,7 @@ def positions(records: Sequence[Record]) -> list[int]:
 
 
 def dead_letters(spool: Path) -> list[int]:
-    """The sequences of the records that are kept, in the order of the files."""
+    """Return the sequences of the dead letters in the order of their files."""
     sequences: list[int] = []
     [kept] = [each.path for each in Spool(spool).recorders() if each.refused is not None]
     survey(kept, RECORDER, on_frame=lambda _, frame: sequences.append(frame.sequence) if frame.kind == EVENT else None)
@@ -110,7 +110,7 @@ async def eventually(reached: Callable[[], bool]) -> None:
             await asyncio.sleep(0.005)
 
 
-async def test_each_synced_record_is_supplied_once_in_order(scene: Scene) -> None:
+async def test_each_synced_record_is_supplied_once_in_order(scene: SourceCase) -> None:
     await scene.record()
     source = scene.source()
     records: list[Record] = []
@@ -121,21 +121,21 @@ async def test_each_synced_record_is_supplied_once_in_order(scene: Scene) -> Non
     assert [each.payload for each in records] == [b"%04d" % at + b"x" * size for at, size in enumerate(SIZES)]
 
 
-async def test_a_batch_holds_at_most_this_many_records(scene: Scene) -> None:
+async def test_a_batch_holds_at_most_this_many_records(scene: SourceCase) -> None:
     await scene.record()
     source = scene.source()
     assert positions(await batch(source, events_max=1)) == [1]
     assert positions(await batch(source, events_max=30)) == list(range(2, 32))
 
 
-async def test_a_batch_holds_at_most_this_many_bytes_and_a_larger_record_comes_alone(scene: Scene) -> None:
+async def test_a_batch_holds_at_most_this_many_bytes_and_a_larger_record_comes_alone(scene: SourceCase) -> None:
     await scene.record([6, 6, 6, 996, 6, 0])  # payloads of 10 bytes, one of 1000
     source = scene.source()
     sizes = [positions(await batch(source, bytes_max=25)) for _ in range(4)]
     assert sizes == [[1, 2], [3], [4], [5, 6]]
 
 
-async def test_after_the_last_record_of_a_closed_queue_every_batch_is_empty(scene: Scene) -> None:
+async def test_after_the_last_record_of_a_closed_queue_every_batch_is_empty(scene: SourceCase) -> None:
     await scene.record()
     scene.queue.close()
     source = scene.source()
@@ -144,7 +144,7 @@ async def test_after_the_last_record_of_a_closed_queue_every_batch_is_empty(scen
     assert await batch(source) == []
 
 
-async def test_the_next_source_supplies_again_what_was_not_acknowledged(scene: Scene) -> None:
+async def test_the_next_source_supplies_again_what_was_not_acknowledged(scene: SourceCase) -> None:
     await scene.record()
     source = scene.source()
     first, second = await batch(source, events_max=5), await batch(source, events_max=5)
@@ -157,7 +157,7 @@ async def test_the_next_source_supplies_again_what_was_not_acknowledged(scene: S
 
 
 @pytest.mark.parametrize("stored", [0, 1, 20, 41])
-async def test_only_segments_whose_records_are_all_stored_are_deleted(scene: Scene, stored: int) -> None:
+async def test_only_segments_whose_records_are_all_stored_are_deleted(scene: SourceCase, stored: int) -> None:
     await scene.record()
     source = scene.source()
     supplied = [await batch(source, events_max=1) for _ in range(max(stored, 1))]
@@ -167,14 +167,14 @@ async def test_only_segments_whose_records_are_all_stored_are_deleted(scene: Sce
     await source.acknowledge(stored)
     kept = {number for number in bases if bases.get(number + 1, len(SIZES) + 2) - 1 > stored}
     await eventually(lambda: all(segment_path(scene.folder, each).exists() == (each in kept) for each in bases))
-    await asyncio.sleep(0.1)  # another turn of the sync thread, which could delete more
+    await asyncio.sleep(0.1)  # a further turn of the sync thread, which could delete more
     assert {number for number in bases if segment_path(scene.folder, number).exists()} == kept
     assert (len(kept) < len(bases)) == (stored >= 20)
     for number in sorted(kept)[:-1]:  # the sync thread still writes to the last one
         assert read_segment(segment_path(scene.folder, number)) == contents[number]
 
 
-async def test_a_refused_record_is_kept_once_however_often_it_is_offered(scene: Scene) -> None:
+async def test_a_refused_record_becomes_one_dead_letter_however_often_it_is_refused(scene: SourceCase) -> None:
     await scene.record()
     source = scene.source()
     refused = await batch(source, events_max=9)
@@ -189,7 +189,7 @@ async def test_a_refused_record_is_kept_once_however_often_it_is_offered(scene: 
     assert dead_letters(scene.folder.parent) == list(range(1, 11))
 
 
-async def test_a_source_that_fails_wakes_the_producers_that_wait_for_space(scene: Scene) -> None:
+async def test_a_source_that_fails_wakes_the_producers_that_wait_for_space(scene: SourceCase) -> None:
     scene.queue.put_nowait(started(), b"{}")
     fill(scene.queue)
     await scene.queue.synced_to()
@@ -207,7 +207,7 @@ async def test_a_source_that_fails_wakes_the_producers_that_wait_for_space(scene
             await waiting
 
 
-async def test_a_source_can_be_released_twice_and_frees_the_folder_for_the_next(scene: Scene) -> None:
+async def test_a_source_can_be_released_twice_and_frees_the_folder_for_the_next(scene: SourceCase) -> None:
     await scene.record()
     source = scene.source()
     await batch(source, events_max=3)

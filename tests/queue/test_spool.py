@@ -1,4 +1,4 @@
-"""The spool: whose recorders live, which database it belongs to, what is not ours."""
+"""The spool: live and dead recorders, the database to which it belongs, and foreign files."""
 
 import threading
 from pathlib import Path
@@ -13,14 +13,14 @@ from pycrorm_async.queue.files.recorder_folder import make_folder
 from tests.queue.factories import RECORDER, episode, make, started
 
 
-def test_a_spool_that_is_not_there_has_no_recorders_and_is_not_made(spool: Path) -> None:
+def test_a_missing_spool_has_no_recorders_and_is_not_made(spool: Path) -> None:
     assert Spool(spool).recorders() == []
     assert Spool(spool).strangers() == []
     assert Spool(spool).log_id() is None
     assert not spool.exists()
 
 
-def test_a_recorder_lives_until_it_is_let_go(spool: Path) -> None:
+def test_a_recorder_is_alive_until_it_is_released(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     (living,) = Spool(spool).recorders()
@@ -31,7 +31,7 @@ def test_a_recorder_lives_until_it_is_let_go(spool: Path) -> None:
 
 
 @pytest.mark.slow
-def test_looking_does_not_keep_a_dead_folder_from_being_opened(spool: Path) -> None:
+def test_listing_recorders_does_not_prevent_the_recovery_of_a_dead_folder(spool: Path) -> None:
     queue = make(spool)
     queue.put_nowait(started(), b"{}")
     queue.release()
@@ -53,7 +53,7 @@ def test_looking_does_not_keep_a_dead_folder_from_being_opened(spool: Path) -> N
         thread.join()
 
 
-def test_a_spool_stays_with_its_log_as_long_as_a_recorder_is_in_it(spool: Path, queue: RecorderQueue) -> None:
+def test_a_spool_stays_bound_to_its_log_while_a_recorder_is_in_it(spool: Path, queue: RecorderQueue) -> None:
     Spool(spool).bind("0190-log-of-a")
     Spool(spool).bind("0190-log-of-a")
     assert Spool(spool).log_id() == "0190-log-of-a"
@@ -71,9 +71,9 @@ def test_a_spool_stays_with_its_log_as_long_as_a_recorder_is_in_it(spool: Path, 
     assert (spool / "log").read_bytes() == b"0190-log-of-a\n"
 
 
-def test_an_empty_spool_is_bound_to_another_log(spool: Path) -> None:
+def test_an_empty_spool_can_be_bound_to_another_log(spool: Path) -> None:
     Spool(spool).bind("0190-log-of-a")
-    make(spool).release()  # nothing was recorded: its folder is gone
+    make(spool).release()  # nothing was recorded, so that its folder is deleted
     (spool / "notes.txt").write_text("mine")
     Spool(spool).bind("0190-log-of-b")
     assert Spool(spool).log_id() == "0190-log-of-b"
@@ -81,7 +81,7 @@ def test_an_empty_spool_is_bound_to_another_log(spool: Path) -> None:
 
 
 @pytest.mark.usefixtures("queue")
-def test_of_many_logs_at_once_exactly_one_gets_the_spool(spool: Path) -> None:
+def test_of_many_concurrent_logs_exactly_one_binds_the_spool(spool: Path) -> None:
     refused: list[str] = []
     begin = threading.Barrier(8)
 
@@ -102,8 +102,8 @@ def test_of_many_logs_at_once_exactly_one_gets_the_spool(spool: Path) -> None:
     assert sorted([*refused, bound]) == [f"log-{number}" for number in range(8)]
 
 
-def test_of_many_recorders_for_different_logs_all_that_stay_are_for_one(spool: Path) -> None:
-    """Each binds, makes its folder, and binds again, as an opened memory does."""
+def test_of_many_recorders_for_different_logs_all_that_remain_use_one(spool: Path) -> None:
+    """Each binds the spool, makes its folder, and binds again, as `Memory.open` does."""
     stay: list[str] = []
     alive: list[FileLock] = []
     begin = threading.Barrier(6)
@@ -128,7 +128,7 @@ def test_of_many_recorders_for_different_logs_all_that_stay_are_for_one(spool: P
     assert set(stay) == {Spool(spool).log_id()}
 
 
-def test_strangers_in_the_spool_are_named_and_left_alone(spool: Path, queue: RecorderQueue) -> None:
+def test_foreign_files_in_the_spool_are_named_and_not_touched(spool: Path, queue: RecorderQueue) -> None:
     (spool / "notes.txt").write_text("mine")
     (spool / "0190f0f0-0000-7000-8000-000000000000").mkdir()
     (spool / "lost+found").mkdir()
@@ -141,7 +141,7 @@ def test_strangers_in_the_spool_are_named_and_left_alone(spool: Path, queue: Rec
     assert [each.path for each in Spool(spool).recorders()] == [queue.folder]
 
 
-def test_a_spool_that_cannot_be_created_is_one_line_with_what_to_do() -> None:
+def test_a_spool_that_cannot_be_created_is_one_line_with_the_next_command() -> None:
     with pytest.raises(SpoolUnavailable) as refused:
         Spool(Path("/proc/none")).bind("a-log")
     assert str(refused.value) == (
@@ -149,7 +149,7 @@ def test_a_spool_that_cannot_be_created_is_one_line_with_what_to_do() -> None:
     )
 
 
-def test_a_file_where_the_spool_belongs_is_one_clear_line(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_spool_is_reported_in_one_clear_line(tmp_path: Path) -> None:
     blocking = tmp_path / "blocking"
     blocking.touch()
     for path in (blocking, blocking / "spool"):

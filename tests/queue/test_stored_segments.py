@@ -1,4 +1,4 @@
-"""Segments are kept after they are stored, as long and as many as the settings say, and stand in nobody's way."""
+"""Stored segments are kept for as long and as many as the settings allow, and never displace new events."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.queue.factories import (
     RECORDER,
     SMALL,
     WALL_NS,
-    as_left_by_a_kill,
+    crashed_copy,
     drain,
     ended,
     episode,
@@ -54,7 +54,7 @@ def bound(spool: Path) -> Path:
 
 
 async def live(spool: Path, *, settings: Settings = SMALL, hours: Hours | None = None, number: int = 1) -> None:
-    """A recorder that fills two segments and a bit, all of it stored."""
+    """Return a recorder that fills two segments and part of a third, all of it stored."""
     wall_ns = (hours or Hours()).wall_ns
     recorder = EpisodeId(RECORDER[:-1] + bytes([number]))
     queue = RecorderQueue.create(
@@ -74,85 +74,87 @@ def put(queue: RecorderQueue) -> None:
     queue.put_nowait(ended(), b"{}")
 
 
-def kept(spool: Path) -> list[tuple[str, str]]:
+def stored_files(spool: Path) -> list[tuple[str, str]]:
     return [(each.path.parent.name, each.path.name) for each in kept_segments(spool)]
 
 
-async def test_what_is_stored_is_kept_whole_and_its_recorders_folder_goes(bound: Path) -> None:
+async def test_stored_segments_are_kept_whole_and_the_recorders_folder_is_deleted(bound: Path) -> None:
     await live(bound)
     folder = bound / "stored" / "a-log" / (name := episode_text(EpisodeId(RECORDER[:-1] + b"\1")))
-    assert kept(bound) == [(name, f"0000000{number}.segment") for number in (1, 2, 3)]
+    assert stored_files(bound) == [(name, f"0000000{number}.segment") for number in (1, 2, 3)]
     assert scan(folder, RECORDER[:-1] + b"\1").cut.position == 11
     assert (folder / "00000003.segment").stat().st_size < SMALL.segment_bytes
     assert sorted(each.name for each in bound.iterdir()) == ["log", "stored"]
     assert (Spool(bound).recorders(), inspect_spool(bound).strangers) == ([], ())
 
 
-async def test_a_dead_recorder_is_kept_the_same_without_its_torn_tail(tmp_path: Path, bound: Path) -> None:
+async def test_a_dead_recorders_segments_are_kept_without_the_torn_tail(tmp_path: Path, bound: Path) -> None:
     queue = make(tmp_path / "alive")
     put(queue)
     await queue.synced_to()
-    folder = as_left_by_a_kill(queue, bound)
+    folder = crashed_copy(queue, bound)
     stored = StoredSegments(bound, SMALL, wall_ns=Hours().wall_ns)
     recovered = open_dead(folder, stored=stored)
     assert recovered is not None
     for record in await drain(recovered, events_max=4):
         await recovered.acknowledge(record.position)
     recovered.release()
-    assert kept(bound) == [(folder.name, f"0000000{number}.segment") for number in (1, 2, 3)]
+    assert stored_files(bound) == [(folder.name, f"0000000{number}.segment") for number in (1, 2, 3)]
     assert scan(bound / "stored" / "a-log" / folder.name, RECORDER).cut.position == 11
     assert not folder.exists()
     queue.close()
     queue.release()
 
 
-async def test_the_oldest_go_when_they_are_too_old_or_too_much(bound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_oldest_segments_are_deleted_when_they_are_too_old_or_too_many(
+    bound: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     hours = Hours()
     for number, hour in ((1, 0), (2, 10), (3, 23)):
         hours.hour = hour
         await live(bound, hours=hours, number=number)
-    assert len(kept(bound)) == 9
+    assert len(stored_files(bound)) == 9
     hours.hour = 24.5
     StoredSegments(bound, SMALL, wall_ns=hours.wall_ns).prune()
-    names = [name for name, _ in kept(bound)]
+    names = [name for name, _ in stored_files(bound)]
     assert len(names) == 6
     assert not (bound / "stored" / "a-log" / episode_text(EpisodeId(RECORDER[:-1] + b"\1"))).exists()
 
     StoredSegments(bound, replace(SMALL, keep_stored_bytes=4 * 4096), wall_ns=hours.wall_ns).prune()
-    assert [name for name, _ in kept(bound)] == names[2:]
+    assert [name for name, _ in stored_files(bound)] == names[2:]
     monkeypatch.setattr(stored_segments, "FILES_MAX", 2)
     StoredSegments(bound, SMALL, wall_ns=hours.wall_ns).prune()
-    assert [name for name, _ in kept(bound)] == names[4:]
+    assert [name for name, _ in stored_files(bound)] == names[4:]
 
 
-async def test_a_recorder_keeps_to_the_bytes_while_it_records(bound: Path) -> None:
+async def test_a_recorder_keeps_within_the_bytes_while_it_records(bound: Path) -> None:
     for number in (1, 2, 3):
         await live(bound, settings=replace(SMALL, keep_stored_bytes=4 * 4096), number=number)
-        assert len(kept(bound)) <= 4
-    assert len(kept(bound)) == 4
+        assert len(stored_files(bound)) <= 4
+    assert len(stored_files(bound)) == 4
 
 
 @pytest.mark.parametrize("nothing", [{"keep_stored_s": 0.0}, {"keep_stored_bytes": 0}])
-async def test_nothing_is_kept_where_the_settings_say_so(bound: Path, nothing: dict[str, int]) -> None:
+async def test_nothing_is_kept_where_the_settings_forbid_it(bound: Path, nothing: dict[str, int]) -> None:
     await live(bound, settings=replace(SMALL, **nothing))  # type: ignore[arg-type]
     assert sorted(each.name for each in bound.iterdir()) == ["log"]
 
 
-async def test_nothing_is_kept_for_no_log_and_a_log_that_names_no_folder(spool: Path) -> None:
+async def test_nothing_is_kept_without_a_log_or_for_a_log_that_names_no_folder(spool: Path) -> None:
     await live(spool)
     Spool(spool).bind("../elsewhere")
     await live(spool)
     assert sorted(each.name for each in spool.iterdir()) == ["log"]
 
 
-async def test_what_was_stored_in_another_log_stays_apart(bound: Path) -> None:
+async def test_segments_stored_in_another_log_are_kept_apart(bound: Path) -> None:
     await live(bound)
     Spool(bound).bind("another-log")
     await live(bound, number=2)
     assert sorted(each.path.parent.parent.name for each in kept_segments(bound)) == ["a-log"] * 3 + ["another-log"] * 3
 
 
-async def test_a_full_disk_takes_kept_segments_before_it_refuses_an_event(
+async def test_a_full_disk_deletes_kept_segments_before_it_refuses_an_event(
     bound: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for number in (2, 3):
@@ -167,36 +169,36 @@ async def test_a_full_disk_takes_kept_segments_before_it_refuses_an_event(
         return segment
 
     monkeypatch.setattr(Segment, "allocate", classmethod(limited))
-    assert len(kept(bound)) == 6
+    assert len(stored_files(bound)) == 6
     queue = make(bound)
-    put(queue)  # nobody stores anything meanwhile
+    put(queue)  # no drainer stores anything meanwhile
     await queue.synced_to()
-    assert 0 < len(kept(bound)) <= 3
+    assert 0 < len(stored_files(bound)) <= 3
     queue.close()
     queue.release()
 
 
-async def test_a_clock_that_is_set_back_makes_no_hole(bound: Path) -> None:
+async def test_a_clock_that_is_set_back_leaves_no_gap(bound: Path) -> None:
     hours = Hours()
     hours.hour = 5
     await live(bound, hours=hours)
-    folder = bound / "stored" / "a-log" / kept(bound)[0][0]
+    folder = bound / "stored" / "a-log" / stored_files(bound)[0][0]
     long_ago = WALL_NS - HOUR_NS
     os.utime(folder / "00000002.segment", ns=(long_ago, long_ago))
     StoredSegments(bound, replace(SMALL, keep_stored_bytes=2 * 4096), wall_ns=hours.wall_ns).prune()
-    assert [file for _, file in kept(bound)] == ["00000002.segment", "00000003.segment"]
+    assert [file for _, file in stored_files(bound)] == ["00000002.segment", "00000003.segment"]
 
 
-async def test_what_cannot_be_kept_is_deleted_as_it_was_before(bound: Path, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_segment_that_cannot_be_kept_is_deleted(bound: Path, caplog: pytest.LogCaptureFixture) -> None:
     (bound / "stored").write_text("not a folder")
     await live(bound)
     assert sorted(each.name for each in bound.iterdir()) == ["log", "stored"]
     assert "cannot be kept, so it is deleted: Not a directory" in caplog.text
 
 
-async def test_open_episodes_are_known_from_the_first_segment_that_is_kept(bound: Path) -> None:
+async def test_open_episodes_are_known_from_the_first_kept_segment(bound: Path) -> None:
     await live(bound)
-    folder = bound / "stored" / "a-log" / kept(bound)[0][0]
+    folder = bound / "stored" / "a-log" / stored_files(bound)[0][0]
     (folder / "00000001.segment").unlink()
     left = scan(folder, RECORDER[:-1] + b"\1")
     assert (left.start.position > 0, left.cut.position, left.open) == (True, 11, {})
@@ -226,7 +228,7 @@ async def test_each_segment_begins_with_the_declarations_in_use_and_can_be_read_
     ]
 
 
-async def test_a_declaration_there_is_no_room_for_is_recorded_once_and_counted(bound: Path) -> None:
+async def test_a_declaration_without_space_is_recorded_once_and_counted(bound: Path) -> None:
     queue = make(bound)
     for number in range(12):
         queue.put_nowait(DECLARED, b'{"dtype":"%d"}' % number)

@@ -1,4 +1,4 @@
-"""Logs: `log` runs a test on both kinds of database, `file_log` on SQLite alone."""
+"""Fixtures for logs: `log` runs a test on both kinds of database, `file_log` on SQLite alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Records for the tests of the store and the writer."""
+"""Factories of records for the tests of the store and the writer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["episode", "record", "run_of", "declaration"]
 
 
 def episode(number: int) -> EpisodeId:
-    """An episode id that differs from others in its last digits only."""
+    """Return an episode id that differs from others in its last digits only."""
     return EpisodeId(bytes(14) + number.to_bytes(2))
 
 
@@ -37,7 +37,7 @@ def record(
 
 
 def run_of(of: EpisodeId, first: int, last: int, *, position: int | None = None) -> list[Record]:
-    """Events `first` to `last`, at positions from `position` on."""
+    """Return events `first` to `last`, at positions from `position` on."""
     start = first if position is None else position
     return [record(of, sequence, position=start + index) for index, sequence in enumerate(range(first, last + 1))]
 

@@ -12,7 +12,7 @@ from pycrorm_async.store.address import DatabaseAddress
 
 @pytest.fixture
 def database_url(tmp_path: Path) -> str:
-    """All of this is about files."""
+    """Use SQLite alone: these tests are about files."""
     return f"sqlite:///{tmp_path / 'memory.db'}"
 
 
@@ -33,7 +33,7 @@ def test_four_slashes_name_a_file_by_its_absolute_path() -> None:
     assert not address.is_private
 
 
-def test_a_password_is_in_no_text_of_an_address() -> None:
+def test_no_text_of_an_address_contains_the_password() -> None:
     address = DatabaseAddress.parse("postgresql://robot:s3cret@lab:5433/memory?password=s3cret")
     assert str(address) == "postgresql://robot:***@lab:5433/memory"
     assert repr(address) == "DatabaseAddress('postgresql://robot:***@lab:5433/memory')"
@@ -43,7 +43,7 @@ def test_a_password_is_in_no_text_of_an_address() -> None:
 
 
 @pytest.mark.parametrize("scheme", ["postgres", "postgresql+psycopg", "postgresql+asyncpg", "sqlite+aiosqlite"])
-def test_a_scheme_of_another_program_means_the_same_database(scheme: str) -> None:
+def test_the_scheme_of_another_program_names_the_same_database(scheme: str) -> None:
     kind = "sqlite" if scheme.startswith("sqlite") else "postgresql"
     rest = "/memory.db" if kind == "sqlite" else "robot:s3cret@lab:5433/memory?sslmode=require"
     address, plain = (DatabaseAddress.parse(f"{each}://{rest}") for each in (scheme, kind))
@@ -76,7 +76,7 @@ def test_a_scheme_of_another_program_means_the_same_database(scheme: str) -> Non
         ("postgresql://u@h/db?sslmode=s3cret", "sslmode is one of disable, allow, prefer, require, verify-ca"),
     ],
 )
-def test_another_url_is_refused_with_what_works_and_without_its_password(url: str, reason: str) -> None:
+def test_another_url_is_refused_with_the_supported_ones_and_without_its_password(url: str, reason: str) -> None:
     with pytest.raises(UnknownUrl) as caught:
         DatabaseAddress.parse(url)
     message = str(caught.value)
@@ -85,7 +85,7 @@ def test_another_url_is_refused_with_what_works_and_without_its_password(url: st
     assert "s3cret" not in message
 
 
-async def test_an_engine_never_makes_a_file_that_is_missing(tmp_path: Path) -> None:
+async def test_an_engine_never_makes_a_missing_file(tmp_path: Path) -> None:
     address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/memory.db")
     for engine in (address.engine(read_only=True), address.engine()):
         with pytest.raises(OperationalError, match="unable to open database file"):
@@ -95,7 +95,7 @@ async def test_an_engine_never_makes_a_file_that_is_missing(tmp_path: Path) -> N
     assert not address.path.exists()
 
 
-async def test_a_path_may_hold_what_a_url_has_to_escape(tmp_path: Path) -> None:
+async def test_a_path_may_contain_characters_that_a_url_must_escape(tmp_path: Path) -> None:
     address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/50%25 of%3F a #memory.db")
     assert address.path == tmp_path / "50% of? a #memory.db"
     address.path.touch()
@@ -110,7 +110,7 @@ async def test_a_commit_waits_for_the_disk_and_a_reader_cannot_write(address: Da
     address.path.touch()
     writing, reading = address.engine(), address.engine(read_only=True)
     async with writing.begin() as connection:
-        assert (await connection.execute(text("PRAGMA synchronous"))).scalar_one() == 2  # FULL
+        assert (await connection.execute(text("PRAGMA synchronous"))).scalar_one() == 2  # 2 is FULL
         await connection.execute(text("CREATE TABLE t (a)"))
     async with reading.connect() as connection:
         with pytest.raises(OperationalError, match="readonly database"):
@@ -119,7 +119,7 @@ async def test_a_commit_waits_for_the_disk_and_a_reader_cannot_write(address: Da
     await reading.dispose()
 
 
-async def test_a_writing_transaction_rolls_back_tables_as_well(address: DatabaseAddress) -> None:
+async def test_a_write_transaction_rolls_back_tables_as_well(address: DatabaseAddress) -> None:
     address.path.touch()
     engine = address.engine()
     async with engine.begin() as connection:

@@ -21,8 +21,8 @@ def name(number: int) -> str:
     return f"00000000-0000-0000-0000-{number:012x}"
 
 
-async def test_every_column_is_stored_as_it_was_given(log: EventLog, database_url: str) -> None:
-    given = record(
+async def test_every_column_is_stored_as_it_was_appended(log: EventLog, database_url: str) -> None:
+    records = record(
         episode(1),
         1,
         position=77,
@@ -32,7 +32,7 @@ async def test_every_column_is_stored_as_it_was_given(log: EventLog, database_ur
         monotonic_ns=9_007_199_254_740_993,
         payload=b'{"name":"milk"}',
     )
-    await log.append([given])
+    await log.append([records])
     assert ask(database_url, "SELECT * FROM event ORDER BY episode, sequence") == [
         (1, 1, "ObjectAdded", 3, 1_785_000_000_123_456_789, 9_007_199_254_740_993, '{"name":"milk"}')
     ]
@@ -58,7 +58,7 @@ async def test_a_payload_is_stored_byte_for_byte(log: EventLog, database_url: st
     assert [each.payload for each in await log.events(1)] == [text.encode() for text in PAYLOADS]
 
 
-async def test_times_may_be_as_large_and_as_small_as_64_bits(log: EventLog, database_url: str) -> None:
+async def test_times_may_be_as_large_and_as_small_as_64_bits_allow(log: EventLog, database_url: str) -> None:
     await log.append(
         [
             record(episode(1), 1, wall_ns=2**63 - 1, monotonic_ns=-(2**63)),
@@ -83,13 +83,13 @@ async def test_episodes_are_numbered_in_the_order_in_which_they_appear(log: Even
 
 
 async def test_a_batch_of_interleaved_episodes_is_stored_whole(log: EventLog, database_url: str) -> None:
-    given = [record(episode(which), sequence) for sequence in range(1, 41) for which in (1, 2, 3)]
-    assert await log.append(given) == {}
+    records = [record(episode(which), sequence) for sequence in range(1, 41) for which in (1, 2, 3)]
+    assert await log.append(records) == {}
     stored = ask(database_url, "SELECT episode, sequence FROM event ORDER BY episode, sequence")
     assert stored == [(which, sequence) for which in (1, 2, 3) for sequence in range(1, 41)]
 
 
-async def test_an_episode_knows_when_it_started_and_ended(log: EventLog, database_url: str) -> None:
+async def test_an_episode_row_has_the_times_of_its_start_and_end(log: EventLog, database_url: str) -> None:
     await log.append([record(episode(1), 1, wall_ns=100), record(episode(1), 2, wall_ns=200)])
     assert ask(database_url, HEADS) == [(1, name(1), 2, 0, 100, None, None, None)]
     await log.append([record(episode(1), 3, wall_ns=300, kind="EpisodeEnded")])
@@ -98,26 +98,26 @@ async def test_an_episode_knows_when_it_started_and_ended(log: EventLog, databas
     assert ask(database_url, HEADS) == [(1, name(1), 4, 0, 100, 300, None, None)]
 
 
-async def test_an_empty_batch_is_no_transaction(file_log: EventLog) -> None:
+async def test_an_empty_batch_opens_no_transaction(file_log: EventLog) -> None:
     holder = sqlite3.connect(file_log.address.path, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
     assert await file_log.append([]) == {}
     holder.close()
 
 
-# --- twice ----------------------------------------------------------------------------------------------------
+# --- repeated batches -------------------------------------------------------------------------------------------------
 
 
 async def test_a_batch_appended_twice_is_stored_once(log: EventLog, database_url: str) -> None:
-    given = [declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 5), *run_of(episode(2), 1, 3)]
-    await log.append(given)
+    records = [declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 5), *run_of(episode(2), 1, 3)]
+    await log.append(records)
     before = ask(database_url, "SELECT * FROM event ORDER BY episode, sequence"), ask(database_url, HEADS)
-    assert await log.append(given) == {}
+    assert await log.append(records) == {}
     assert (ask(database_url, "SELECT * FROM event ORDER BY episode, sequence"), ask(database_url, HEADS)) == before
     assert ask(database_url, "SELECT count(*) FROM pycrorm_declaration") == [(1,)]
 
 
-async def test_a_batch_that_overlaps_what_is_stored_adds_what_is_new(log: EventLog, database_url: str) -> None:
+async def test_a_batch_that_overlaps_stored_events_adds_the_new_ones(log: EventLog, database_url: str) -> None:
     await log.append(run_of(episode(1), 1, 5))
     assert await log.append([*run_of(episode(1), 3, 8), *run_of(episode(1), 7, 9)]) == {}
     assert ask(database_url, "SELECT sequence FROM event ORDER BY sequence") == [(n,) for n in range(1, 10)]
@@ -135,7 +135,7 @@ async def test_a_batch_that_overlaps_what_is_stored_adds_what_is_new(log: EventL
         {"monotonic_ns": 1},
     ],
 )
-async def test_another_event_under_a_stored_number_is_damage_and_stores_nothing(
+async def test_a_different_event_under_a_stored_number_is_damage_and_stores_nothing(
     log: EventLog, database_url: str, change: dict[str, bytes]
 ) -> None:
     await log.append(run_of(episode(1), 1, 3))
@@ -153,7 +153,7 @@ async def test_another_event_under_a_stored_number_is_damage_and_stores_nothing(
     assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(1), 3)]
 
 
-async def test_another_event_under_a_number_of_the_same_batch_is_damage(log: EventLog, database_url: str) -> None:
+async def test_a_different_event_under_a_number_of_the_same_batch_is_damage(log: EventLog, database_url: str) -> None:
     with pytest.raises(LogDamaged) as caught:
         await log.append([*run_of(episode(1), 1, 3), record(episode(1), 3, payload=b"{}")])
     assert (caught.value.episode, caught.value.sequence) == (name(1), 3)
@@ -165,7 +165,7 @@ async def test_an_event_numbered_zero_is_damage(log: EventLog) -> None:
         await log.append([record(episode(1), 0)])
 
 
-# --- refused --------------------------------------------------------------------------------------------------
+# --- refused events ---------------------------------------------------------------------------------------------------
 
 
 async def test_a_gap_stops_its_episode_before_the_gap_and_no_other(log: EventLog, database_url: str) -> None:
@@ -181,16 +181,14 @@ async def test_a_gap_stops_its_episode_before_the_gap_and_no_other(log: EventLog
     assert [(row.id, row.refused) for row in await log.stopped()] == [(name(1), reason)]
 
 
-async def test_an_episode_with_a_gap_goes_on_being_refused_with_its_first_reason_shown(
-    log: EventLog, database_url: str
-) -> None:
+async def test_an_episode_with_a_gap_stays_refused_and_shows_its_first_reason(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 4)])
     refused = await log.append([*run_of(episode(1), 5, 9), *run_of(episode(2), 1, 1)])
     assert refused == {episode(1): "event 3 did not arrive before event 4"}
     assert ask(database_url, "SELECT head FROM episode ORDER BY number") == [(2,), (1,)]
 
 
-async def test_an_episode_that_begins_with_a_gap_is_known_and_refused(log: EventLog, database_url: str) -> None:
+async def test_an_episode_that_begins_with_a_gap_has_a_row_and_is_refused(log: EventLog, database_url: str) -> None:
     assert await log.append(run_of(episode(1), 2, 4)) == {episode(1): "event 1 did not arrive before event 2"}
     assert [row[:3] for row in ask(database_url, HEADS)] == [(1, name(1), 0)]
 
@@ -202,14 +200,14 @@ async def test_a_refusal_ends_when_the_missing_events_arrive(log: EventLog, data
     assert await log.stopped() == []
 
 
-async def test_repeating_what_is_stored_says_nothing_about_a_refusal(log: EventLog, database_url: str) -> None:
+async def test_repeating_stored_events_does_not_change_a_refusal(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(1), 1, 2), *run_of(episode(1), 4, 6)])
     assert await log.append(run_of(episode(1), 1, 2)) == {}
     assert ask(database_url, "SELECT head, refused FROM episode") == [(2, "event 3 did not arrive before event 4")]
 
 
 @pytest.mark.parametrize("payload", [b'{"name":"a\x00b"}', b'{"name":"\xff"}', b'{"name":"\xc3', b'"\xed\xa0\x80"'])
-async def test_what_no_database_holds_as_text_stops_its_episode(
+async def test_text_that_no_database_can_hold_stops_its_episode(
     log: EventLog, database_url: str, payload: bytes
 ) -> None:
     refused = await log.append(
@@ -230,7 +228,7 @@ async def test_an_episode_number_beyond_the_last_is_refused_and_nothing_else_is(
     await log.append(run_of(episode(1), 1, 1))
     taken = f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({EPISODE_NUMBER_MAX}, 'x', 0, 0)"
     ask_to_change(database_url, taken)
-    if database_url.startswith("postgresql"):  # there, numbers come from a sequence
+    if database_url.startswith("postgresql"):  # PostgreSQL takes the numbers from a sequence
         ask_to_change(database_url, f"SELECT setval('pycrorm.episode_number', {EPISODE_NUMBER_MAX})")
     refused = await log.append([*run_of(episode(2), 1, 2), *run_of(episode(1), 2, 3)])
     assert refused == {
@@ -252,7 +250,9 @@ async def test_an_event_number_beyond_the_last_is_refused(log: EventLog, databas
 # --- declarations ---------------------------------------------------------------------------------------------
 
 
-async def test_declarations_are_kept_once_in_the_order_of_their_first_arrival(log: EventLog, database_url: str) -> None:
+async def test_declarations_are_stored_once_in_the_order_of_their_first_arrival(
+    log: EventLog, database_url: str
+) -> None:
     one, two, three = (json.dumps({"dtype": letter, "ü": "\u2028"}, ensure_ascii=False).encode() for letter in "CAB")
     await log.append([declaration(one), *run_of(episode(1), 1, 2), declaration(two), declaration(one)])
     await log.append([declaration(two), declaration(three)])
@@ -264,17 +264,19 @@ async def test_declarations_are_kept_once_in_the_order_of_their_first_arrival(lo
     ]
 
 
-async def test_a_record_of_the_recorder_that_is_no_declaration_is_damage(log: EventLog, database_url: str) -> None:
+async def test_a_record_without_an_episode_that_is_no_declaration_is_damage(log: EventLog, database_url: str) -> None:
     odd = declaration(b"{}", position=12)._replace(type="Other")
     with pytest.raises(DamageError, match="record 12 belongs to no episode and is a Other"):
         await log.append([*run_of(episode(1), 1, 2), odd])
     assert ask(database_url, "SELECT count(*) FROM event") == [(0,)]
 
 
-# --- the database is away -------------------------------------------------------------------------------------
+# --- an unavailable database ------------------------------------------------------------------------------------------
 
 
-async def test_a_database_locked_by_another_writer_is_away_and_takes_the_batch_afterwards(file_log: EventLog) -> None:
+async def test_a_database_locked_by_another_writer_is_unavailable_and_takes_the_batch_afterwards(
+    file_log: EventLog,
+) -> None:
     impatient = await EventLog.open(file_log.address, create=True, busy_timeout_s=0.05)
     holder = sqlite3.connect(file_log.address.path, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
@@ -287,14 +289,14 @@ async def test_a_database_locked_by_another_writer_is_away_and_takes_the_batch_a
     assert ask(file_log.address.path, "SELECT count(*) FROM event") == [(3,)]
 
 
-async def test_a_file_removed_below_the_log_is_an_unavailable_database_not_a_success(file_log: EventLog) -> None:
+async def test_a_file_removed_below_the_log_is_reported_as_an_unavailable_database(file_log: EventLog) -> None:
     await file_log.append(run_of(episode(1), 1, 3))
     file_log.address.path.unlink()
     with pytest.raises(DatabaseUnavailable, match="the file was removed or replaced while it was open"):
         await file_log.append(run_of(episode(1), 4, 5))
 
 
-async def test_a_file_replaced_below_the_log_is_an_unavailable_database_not_a_success(
+async def test_a_file_replaced_below_the_log_is_reported_as_an_unavailable_database(
     file_log: EventLog,
 ) -> None:
     await file_log.append(run_of(episode(1), 1, 3))
@@ -304,7 +306,7 @@ async def test_a_file_replaced_below_the_log_is_an_unavailable_database_not_a_su
         await file_log.append(run_of(episode(1), 4, 5))
 
 
-async def test_a_log_replaced_by_garbage_is_reported_as_ours_to_mend(file_log: EventLog) -> None:
+async def test_a_log_replaced_by_garbage_is_reported_as_a_fault_of_the_system(file_log: EventLog) -> None:
     await file_log.append(run_of(episode(1), 1, 3))
     await file_log.close()
     content = bytearray(file_log.address.path.read_bytes())
@@ -316,7 +318,7 @@ async def test_a_log_replaced_by_garbage_is_reported_as_ours_to_mend(file_log: E
 
 @pytest.mark.parametrize("with_new", [True, False])
 @pytest.mark.parametrize("meanwhile", ["nothing", "the same", "a part of it", "folded", "refused", "other"])
-async def test_what_was_made_before_the_transaction_is_made_again_if_the_episode_is_not_as_it_was(
+async def test_values_prepared_before_the_transaction_are_prepared_again_if_the_episode_has_changed(
     log: EventLog, database_url: str, meanwhile: str, with_new: bool
 ) -> None:
     await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 1)])
@@ -350,7 +352,7 @@ async def test_what_was_made_before_the_transaction_is_made_again_if_the_episode
     )
 
 
-async def test_another_event_under_a_key_that_was_free_before_the_transaction_is_damage(
+async def test_a_different_event_under_a_key_that_was_free_before_the_transaction_is_damage(
     log: EventLog, database_url: str
 ) -> None:
     await log.append(run_of(episode(1), 1, 3))
@@ -364,7 +366,7 @@ async def test_another_event_under_a_key_that_was_free_before_the_transaction_is
     assert ask(database_url, "SELECT sequence, payload FROM event WHERE sequence > 3") == [(4, "{}")]
 
 
-async def test_many_are_stored_as_few_are(log: EventLog, database_url: str) -> None:
+async def test_multi_row_statements_store_the_same_rows_as_single_ones(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(1), 1, 2_500), *run_of(episode(2), 1, 2)])
     await log.append([*run_of(episode(1), 2_400, 5_000), *run_of(episode(3), 1, 1_500)])
     assert ask(database_url, "SELECT episode, count(*), max(sequence) FROM event GROUP BY episode ORDER BY 1") == [

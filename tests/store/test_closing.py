@@ -1,4 +1,4 @@
-"""A connection to SQLite is closed once, whoever asks for it and when."""
+"""A connection to SQLite is closed once, whichever thread asks and when."""
 
 import asyncio
 import time
@@ -7,8 +7,8 @@ from pathlib import Path
 from pycrorm_async.store.sqlite.engine import _connect
 
 
-async def test_a_closing_ends_although_its_thread_was_asked_to_end_meanwhile(tmp_path: Path) -> None:
-    """As SQLAlchemy does it when a closing is cancelled: the closing goes on, and the thread is told to end as well."""
+async def test_a_close_ends_although_its_thread_was_stopped_meanwhile(tmp_path: Path) -> None:
+    """SQLAlchemy does this when a close is cancelled: the close continues, and its thread is stopped as well."""
     file = tmp_path / "memory.db"
     file.touch()
     connection = await _connect(f"{file.as_uri()}?mode=rw", 1.0)

@@ -1,4 +1,4 @@
-"""An end that recovery computed says only how far its folder knew: a log that knows more keeps what it knows."""
+"""Computed ends: recovery knows only its folder, so that a log with more events of the episode keeps them."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ HEADS = "SELECT head, ended_wall_ns, refused FROM episode"
 
 
 def lost(sequence: int) -> Record:
-    """The computed end behind that many events."""
+    """Return the computed end after this many events."""
     return record(episode(1), sequence + 1, kind="EpisodeEnded", payload=b'{"status":"LOST"}', wall_ns=50 + sequence)
 
 
-async def test_it_follows_what_the_log_has_when_the_folder_had_less(log: EventLog, database_url: str) -> None:
+async def test_a_computed_end_follows_the_events_of_the_log_when_the_folder_had_fewer(
+    log: EventLog, database_url: str
+) -> None:
     await log.append(run_of(episode(1), 1, 5))
-    for _ in range(2):  # a mended folder, drained twice
+    for _ in range(2):  # a repaired folder that is drained twice
         assert await log.append([*run_of(episode(1), 1, 2), lost(2)]) == {}
         assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4, 5, 6]
         assert ask(database_url, EVENTS)[-1] == (6, "EpisodeEnded", '{"status":"LOST"}')
         assert ask(database_url, HEADS) == [(6, 52, None)]
 
 
-async def test_it_is_left_out_when_the_log_knows_the_end(log: EventLog, database_url: str) -> None:
+async def test_a_computed_end_is_ignored_when_the_log_has_an_end(log: EventLog, database_url: str) -> None:
     whole = [*run_of(episode(1), 1, 5), record(episode(1), 6, kind="EpisodeEnded", payload=b'{"status":"SUCCEEDED"}')]
     await log.append(whole)
     assert await log.append([*run_of(episode(1), 1, 3), lost(3)]) == {}
@@ -36,13 +38,15 @@ async def test_it_is_left_out_when_the_log_knows_the_end(log: EventLog, database
     assert ask(database_url, HEADS)[0][0] == 6
 
 
-async def test_where_the_folder_knows_as_much_it_is_stored_once_as_ever(log: EventLog, database_url: str) -> None:
+async def test_a_computed_end_is_stored_once_when_the_folder_and_the_log_agree(
+    log: EventLog, database_url: str
+) -> None:
     for _ in range(2):
         assert await log.append([*run_of(episode(1), 1, 3), lost(3)]) == {}
     assert [row[0] for row in ask(database_url, EVENTS)] == [1, 2, 3, 4]
 
 
-async def test_any_other_event_under_a_number_that_is_taken_is_damage_still(log: EventLog) -> None:
+async def test_any_other_event_under_a_used_number_is_still_damage(log: EventLog) -> None:
     await log.append(run_of(episode(1), 1, 5))
     with pytest.raises(LogDamaged):
         await log.append([record(episode(1), 3, kind="EpisodeEnded", payload=b'{"status":"FAILED"}')])
@@ -50,7 +54,7 @@ async def test_any_other_event_under_a_number_that_is_taken_is_damage_still(log:
         await log.append([*run_of(episode(1), 1, 1), record(episode(1), 2, payload=b"{}"), lost(2)])
 
 
-async def test_a_log_that_waits_for_missing_events_waits_on(log: EventLog, database_url: str) -> None:
+async def test_a_log_that_waits_for_missing_events_keeps_waiting(log: EventLog, database_url: str) -> None:
     await log.append(run_of(episode(1), 1, 3))
     refused = await log.append(run_of(episode(1), 6, 7))
     assert refused == {episode(1): "events 4 to 5 did not arrive before event 6"}

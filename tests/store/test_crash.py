@@ -16,7 +16,7 @@ import pytest
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.crash.recorder_process import say
+from tests.crash.recorder_process import report
 from tests.databases import ask
 from tests.store.factories import episode, run_of
 
@@ -27,11 +27,11 @@ PER_BATCH = 300
 
 @pytest.fixture
 def database_url(tmp_path: Path) -> str:
-    """All of this is about files."""
+    """Use SQLite alone: these tests are about files."""
     return f"sqlite:///{tmp_path / 'memory.db'}"
 
 
-# Imports once, then forks a process for every line it reads: the child appends batches from that number on, for ever.
+# This script imports once, then forks a child for every line it reads, which appends batches from that number on.
 APPENDER = """
 import asyncio, os, sys
 from itertools import count
@@ -58,17 +58,17 @@ async def append_all(address: DatabaseAddress, numbers: Iterable[int]) -> None:
     log = await EventLog.open(address, create=True)
     for number in numbers:
         assert await log.append(batch(number)) == {}
-        say("appended", number)
+        report("appended", number)
     await log.close()
 
 
-def test_a_process_killed_while_appending_leaves_whole_batches_and_the_next_one_goes_on(
+def test_a_process_killed_during_an_append_leaves_whole_batches_and_the_next_one_continues(
     address: DatabaseAddress,
 ) -> None:
     seed = int.from_bytes(os.urandom(4))
     print(f"seed {seed}")
     chance = random.Random(seed)
-    known = 0  # how many batches are in the log
+    stored_batches = 0  # the number of batches in the log
     with subprocess.Popen(
         [sys.executable, "-c", APPENDER, str(address)],
         stdin=subprocess.PIPE,
@@ -79,9 +79,9 @@ def test_a_process_killed_while_appending_leaves_whole_batches_and_the_next_one_
         assert appender.stdin is not None
         assert appender.stdout is not None
         for _ in range(20):
-            appender.stdin.write(f"{max(known - 1, 0)}\n")  # the last one again
+            appender.stdin.write(f"{max(stored_batches - 1, 0)}\n")  # the last batch again
             appender.stdin.flush()
-            child, killed, appended, wanted = 0, False, known, chance.randrange(1, 4)
+            child, killed, appended, wanted = 0, False, stored_batches, chance.randrange(1, 4)
             for line in appender.stdout:
                 word, number = line.split()
                 if word == "running":
@@ -97,17 +97,20 @@ def test_a_process_killed_while_appending_leaves_whole_batches_and_the_next_one_
                     break
             heads = ask(address.path, "SELECT head FROM episode ORDER BY number")
             counts = ask(address.path, "SELECT count(*), min(sequence), max(sequence) FROM event GROUP BY episode")
-            known = heads[0][0] // PER_BATCH
-            assert known in (appended, appended + 1)  # the kill may come between the commit and the report of it
-            assert heads == [(known * PER_BATCH,)] * 2
-            assert counts == [(known * PER_BATCH, 1, known * PER_BATCH)] * 2
+            stored_batches = heads[0][0] // PER_BATCH
+            assert stored_batches in (
+                appended,
+                appended + 1,
+            )  # the kill may fall between the commit and the report of it
+            assert heads == [(stored_batches * PER_BATCH,)] * 2
+            assert counts == [(stored_batches * PER_BATCH, 1, stored_batches * PER_BATCH)] * 2
 
-    asyncio.run(append_all(address, range(known)))
-    assert ask(address.path, "SELECT count(*) FROM event") == [(known * PER_BATCH * 2,)]
+    asyncio.run(append_all(address, range(stored_batches)))
+    assert ask(address.path, "SELECT count(*) FROM event") == [(stored_batches * PER_BATCH * 2,)]
     assert ask(address.path, "PRAGMA integrity_check") == [("ok",)]
 
 
-def test_an_append_cancelled_at_each_of_its_awaits_leaves_a_whole_batch_or_nothing_and_no_lock(
+def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_and_no_lock(
     address: DatabaseAddress,
 ) -> None:
     async def append_and_cancel(number: int, at: int) -> bool:
@@ -121,7 +124,7 @@ def test_an_append_cancelled_at_each_of_its_awaits_leaves_a_whole_batch_or_nothi
             await asyncio.sleep(0)
         appending.cancel()
         await asyncio.wait([appending])
-        # A lock that only the garbage collector would undo shows here: nothing has been collected yet.
+        # A lock that only the garbage collector would release is detected here: it has not run yet.
         ask(address.path, "BEGIN IMMEDIATE")
         await log.close()
         return appending.cancelled()
@@ -129,20 +132,23 @@ def test_an_append_cancelled_at_each_of_its_awaits_leaves_a_whole_batch_or_nothi
     gc.collect()
     gc.disable()
     try:
-        known, at = 0, 0
+        stored_batches, at = 0, 0
         stored_though_cancelled: set[bool] = set()
         while True:
             at += 1
-            cancelled = asyncio.run(append_and_cancel(known, at))
+            cancelled = asyncio.run(append_and_cancel(stored_batches, at))
             heads = ask(address.path, "SELECT head FROM episode ORDER BY number")
-            assert heads in ([(known * PER_BATCH,)] * 2 if known else [], [((known + 1) * PER_BATCH,)] * 2)
-            before, known = known, heads[0][0] // PER_BATCH if heads else 0
+            assert heads in (
+                [(stored_batches * PER_BATCH,)] * 2 if stored_batches else [],
+                [((stored_batches + 1) * PER_BATCH,)] * 2,
+            )
+            before, stored_batches = stored_batches, heads[0][0] // PER_BATCH if heads else 0
             if not cancelled:
                 break
-            stored_though_cancelled.add(known > before)
+            stored_though_cancelled.add(stored_batches > before)
     finally:
         gc.enable()
     assert at > 6  # an append has more awaits than that
-    assert stored_though_cancelled == {False, True}  # it was cancelled before the commit, and in it
-    asyncio.run(append_all(address, range(known + 1)))
-    assert ask(address.path, "SELECT count(*) FROM event") == [((known + 1) * PER_BATCH * 2,)]
+    assert stored_though_cancelled == {False, True}  # cancelled before the commit, and during it
+    asyncio.run(append_all(address, range(stored_batches + 1)))
+    assert ask(address.path, "SELECT count(*) FROM event") == [((stored_batches + 1) * PER_BATCH * 2,)]

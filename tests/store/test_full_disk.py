@@ -1,4 +1,4 @@
-"""A database whose disk is full is away: what is not stored is kept, and stored when there is room again."""
+"""A database on a full disk is unavailable: events stay in the source, and are stored when there is space again."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.writer.fakes import KeptSource
 
 
 class SmallDisk:
-    """A disk of 2 MiB of its own; where there is no right to mount one, SQLite is told to take so many pages."""
+    """A disk of 2 MiB; where the machine permits no mount, a limit on SQLite's pages replaces it."""
 
     def __init__(self, place: Path, *, mounted: bool) -> None:
         self.place = place
@@ -39,7 +39,7 @@ class SmallDisk:
         if not self._mounted:
             event.listen(engine.sync_engine, "checkout", self._limit_pages)
 
-    def make_room(self) -> None:
+    def free_space(self) -> None:
         self._pages = 2**20
         if self._mounted:
             (self.place / "ballast").unlink()
@@ -66,7 +66,7 @@ def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Small
     disk.release()
 
 
-async def test_a_database_on_a_full_disk_is_away_and_everything_is_stored_once_when_there_is_room(
+async def test_a_database_on_a_full_disk_is_unavailable_and_stores_everything_once_when_there_is_space(
     small_disk: SmallDisk,
 ) -> None:
     small_disk.fill()
@@ -84,7 +84,7 @@ async def test_a_database_on_a_full_disk_is_away_and_everything_is_stored_once_w
     assert 0 < len(source.kept) < 1000
     with pytest.raises(DatabaseUnavailable, match="full"):
         await log.append(records)
-    await asyncio.to_thread(small_disk.make_room)
+    await asyncio.to_thread(small_disk.free_space)
     await asyncio.wait_for(running, 60)
     await log.close()
     assert source.kept == []

@@ -1,4 +1,4 @@
-"""Rows go into a table of SQLite as they are, whatever is None in them and however many they are."""
+"""Multi-row inserts into SQLite keep every value, whichever columns are None and however many rows there are."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ VALUES: tuple[tuple[Any, ...], ...] = (
 
 
 def any_rows(count: int, *, empty_often: float) -> list[tuple[Any, ...]]:
-    """Different in what is None in all of them, some and none; the last column has its first value late."""
+    """Return rows with columns that are None in all, some and no rows; the last column has its first value late."""
     choice = random.Random(count)
     rows = []
     for number in range(count):
@@ -44,7 +44,7 @@ def any_rows(count: int, *, empty_often: float) -> list[tuple[Any, ...]]:
 
 @pytest.mark.parametrize("empty_often", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("count", [1, 63, 64, 65, 300, 5_000])
-async def test_what_is_inserted_and_changed_is_what_was_given(
+async def test_inserted_and_updated_rows_hold_the_values_that_were_passed(
     file_log: EventLog, count: int, empty_often: float
 ) -> None:
     rows = any_rows(count, empty_often=empty_often)

@@ -1,7 +1,7 @@
-"""A member of `pycrorm_folder` who plants code in the tables' schemas gains no right that the owner has.
+"""A member of `pycrorm_folder` who plants code in the tables' schemas gains no right of the owner.
 
-Each attack is a real login. It plants a payload that rewrites the log, which only the owner can, and gives itself the
-owner's rights back first with RESET ROLE. Then the owner does everything that comes across the tables.
+Each attack is a real login. It plants a payload that rewrites the log, which only the owner may do, after RESET ROLE
+has restored the owner's rights. Then the owner performs every operation that touches the tables.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ END $$"""
 
 
 def shadow(signature: str, result: str, value: str) -> str:
-    """A function that PostgreSQL takes instead of its own where the arguments match better."""
+    """Return a function that PostgreSQL prefers to its own because the arguments match better."""
     return (
         f"CREATE FUNCTION memory_tables.{signature} RETURNS {result} LANGUAGE plpgsql AS"
         f" $$ BEGIN PERFORM memory_tables.payload(); RETURN {value}; END $$"
@@ -92,7 +92,7 @@ ATTACKS: dict[str, Sequence[str]] = {
 
 @pytest.fixture(params=["superuser"])
 async def owner(request: pytest.FixtureRequest, server: Server, tmp_path: Path) -> str:
-    """The URL of the owner of a memory with roles and with one action in its tables."""
+    """Return the URL of the owner of a memory with roles and with one action in its tables."""
     url = server.new_database()
     database = urlsplit(url).path.removeprefix("/")
     if request.param == "ordinary":
@@ -103,14 +103,14 @@ async def owner(request: pytest.FixtureRequest, server: Server, tmp_path: Path) 
                 ask(url, f"CREATE ROLE pycrorm_{role}")
         ask(url, f"GRANT pycrorm_folder TO owner_of_{database}")
         url = server.url(database, user=f"owner_of_{database}")
-    await _record(url, tmp_path / "spool", "first", 1)
+    await _record_one(url, tmp_path / "spool", "first", 1)
     for statement in GRANTS:
         ask(url, statement)
     return url
 
 
 def member(server: Server, url: str, role: str) -> str:
-    """The URL of a login that is a member of this role and of no other."""
+    """Return the URL of a login that is a member of this role only."""
     database = urlsplit(url).path.removeprefix("/")
     name = f"{role}_of_{database}"
     ask(server.url(database), f"CREATE ROLE {name} LOGIN IN ROLE pycrorm_{role}")
@@ -118,17 +118,17 @@ def member(server: Server, url: str, role: str) -> str:
     return server.url(database, user=name)
 
 
-async def _record(url: str, spool: Path, description: str, step: int) -> None:
+async def _record_one(url: str, spool: Path, description: str, step: int) -> None:
     opening = Memory.open(url, spool=spool, settings=SETTINGS)
     async with opening as memory, memory.episode(description=description):
         await StepActionPerformable("a", step).perform()
 
 
-async def _do_everything(url: str, spool: Path) -> None:
-    """Whatever an owner does with a memory; each that is refused is refused with an error of ours."""
+async def _perform_every_operation(url: str, spool: Path) -> None:
+    """Perform everything an owner does with a memory; a refused operation must raise an error of this package."""
     address = DatabaseAddress.parse(url)
     with suppress(PycrormError):
-        await _record(url, spool, "more", 2)
+        await _record_one(url, spool, "more", 2)
     with suppress(PycrormError):
         await recover(url, spool=spool)
     log = await EventLog.open(address, create=False)
@@ -149,14 +149,14 @@ async def _do_everything(url: str, spool: Path) -> None:
 
 
 @pytest.mark.parametrize("attack", ATTACKS)
-async def test_a_folder_cannot_rewrite_the_log_by_code_that_the_owner_comes_across(
+async def test_a_folder_cannot_rewrite_the_log_by_code_that_the_owner_executes(
     attack: str, owner: str, server: Server, tmp_path: Path
 ) -> None:
     attacker = member(server, owner, "folder")
     before = ask(owner, "SELECT episode, sequence, payload FROM pycrorm.event ORDER BY 1, 2")
     for statement in (*FUNCTIONS, *ATTACKS[attack]):
         ask(attacker, statement)
-    await _do_everything(owner, tmp_path / "spool")
+    await _perform_every_operation(owner, tmp_path / "spool")
     after = ask(owner, "SELECT episode, sequence, payload FROM pycrorm.event ORDER BY 1, 2")
     assert after[: len(before)] == before
     assert len(after) > len(before)  # the owner's own episode was appended
@@ -170,7 +170,7 @@ async def test_the_owner_is_refused_at_the_tables_and_another_login_folds_what_t
 ) -> None:
     folder, reader = (member(server, owner, role) for role in ("folder", "reader"))
     with pytest.raises(TablesUntrusted, match="fold with a login that is a member of pycrorm_folder"):
-        await _record(owner, tmp_path / "spool", "more", 2)
+        await _record_one(owner, tmp_path / "spool", "more", 2)
     log = await EventLog.open(DatabaseAddress.parse(folder), create=True)
     projector = Projector(log)
     await projector.open()
@@ -181,7 +181,7 @@ async def test_the_owner_is_refused_at_the_tables_and_another_login_folds_what_t
     async with Reading.open(reader) as reading:
         assert [each.description for each in await reading.episodes()] == ["first", "more"]
     log = await EventLog.open(DatabaseAddress.parse(owner), create=True)
-    async with log.reading() as connection:  # so that nothing there is found in place of what is in pg_catalog
+    async with log.reading() as connection:  # so that no object there hides one of pg_catalog
         assert (await connection.execute(text("SHOW search_path"))).scalar_one() == "pycrorm"
     await log.close()
     with pytest.raises(TablesUntrusted, match="read with one of pycrorm_reader"):

@@ -1,6 +1,6 @@
-"""Whatever happens to the way to PostgreSQL or to the server: every event is stored once and in order.
+"""Faults of the network or of the PostgreSQL server: every event is stored once and in order.
 
-The oracle is what was put into the source; it is compared with what a connection of its own finds in the end.
+The tests compare what was put into the source with what a connection of their own reads at the end.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ EVENTS = (
 )
 
 
-def made(rng: random.Random, events: int) -> list[Record]:
-    """Records of three episodes, mixed, with a declaration now and then."""
+def records_of_three_episodes(rng: random.Random, events: int) -> list[Record]:
+    """Return records of three interleaved episodes, with some declarations."""
     records: list[Record] = []
     heads = dict.fromkeys((1, 2, 3), 0)
     while len(records) < events:
@@ -69,13 +69,13 @@ def expected(records: list[Record]) -> list[tuple[object, ...]]:
 
 
 async def until(condition: Callable[[], bool]) -> None:
-    """Waits for what no event tells."""
+    """Wait for a condition for which there is no event."""
     while not condition():  # noqa: ASYNC110
         await asyncio.sleep(0.001)
 
 
 @pytest.fixture
-def direct(server: Server) -> str:
+def direct_url(server: Server) -> str:
     """The database's own URL, without a proxy."""
     return server.new_database()
 
@@ -86,14 +86,14 @@ async def proxy(server: Server) -> AsyncIterator[Proxy]:
         yield between
 
 
-def through(proxy: Proxy, direct: str) -> DatabaseAddress:
-    return DatabaseAddress.parse(proxy.url(urlsplit(direct).path.removeprefix("/"), password="s3cr"))
+def url_through_proxy(proxy: Proxy, direct_url: str) -> DatabaseAddress:
+    return DatabaseAddress.parse(proxy.url(urlsplit(direct_url).path.removeprefix("/"), password="s3cr"))
 
 
 async def drained(
     address: DatabaseAddress, records: list[Record], meanwhile: Callable[[Drain], Coroutine[Any, Any, None]]
 ) -> tuple[Drain, KeptSource]:
-    """Drains all of it while something else happens; told of nothing but a database that is away."""
+    """Drain everything while a fault happens; only an unavailable database is reported."""
     log = await EventLog.open(address, create=True, busy_timeout_s=2.0)
     source = KeptSource(records, closed=True)
     drain = Drain(source, log.append, settings=SETTINGS, backoff=QUICKLY)
@@ -106,13 +106,13 @@ async def drained(
     return drain, source
 
 
-def proved(direct: str, records: list[Record], drain: Drain, source: KeptSource) -> None:
-    assert stored(direct) == expected(records)
+def verify_stored_once(direct_url: str, records: list[Record], drain: Drain, source: KeptSource) -> None:
+    assert stored(direct_url) == expected(records)
     assert source.kept == []
     state = drain.state
     assert (state.appended, state.acknowledged, state.refused, state.away) == (len(records), len(records), {}, None)
     assert "s3cr" not in (state.last_error or "")
-    heads = ask(direct, "SELECT head FROM episode ORDER BY id")
+    heads = ask(direct_url, "SELECT head FROM episode ORDER BY id")
     assert heads == [(sum(each.episode == episode(number) for each in records),) for number in (1, 2, 3)]
 
 
@@ -128,8 +128,8 @@ FAULTS: dict[str, Callable[[Proxy], None]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-async def test_a_connection_that_fails_again_and_again_costs_nothing(fault: str, proxy: Proxy, direct: str) -> None:
-    records = made(random.Random(7), 3000)
+async def test_a_connection_that_fails_repeatedly_costs_no_event(fault: str, proxy: Proxy, direct_url: str) -> None:
+    records = records_of_three_episodes(random.Random(7), 3000)
     happened = 0
 
     async def again_and_again(drain: Drain) -> None:
@@ -144,63 +144,65 @@ async def test_a_connection_that_fails_again_and_again_costs_nothing(fault: str,
                 await asyncio.sleep(rng.uniform(0, 0.01))
             happened += drain.state.retries > before or proxy.faults > seen
 
-    drain, source = await drained(through(proxy, direct), records, again_and_again)
+    drain, source = await drained(url_through_proxy(proxy, direct_url), records, again_and_again)
     assert drain.state.retries > 0
     assert happened > 0
-    proved(direct, records, drain, source)
+    verify_stored_once(direct_url, records, drain, source)
 
 
-async def test_a_lost_reply_to_every_single_commit_stores_everything_once(proxy: Proxy, direct: str) -> None:
-    records = made(random.Random(8), 1500)
-    address = through(proxy, direct)
+async def test_a_lost_reply_to_every_commit_stores_everything_once(proxy: Proxy, direct_url: str) -> None:
+    records = records_of_three_episodes(random.Random(8), 1500)
+    address = url_through_proxy(proxy, direct_url)
     log = await EventLog.open(address, create=True)
     for first in range(0, len(records), 100):
         proxy.swallow_reply_to(b"COMMIT")
         with pytest.raises(DatabaseUnavailable):
             await log.append(records[first : first + 100])
-        # It was done, and is done once.
-        assert stored(direct) == expected(records[: first + 100])
+        # The transaction was committed, and is not repeated.
+        assert stored(direct_url) == expected(records[: first + 100])
         assert await log.append(records[first : first + 100]) == {}
     await log.close()
     assert proxy.faults == 15
-    assert stored(direct) == expected(records)
+    assert stored(direct_url) == expected(records)
 
 
-async def test_a_batch_cut_at_any_byte_is_stored_whole_or_not_at_all(proxy: Proxy, direct: str) -> None:
-    address = through(proxy, direct)
+async def test_a_batch_cut_at_any_byte_is_stored_whole_or_not_at_all(proxy: Proxy, direct_url: str) -> None:
+    address = url_through_proxy(proxy, direct_url)
     log = await EventLog.open(address, create=True)
-    known = 0
+    stored_events = 0
     for count in [*range(1, 400, 13), *range(400, 16_000, 397)]:
         batch = [
-            each._replace(sequence=each.sequence + known, position=each.position + known)
+            each._replace(sequence=each.sequence + stored_events, position=each.position + stored_events)
             for each in run_of(episode(1), 1, 60)
         ]
         proxy.cut_after_bytes(count)
         with contextlib.suppress(DatabaseUnavailable):
             assert await log.append(batch) == {}
-        [[head]] = ask(direct, "SELECT coalesce(max(head), 0) FROM episode")
-        assert head in (known, known + 60)
-        assert ask(direct, "SELECT count(*), coalesce(max(sequence), 0) FROM event") == [(head, head)]
-        known = head
-    assert known > 0
+        [[head]] = ask(direct_url, "SELECT coalesce(max(head), 0) FROM episode")
+        assert head in (stored_events, stored_events + 60)
+        assert ask(direct_url, "SELECT count(*), coalesce(max(sequence), 0) FROM event") == [(head, head)]
+        stored_events = head
+    assert stored_events > 0
     assert proxy.faults > 20
     await log.close()
 
 
-async def test_a_dribbling_connection_stores_everything(proxy: Proxy, direct: str) -> None:
+async def test_a_connection_that_dribbles_stores_everything(proxy: Proxy, direct_url: str) -> None:
     proxy.dribble(64)
-    records = made(random.Random(10), 1000)
+    records = records_of_three_episodes(random.Random(10), 1000)
 
-    async def nothing(_: Drain) -> None:
+    async def no_fault(_: Drain) -> None:
         return
 
-    drain, source = await drained(through(proxy, direct), records, nothing)
+    drain, source = await drained(url_through_proxy(proxy, direct_url), records, no_fault)
     assert drain.state.retries == 0
-    proved(direct, records, drain, source)
+    verify_stored_once(direct_url, records, drain, source)
 
 
-async def test_a_server_that_refuses_every_connection_is_away_until_it_takes_one(proxy: Proxy, direct: str) -> None:
-    records = made(random.Random(12), 1000)
+async def test_a_server_that_refuses_every_connection_is_unavailable_until_it_accepts_one(
+    proxy: Proxy, direct_url: str
+) -> None:
+    records = records_of_three_episodes(random.Random(12), 1000)
 
     async def refusing(drain: Drain) -> None:
         proxy.refuse()
@@ -209,15 +211,15 @@ async def test_a_server_that_refuses_every_connection_is_away_until_it_takes_one
         assert drain.state.away is not None
         proxy.refuse(refusing=False)
 
-    drain, source = await drained(through(proxy, direct), records, refusing)
-    proved(direct, records, drain, source)
+    drain, source = await drained(url_through_proxy(proxy, direct_url), records, refusing)
+    verify_stored_once(direct_url, records, drain, source)
 
 
-async def test_a_connection_that_goes_silent_is_given_up_and_the_batch_goes_through_another(
-    proxy: Proxy, direct: str, monkeypatch: pytest.MonkeyPatch
+async def test_a_silent_connection_is_closed_and_the_batch_is_sent_through_another(
+    proxy: Proxy, direct_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(engine, "ANSWER_S_MAX", 0.5)
-    records = made(random.Random(13), 1000)
+    records = records_of_three_episodes(random.Random(13), 1000)
 
     async def silent(drain: Drain) -> None:
         proxy.stall()
@@ -226,20 +228,22 @@ async def test_a_connection_that_goes_silent_is_given_up_and_the_batch_goes_thro
         proxy.reset()
         proxy.flow()
 
-    drain, source = await drained(through(proxy, direct), records, silent)
-    proved(direct, records, drain, source)
+    drain, source = await drained(url_through_proxy(proxy, direct_url), records, silent)
+    verify_stored_once(direct_url, records, drain, source)
 
 
-async def test_the_server_asks_after_a_machine_that_says_nothing_any_more_in_the_middle_of_a_statement(
-    direct: str,
+async def test_the_server_probes_a_machine_that_goes_silent_in_the_middle_of_a_statement(
+    direct_url: str,
 ) -> None:
     asked = "SELECT name, reset_val::int FROM pg_settings WHERE source = 'client' AND name LIKE 'tcp%' ORDER BY name"
-    log = await EventLog.open(DatabaseAddress.parse(direct), create=True)
+    log = await EventLog.open(DatabaseAddress.parse(direct_url), create=True)
     async with log.engine.connect() as connection:
         answer = {row.name: row.reset_val for row in await connection.execute(text(asked))}
     await log.close()
     idle, interval, count = (answer[f"tcp_keepalives_{each}"] for each in ("idle", "interval", "count"))
-    assert 5 <= idle + interval * count <= 30  # seconds until a silent machine is given up, and its locks
+    assert (
+        5 <= idle + interval * count <= 30
+    )  # seconds until the server ends the session of a silent machine and releases its locks
     assert answer["tcp_user_timeout"] <= 30_000
 
 
@@ -248,14 +252,14 @@ async def test_the_server_asks_after_a_machine_that_says_nothing_any_more_in_the
 
 @pytest.fixture
 def own_server() -> Iterator[Server]:
-    """A server to be killed."""
+    """A server that the tests kill."""
     with server_in_memory() as running:
         yield running
 
 
-async def test_a_server_killed_under_load_again_and_again_has_everything_once_in_the_end(own_server: Server) -> None:
+async def test_a_server_killed_repeatedly_under_load_stores_everything_once_in_the_end(own_server: Server) -> None:
     url = own_server.new_database()
-    records = made(random.Random(14), 20_000)
+    records = records_of_three_episodes(random.Random(14), 20_000)
     rng = random.Random(15)
 
     async def killing(drain: Drain) -> None:
@@ -267,39 +271,39 @@ async def test_a_server_killed_under_load_again_and_again_has_everything_once_in
             await until(lambda: drain.state.away is not None or drain.state.appended == len(records))
             acknowledged = drain.state.acknowledged
             await asyncio.to_thread(own_server.start)
-            # What was acknowledged before the server died is there when it is back.
+            # A batch that was acknowledged before the kill is in the database after the restart.
             [[count]] = await asyncio.to_thread(ask, url, "SELECT count(*) FROM event")
             assert count >= sum(each.episode is not None for each in records[:acknowledged])
 
     drain, source = await drained(DatabaseAddress.parse(url), records, killing)
     assert drain.state.retries >= 3
-    proved(url, records, drain, source)
+    verify_stored_once(url, records, drain, source)
 
 
 @pytest.mark.parametrize("what", ["pg_terminate_backend", "pg_cancel_backend"])
-async def test_an_administrator_who_ends_sessions_or_statements_costs_nothing(what: str, direct: str) -> None:
-    records = made(random.Random(16), 6000)
+async def test_an_administrator_who_ends_sessions_or_statements_costs_no_event(what: str, direct_url: str) -> None:
+    records = records_of_three_episodes(random.Random(16), 6000)
 
     async def ending(drain: Drain) -> None:
         sessions = "pg_stat_activity WHERE application_name = 'pycrorm' AND datname = current_database()"
         statement = f"SELECT {what}(pid) FROM {sessions}"
         while drain.state.appended < len(records):
-            await asyncio.to_thread(ask, direct, statement)
+            await asyncio.to_thread(ask, direct_url, statement)
             await asyncio.sleep(0.05)
 
-    drain, source = await drained(DatabaseAddress.parse(direct), records, ending)
-    proved(direct, records, drain, source)
+    drain, source = await drained(DatabaseAddress.parse(direct_url), records, ending)
+    verify_stored_once(direct_url, records, drain, source)
 
 
-async def test_an_append_cancelled_at_each_of_its_awaits_leaves_a_whole_batch_or_nothing_and_no_lock(
-    direct: str,
+async def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_and_no_lock(
+    direct_url: str,
 ) -> None:
-    known = at = 0
-    address = DatabaseAddress.parse(direct)
+    stored_events = at = 0
+    address = DatabaseAddress.parse(direct_url)
     while True:
         at += 1
         log = await EventLog.open(address, create=True, busy_timeout_s=2.0)
-        appending = asyncio.create_task(log.append(run_of(episode(1), known + 1, known + 30)))
+        appending = asyncio.create_task(log.append(run_of(episode(1), stored_events + 1, stored_events + 30)))
         awaited: list[object] = []
         while len(awaited) < at and not appending.done():
             waiter = getattr(appending, "_fut_waiter", None)
@@ -308,13 +312,15 @@ async def test_an_append_cancelled_at_each_of_its_awaits_leaves_a_whole_batch_or
             await asyncio.sleep(0)
         appending.cancel()
         await asyncio.wait([appending])
-        [[head]] = ask(direct, "SELECT coalesce(max(head), 0) FROM episode")
-        assert head in (known, known + 30)
-        assert ask(direct, "SELECT count(*) FROM event") == [(head,)]
-        known = head
+        [[head]] = ask(direct_url, "SELECT coalesce(max(head), 0) FROM episode")
+        assert head in (stored_events, stored_events + 30)
+        assert ask(direct_url, "SELECT count(*) FROM event") == [(head,)]
+        stored_events = head
         second = await EventLog.open(address, create=True, busy_timeout_s=2.0)
-        assert await second.append(run_of(episode(1), known + 1, known + 1)) == {}  # nobody holds its row
-        known += 1
+        assert (
+            await second.append(run_of(episode(1), stored_events + 1, stored_events + 1)) == {}
+        )  # no session locks its row
+        stored_events += 1
         await second.close()
         await log.close()
         if not appending.cancelled():

@@ -1,4 +1,4 @@
-"""`GRANTS` run by an owner of a database who is no superuser, with and without the right to create roles."""
+"""`GRANTS` run by an owner of a database without superuser rights, with and without the right to create roles."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def new_server() -> Iterator[Server]:
-    """A server that never had the roles of a memory, which belong to a whole server."""
+    """A server without the roles of a memory, which belong to the whole server."""
     with server_in_memory() as running:
         yield running
 
 
 def owned(server: Server, *, may: str) -> str:
-    """The URL of an ordinary owner of a new database, who has this attribute."""
+    """Return the URL of an ordinary owner, with this attribute, of a new database."""
     url = server.new_database()
     database = urlsplit(url).path.removeprefix("/")
     ask(url, f"CREATE ROLE owner_of_{database} LOGIN {may}")
@@ -47,10 +47,10 @@ def grant(url: str) -> None:
         ask(url, statement)
 
 
-async def test_an_owner_gets_the_statements_that_are_missing_runs_them_by_another_and_keeps_the_log(
+async def test_an_owner_is_shown_the_missing_statements_has_another_login_run_them_and_keeps_the_log(
     new_server: Server,
 ) -> None:
-    # One after the other: the roles are missing only on a server where no memory has them.
+    # In this order: the roles are missing only on a server without a memory that has them.
     url = owned(new_server, may="NOCREATEROLE")
     login = urlsplit(url).username
     superuser = new_server.url(urlsplit(url).path.removeprefix("/"))
@@ -69,7 +69,7 @@ async def test_an_owner_gets_the_statements_that_are_missing_runs_them_by_anothe
     ask(superuser, member)
     grant(url)
     grant(url)
-    # The log is the owner's as before, through connections from before and new ones.
+    # The log still belongs to the owner, through earlier and new connections.
     assert await log.append(run_of(episode(1), 2, 3)) == {}
     await log.close()
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
@@ -79,7 +79,7 @@ async def test_an_owner_gets_the_statements_that_are_missing_runs_them_by_anothe
         await Projector(log).open()
     await log.close()
 
-    # Who may create roles needs nobody else.
+    # An owner who may create roles needs no other login.
     url = owned(new_server, may="CREATEROLE")
     for role in ("recorder", "folder", "reader"):
         ask(superuser, f"DROP OWNED BY pycrorm_{role}")

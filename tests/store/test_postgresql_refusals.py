@@ -1,4 +1,4 @@
-"""What keeps PostgreSQL from being used is one line that names the database, says why, and shows no password."""
+"""Refusals by PostgreSQL: one line that names the database, gives the reason, and shows no password."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GUARDED = "local all guarded scram-sha-256\n"
 
 
 def guarded_in(server: Server) -> str:
-    """The name of a new database that asks the user `guarded` for the password."""
+    """Return the name of a new database that requires a password of the user `guarded`."""
     rules = server.folder / "pg_hba.conf"
     if not rules.read_text().startswith(GUARDED):
         rules.write_text(GUARDED + rules.read_text())
@@ -43,18 +43,18 @@ def guarded(server: Server) -> str:
 async def refused(
     url: str, caplog: pytest.LogCaptureFixture, *, create: bool = True, busy_timeout_s: float = 2.0
 ) -> PycrormError:
-    """The error that opening raises: one line, no password in it, in what caused it, nor in any log."""
+    """Return the error that opening raises: one line, with no password in it, its causes, or the logs."""
     caplog.set_level(logging.DEBUG)
     with pytest.raises(PycrormError) as caught:
         log = await EventLog.open(DatabaseAddress.parse(url), create=create, busy_timeout_s=busy_timeout_s)
         await log.close()
-    told = "".join(traceback.format_exception(caught.value)) + caplog.text + repr(caught.value.__dict__)
-    assert "s3cr" not in told
+    output = "".join(traceback.format_exception(caught.value)) + caplog.text + repr(caught.value.__dict__)
+    assert "s3cr" not in output
     assert "\n" not in str(caught.value)
     return caught.value
 
 
-async def test_the_right_password_opens_whatever_characters_it_has(server: Server, guarded: str) -> None:
+async def test_a_password_with_any_characters_opens_the_database(server: Server, guarded: str) -> None:
     address = DatabaseAddress.parse(server.url(guarded, user="guarded", password=WRITTEN))
     log = await EventLog.open(address, create=True)
     await log.append(run_of(episode(1), 1, 3))
@@ -63,14 +63,18 @@ async def test_the_right_password_opens_whatever_characters_it_has(server: Serve
 
 
 @pytest.mark.parametrize("password", ["s3cr-wrong", ""])
-async def test_a_wrong_password(server: Server, guarded: str, password: str, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_wrong_password_is_refused(
+    server: Server, guarded: str, password: str, caplog: pytest.LogCaptureFixture
+) -> None:
     error = await refused(server.url(guarded, user="guarded", password=password), caplog)
     assert type(error) is DatabaseUnavailable
     assert str(error).endswith('password authentication failed for user "guarded"')
     assert f"@/{guarded}?host={server.folder}: " in str(error)
 
 
-async def test_who_is_not_known_or_may_not_log_in(server: Server, caplog: pytest.LogCaptureFixture) -> None:
+async def test_an_unknown_login_or_one_without_permission_is_refused(
+    server: Server, caplog: pytest.LogCaptureFixture
+) -> None:
     error = await refused(server.url(user="stranger", password="s3cr"), caplog)
     assert str(error).endswith('role "stranger" does not exist')
     error = await refused(server.url(user="pg_monitor", password="s3cr"), caplog)
@@ -78,7 +82,7 @@ async def test_who_is_not_known_or_may_not_log_in(server: Server, caplog: pytest
 
 
 @pytest.mark.parametrize("create", [True, False])
-async def test_no_such_database(server: Server, create: bool, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_missing_database_is_refused(server: Server, create: bool, caplog: pytest.LogCaptureFixture) -> None:
     error = await refused(server.url("nothing", password="s3cr"), caplog, create=create)
     assert type(error) is DatabaseUnavailable
     assert str(error).endswith('database "nothing" does not exist')
@@ -92,14 +96,14 @@ async def test_no_such_database(server: Server, create: bool, caplog: pytest.Log
         ("postgresql://ada:s3cr@no-such-host.invalid/memory", "no-such-host.invalid/memory: cannot be reached: "),
     ],
 )
-async def test_no_server_there(place: str, reason: str, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_missing_server_is_refused(place: str, reason: str, caplog: pytest.LogCaptureFixture) -> None:
     error = await refused(place, caplog)
     assert type(error) is DatabaseUnavailable
     assert reason in str(error)
     assert str(error).startswith("postgresql://ada:***@")
 
 
-async def test_something_else_than_a_server_there(caplog: pytest.LogCaptureFixture) -> None:
+async def test_another_program_at_the_port_is_refused(caplog: pytest.LogCaptureFixture) -> None:
     async def other(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"HTTP/1.1 400 Bad Request\r\n\r\n")
         writer.close()
@@ -112,7 +116,7 @@ async def test_something_else_than_a_server_there(caplog: pytest.LogCaptureFixtu
     await listening.wait_closed()
 
 
-async def test_a_server_that_says_nothing_is_not_waited_for_longer_than_allowed(
+async def test_opening_waits_for_a_silent_server_no_longer_than_allowed(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -122,12 +126,12 @@ async def test_a_server_that_says_nothing_is_not_waited_for_longer_than_allowed(
     assert str(error).endswith("no answer in time")
 
 
-async def test_a_server_too_old(
+async def test_a_server_that_is_too_old_is_refused(
     server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     url = server.new_database()
     [[version]] = ask(url, "SELECT current_setting('server_version_num')::int / 10000")
-    # A real server of today's version, looked at by a program that needs the next one.
+    # A server of today's version, checked by a program that requires the next one.
     monkeypatch.setattr(dialect, "_SERVER_MIN", (version + 1) * 10_000)
     error = await refused(url, caplog)
     assert type(error) is DatabaseUnavailable
@@ -136,7 +140,9 @@ async def test_a_server_too_old(
     assert ask(url, f"SELECT count(*) FROM pg_namespace WHERE nspname IN {ours}") == [(0,)]
 
 
-async def test_a_user_without_rights(server: Server, guarded: str, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_login_without_rights_is_refused(
+    server: Server, guarded: str, caplog: pytest.LogCaptureFixture
+) -> None:
     url = server.url(guarded)
     ask(url, f"REVOKE CREATE ON DATABASE {guarded} FROM guarded")
     theirs = server.url(guarded, user="guarded", password=WRITTEN)
@@ -175,7 +181,7 @@ async def test_a_log_of_a_newer_version_is_refused(server: Server, caplog: pytes
         assert "its format is 99, this version reads 1" in str(error)
 
 
-async def test_no_connection_left(server: Server, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_server_without_free_connections_is_refused(server: Server, caplog: pytest.LogCaptureFixture) -> None:
     url = server.new_database()
     database = urlsplit(url).path.removeprefix("/")
     ask(server.url(), f"ALTER DATABASE {database} CONNECTION LIMIT 0")
@@ -185,7 +191,7 @@ async def test_no_connection_left(server: Server, caplog: pytest.LogCaptureFixtu
     assert str(error).endswith(f'too many connections for database "{database}"')
 
 
-async def test_a_reader_is_told_where_there_is_no_memory_yet_and_makes_nothing(
+async def test_a_reader_without_a_memory_is_refused_and_makes_nothing(
     server: Server, caplog: pytest.LogCaptureFixture
 ) -> None:
     url = server.new_database()

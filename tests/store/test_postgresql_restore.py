@@ -1,4 +1,4 @@
-"""While a backup is put back, tables of the memory are missing: writers wait, readers get a line, no log is made."""
+"""During the restore of a backup tables are missing: writers wait, readers get a line, and no log is made."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ DROP = "DROP SCHEMA IF EXISTS pycrorm, memory_tables, memory CASCADE"
 
 @pytest.fixture
 def database_url(server: Server) -> str:
-    """All of this is about PostgreSQL."""
+    """Use PostgreSQL alone: these tests are about its restore."""
     return server.new_database()
 
 
@@ -42,7 +42,7 @@ def run_tool(server: Server, tool: str, *arguments: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def _away(memory: Memory) -> str | None:
+def _unavailable(memory: Memory) -> str | None:
     writer = memory.status.writer
     return None if writer is None else writer.queue.away
 
@@ -55,20 +55,20 @@ class Backup:
         self._database = urlsplit(url).path.removeprefix("/")
         run_tool(server, "pg_dump", "--format=custom", f"--file={file}", self._database)
 
-    def put_back(self, *sections: str) -> None:
-        """All of it, or sections of it: `pre-data` makes the tables, `data` fills them, `post-data` adds keys."""
+    def restore(self, *sections: str) -> None:
+        """Restore all of it, or sections: `pre-data` makes the tables, `data` fills them, `post-data` adds keys."""
         chosen = [f"--section={each}" for each in sections]
         run_tool(self._server, "pg_restore", f"--dbname={self._database}", *chosen, str(self._file))
 
 
-async def until_asked_again(drain: Drain, *, times: int) -> None:
-    """Waits until the drain has met so many refusals more."""
+async def until_refused_again(drain: Drain, *, times: int) -> None:
+    """Wait until the drain has met this many more refusals."""
     enough = drain.state.retries + times
     while drain.state.retries < enough:  # noqa: ASYNC110  nothing tells of it
         await asyncio.sleep(0.001)
 
 
-async def test_a_writer_waits_while_its_tables_are_dropped_and_put_back_step_by_step(
+async def test_a_writer_waits_while_its_tables_are_dropped_and_restored_step_by_step(
     server: Server, database_url: str, tmp_path: Path
 ) -> None:
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
@@ -87,10 +87,10 @@ async def test_a_writer_waits_while_its_tables_are_dropped_and_put_back_step_by_
         source.close()
         for sections in ([], ["pre-data"], ["data"]):
             if sections:
-                await asyncio.to_thread(backup.put_back, *sections)
-            await until_asked_again(drain, times=3)
+                await asyncio.to_thread(backup.restore, *sections)
+            await until_refused_again(drain, times=3)
             assert drain.state.away is not None
-        await asyncio.to_thread(backup.put_back, "post-data")
+        await asyncio.to_thread(backup.restore, "post-data")
     assert drain.state.away is None
     assert ask(database_url, "SELECT id FROM pycrorm_log") == [(log.log_id,)]
     heads = ask(
@@ -101,7 +101,7 @@ async def test_a_writer_waits_while_its_tables_are_dropped_and_put_back_step_by_
     await log.close()
 
 
-async def test_a_memory_goes_on_after_its_schemas_were_dropped_and_put_back_while_it_recorded(
+async def test_a_memory_continues_after_its_schemas_were_dropped_and_restored_while_it_recorded(
     server: Server, database_url: str, tmp_path: Path
 ) -> None:
     opening = Memory.open(database_url, spool=tmp_path / "spool", settings=SETTINGS)
@@ -112,22 +112,22 @@ async def test_a_memory_goes_on_after_its_schemas_were_dropped_and_put_back_whil
         await asyncio.to_thread(ask, database_url, DROP)
         await StepActionPerformable("a", 2).perform()
         flushing = asyncio.create_task(memory.flush())
-        while _away(memory) is None and not flushing.done():  # noqa: ASYNC110
+        while _unavailable(memory) is None and not flushing.done():  # noqa: ASYNC110
             await asyncio.sleep(0.001)
         assert not flushing.done()
-        await asyncio.to_thread(backup.put_back)
+        await asyncio.to_thread(backup.restore)
         await flushing
     assert ask(database_url, "SELECT step FROM step_action ORDER BY step") == [(1,), (2,)]
 
 
 GONE: dict[str, Callable[[Backup], None]] = {
     "nothing is there": lambda _: None,
-    "the tables are there and empty": lambda backup: backup.put_back("pre-data"),
+    "the tables are there and empty": lambda backup: backup.restore("pre-data"),
 }
 
 
 @pytest.mark.parametrize("state", GONE)
-async def test_no_log_is_made_in_the_place_of_the_one_a_spool_belongs_to(
+async def test_no_log_is_made_in_place_of_the_one_to_which_a_spool_belongs(
     state: str, server: Server, database_url: str, tmp_path: Path
 ) -> None:
     spool = tmp_path / "spool"
@@ -147,14 +147,14 @@ async def test_no_log_is_made_in_the_place_of_the_one_a_spool_belongs_to(
             pass
     assert ask(database_url, "SELECT count(*) FROM pg_class") == before
     ask(database_url, DROP)
-    backup.put_back()
+    backup.restore()
     await recover(database_url, spool=spool)
     await memory.__aexit__(None, None, None)
     assert ask(database_url, "SELECT step FROM step_action") == [(1,)]
 
 
 @pytest.mark.parametrize("state", GONE)
-async def test_a_reader_gets_one_line_while_a_backup_is_put_back(
+async def test_a_reader_gets_one_line_while_a_backup_is_restored(
     state: str, server: Server, database_url: str, tmp_path: Path
 ) -> None:
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)

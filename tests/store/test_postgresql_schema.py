@@ -1,4 +1,4 @@
-"""The log on PostgreSQL: made once however many open it, append-only for everybody, each role with its own rights."""
+"""The log on PostgreSQL: made once by many openers, append-only for every login, with separate rights for each role."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ ORDER BY kind, name"""
 
 @pytest.fixture
 def database_url(server: Server) -> str:
-    """All of this is about PostgreSQL."""
+    """Use PostgreSQL alone: these tests are about its schema."""
     return server.new_database()
 
 
@@ -73,7 +73,7 @@ def database_url(server: Server) -> str:
         "MERGE INTO event USING event AS other ON event.sequence = other.sequence WHEN MATCHED THEN DELETE",
     ],
 )
-async def test_the_database_itself_refuses_to_change_or_delete_what_was_appended_also_to_its_owner(
+async def test_the_database_refuses_even_its_owner_to_change_or_delete_an_event(
     log: EventLog, database_url: str, statement: str
 ) -> None:
     await log.append([declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 3)])
@@ -82,7 +82,7 @@ async def test_the_database_itself_refuses_to_change_or_delete_what_was_appended
     assert ask(database_url, COUNTS) == [(3,)]
 
 
-async def test_an_older_log_is_brought_up_to_date_and_equals_a_new_one(server: Server) -> None:
+async def test_an_older_log_is_migrated_and_equals_a_new_one(server: Server) -> None:
     urls = [server.new_database(), server.new_database()]
     log = await EventLog.open(DatabaseAddress.parse(urls[0]), create=True)
     await log.append(run_of(episode(1), 1, 3))
@@ -95,9 +95,9 @@ async def test_an_older_log_is_brought_up_to_date_and_equals_a_new_one(server: S
         ids += [await make_or_migrate(engine, "name", birth=Birth("a-new-id", 5), migrations=grown) for _ in range(2)]
         await engine.dispose()
     assert ids == [log.log_id, log.log_id, "a-new-id", "a-new-id"]
-    found = ask(urls[0], ALL_OF_IT)
-    assert found == ask(urls[1], ALL_OF_IT)
-    assert {"by_robot", "episode_behind", "event_is_not_changed", "refuse_change"} < {name for _, name, _ in found}
+    catalog = ask(urls[0], ALL_OF_IT)
+    assert catalog == ask(urls[1], ALL_OF_IT)
+    assert {"by_robot", "episode_behind", "event_is_not_changed", "refuse_change"} < {name for _, name, _ in catalog}
     assert ask(urls[0], "SELECT format FROM pycrorm_log") == [(2,)]
     assert ask(urls[0], COUNTS) == [(3,)]
 
@@ -151,9 +151,9 @@ def test_eight_processes_that_open_a_new_database_at_once_agree_on_one_log_and_o
         assert each.stdin is not None
         each.stdin.write("now\n")
         each.stdin.flush()
-    told = [each.communicate() for each in openers]
-    assert [error for _, error in told] == [""] * 8
-    ids = {output.strip() for output, _ in told}
+    outputs = [each.communicate() for each in openers]
+    assert [error for _, error in outputs] == [""] * 8
+    ids = {output.strip() for output, _ in outputs}
     assert len(ids) == 1
     assert ask(url, "SELECT id FROM pycrorm_log") == [(ids.pop(),)]
     assert ask(url, "SELECT count(*) FROM memory_tables.pycrorm_generation") == [(1,)]
@@ -169,7 +169,7 @@ def started(number: int) -> Record:
 
 @pytest.fixture
 async def roles(server: Server, database_url: str) -> dict[str, str]:
-    """The URL of a member of each role, in a memory with the documented rights, given twice."""
+    """Return the URL of a member of each role, in a memory to which the documented rights were granted twice."""
     database = urlsplit(database_url).path.removeprefix("/")
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     await Projector(log).open()
@@ -203,7 +203,7 @@ async def test_a_recorder_appends_and_cannot_fold(roles: dict[str, str], databas
             ask(roles["recorder"], statement)
 
 
-async def test_a_folder_appends_and_folds_also_what_another_folder_made(
+async def test_a_folder_appends_and_folds_also_tables_that_another_folder_made(
     roles: dict[str, str], database_url: str
 ) -> None:
     address = DatabaseAddress.parse(roles["folder"])
@@ -220,7 +220,7 @@ async def test_a_folder_appends_and_folds_also_what_another_folder_made(
             ask(roles["folder"], statement)
 
 
-async def test_a_reader_reads_log_tables_and_views_also_those_made_later_and_writes_nothing(
+async def test_a_reader_reads_log_tables_and_views_including_later_ones_and_writes_nothing(
     roles: dict[str, str], database_url: str
 ) -> None:
     ask(roles["folder"], "CREATE TABLE memory.later (id int)")
@@ -241,9 +241,7 @@ async def test_a_reader_reads_log_tables_and_views_also_those_made_later_and_wri
 
 
 @pytest.mark.parametrize("role", ["recorder", "folder", "reader"])
-async def test_no_role_can_change_or_delete_what_was_appended(
-    roles: dict[str, str], role: str, database_url: str
-) -> None:
+async def test_no_role_can_change_or_delete_an_event(roles: dict[str, str], role: str, database_url: str) -> None:
     for statement in (
         "UPDATE pycrorm.event SET payload = '{}'",
         "DELETE FROM pycrorm.event",
@@ -261,10 +259,10 @@ async def test_no_role_can_change_or_delete_what_was_appended(
     assert ask(database_url, COUNTS) == [(1,)]
 
 
-# --- at once ----------------------------------------------------------------------------------------------------
+# --- concurrency ------------------------------------------------------------------------------------------------------
 
 
-async def test_two_that_append_the_same_episode_at_once_store_it_once(database_url: str) -> None:
+async def test_two_concurrent_appends_of_one_episode_store_it_once(database_url: str) -> None:
     address = DatabaseAddress.parse(database_url)
     logs = [await EventLog.open(address, create=True) for _ in range(2)]
     for first in range(1, 400, 20):
@@ -280,7 +278,7 @@ async def test_two_that_append_the_same_episode_at_once_store_it_once(database_u
         await each.close()
 
 
-async def test_sixteen_that_append_different_episodes_at_once_lose_nothing_and_share_no_number(
+async def test_sixteen_concurrent_appends_of_different_episodes_lose_nothing_and_share_no_number(
     database_url: str,
 ) -> None:
     address = DatabaseAddress.parse(database_url)
@@ -307,7 +305,7 @@ async def test_sixteen_that_append_different_episodes_at_once_lose_nothing_and_s
     assert ask(database_url, "SELECT count(*) FROM pycrorm_declaration") == [(7,)]
 
 
-async def test_a_row_that_another_session_holds_is_waited_for_and_then_the_database_is_away(
+async def test_an_append_waits_for_a_row_that_another_session_locks_and_then_the_database_is_unavailable(
     database_url: str,
 ) -> None:
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True, busy_timeout_s=0.3)
@@ -326,7 +324,7 @@ async def test_a_row_that_another_session_holds_is_waited_for_and_then_the_datab
     await log.close()
 
 
-async def test_two_that_append_the_same_episodes_in_opposite_order_do_not_wait_in_a_circle(
+async def test_concurrent_appends_of_the_same_episodes_in_opposite_order_do_not_deadlock(
     database_url: str,
 ) -> None:
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
@@ -334,7 +332,7 @@ async def test_two_that_append_the_same_episodes_in_opposite_order_do_not_wait_i
     ask(database_url, "ALTER SYSTEM SET deadlock_timeout = '50ms'")
     ask(database_url, "SELECT pg_reload_conf()")
     for _ in range(20):
-        # Each in the opposite order of the other: rows are taken by number, so that they cannot wait in a circle.
+        # The orders are opposite; appends lock rows by number, so that they cannot deadlock.
         heads = {each.number: each.head for each in await log.episodes()}
         one = [*run_of(episode(1), heads[1] + 1, heads[1] + 1), *run_of(episode(2), heads[2] + 1, heads[2] + 1)]
         answers = await asyncio.gather(log.append(one), log.append(one[::-1]), return_exceptions=True)
@@ -345,7 +343,7 @@ async def test_two_that_append_the_same_episodes_in_opposite_order_do_not_wait_i
     await log.close()
 
 
-async def test_nothing_is_skipped_when_an_earlier_number_is_committed_later(database_url: str) -> None:
+async def test_no_event_is_skipped_when_an_earlier_number_is_committed_later(database_url: str) -> None:
     address = DatabaseAddress.parse(database_url)
     log = await EventLog.open(address, create=True)
     projector = Projector(log)
@@ -354,10 +352,10 @@ async def test_nothing_is_skipped_when_an_earlier_number_is_committed_later(data
     transaction = await slow.begin()
     assert (
         await Appending(dialect_of(slow), [started(1)]).write(slow)
-    ).refusals == {}  # has its number, and is not committed
+    ).refusals == {}  # it has its number, and is not committed
     assert await log.append([started(2)]) == {}
     rolled_back = await asyncpg.connect(database_url)
-    await rolled_back.execute("SELECT nextval('pycrorm.episode_number')")  # a number that nobody will have
+    await rolled_back.execute("SELECT nextval('pycrorm.episode_number')")  # a number that no event will have
     await rolled_back.close()
     assert await log.append([started(3)]) == {}
     assert await projector.catch_up() == 2

@@ -1,4 +1,4 @@
-"""A batch that waits for a synchronous standby in vain is never acknowledged, whatever is in it and however it ends."""
+"""A batch that waits in vain for a synchronous standby is never acknowledged, whatever it holds and however it ends."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ BATCHES = {
 
 @pytest.fixture
 def database_url(server: Server) -> str:
-    """All of this is about PostgreSQL."""
+    """Use PostgreSQL alone: these tests are about its standbys."""
     return server.new_database()
 
 
 @asynccontextmanager
 async def standby_missing(url: str) -> AsyncIterator[asyncpg.Connection]:
-    """While inside, every COMMIT on the server waits for a standby that is not there."""
+    """Make every COMMIT on the server wait for a standby that does not exist, inside the context."""
     watch = await asyncpg.connect(url)
     try:
         await watch.execute("ALTER SYSTEM SET synchronous_standby_names = 'nowhere'")
@@ -62,7 +62,7 @@ async def _is_in_force(url: str, watch: asyncpg.Connection) -> bool:
 
 
 async def _ended_while_waiting(committing: asyncio.Task[object], watch: asyncpg.Connection, how: str) -> bool:
-    """Cancels or terminates the session that waits for the standby; False if the task was done without waiting."""
+    """Cancel or terminate the session that waits for the standby; return False if the task ended without waiting."""
     while not committing.done():
         pids = [row["pid"] for row in await watch.fetch(_WAITING)]
         for pid in pids:
@@ -75,7 +75,7 @@ async def _ended_while_waiting(committing: asyncio.Task[object], watch: asyncpg.
 
 
 @pytest.mark.parametrize("how", ["pg_cancel_backend", "pg_terminate_backend"])
-async def test_a_batch_that_was_ended_while_it_waited_for_a_standby_is_not_stored_however_often_it_is_tried(
+async def test_a_batch_that_is_ended_while_it_waits_for_a_standby_is_not_stored_however_often_it_is_tried(
     how: str, database_url: str
 ) -> None:
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
@@ -83,11 +83,11 @@ async def test_a_batch_that_was_ended_while_it_waited_for_a_standby_is_not_store
     try:
         async with standby_missing(database_url) as watch:
             for name, records in BATCHES.items():
-                for _ in range(2):  # the first one commits, the second one finds all of it there
+                for _ in range(2):  # the first attempt commits, the second one finds all of it stored
                     appending = asyncio.create_task(log.append(records))
                     assert await _ended_while_waiting(appending, watch, how), f"{name}: {appending}"
                     assert isinstance(appending.exception(), DatabaseUnavailable), name
-        refusals = [await log.append(records) for records in BATCHES.values()]  # now each is answered
+        refusals = [await log.append(records) for records in BATCHES.values()]  # now each attempt is answered
         assert [each.keys() for each in refusals] == [{episode(1)} if "gap" in name else set() for name in BATCHES]
     finally:
         await log.close()

@@ -31,14 +31,14 @@ async def test_an_event_comes_back_as_it_was_appended(log: EventLog) -> None:
     ]
 
 
-async def test_an_episode_nobody_stored_has_no_number_and_no_events(log: EventLog) -> None:
+async def test_an_unknown_episode_has_no_number_and_no_events(log: EventLog) -> None:
     await log.append([*run_of(episode(4), 1, 1), *run_of(episode(7), 1, 1)])
     assert await log.episode_number(episode(7)) == 2
     assert await log.episode_number(episode(8)) is None
     assert await log.events(3) == []
 
 
-async def test_what_is_behind_shrinks_as_it_is_folded(log: EventLog) -> None:
+async def test_the_list_of_unfolded_episodes_shrinks_as_they_are_folded(log: EventLog) -> None:
     await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 2)])
     assert [(row.number, row.folded, row.head) for row in await log.behind()] == [(1, 0, 3), (2, 0, 2)]
     async with log.engine.begin() as connection:
@@ -50,7 +50,7 @@ async def test_what_is_behind_shrinks_as_it_is_folded(log: EventLog) -> None:
     assert await log.unfolded(2) == [(1, 2, 3), (2, 2, 3)]
 
 
-async def test_progress_that_someone_else_made_is_noticed(log: EventLog) -> None:
+async def test_progress_of_another_process_is_noticed(log: EventLog) -> None:
     await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 3)])
     async with log.engine.begin() as connection:
         assert await advance_folded(connection, [(1, 0, 2)])
@@ -67,7 +67,7 @@ async def test_the_tables_cannot_be_ahead_of_the_log(log: EventLog) -> None:
             await advance_folded(connection, [(1, 0, 4)])
 
 
-async def test_a_parked_episode_is_not_behind_but_still_takes_events(log: EventLog) -> None:
+async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventLog) -> None:
     await log.append([*run_of(episode(1), 1, 3), *run_of(episode(2), 1, 1)])
     async with log.engine.begin() as connection:
         await park(connection, 1, "column height is an integer and a text")
@@ -84,12 +84,12 @@ async def test_a_parked_episode_is_not_behind_but_still_takes_events(log: EventL
 
 
 @pytest.mark.slow
-async def test_an_episode_row_says_all_that_is_known(log: EventLog) -> None:
+async def test_an_episode_row_holds_all_its_columns(log: EventLog) -> None:
     await log.append([record(episode(1), 1, wall_ns=10), record(episode(1), 2, wall_ns=20, kind="EpisodeEnded")])
     assert await log.episodes() == [EpisodeRow(1, "00000000-0000-0000-0000-000000000001", 2, 0, 10, 20, None, None)]
 
 
-async def test_finding_what_is_behind_looks_at_no_other_episode(file_log: EventLog) -> None:
+async def test_the_query_for_unfolded_episodes_reads_no_other_episode(file_log: EventLog) -> None:
     behind = " | ".join(
         row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_BEHIND}", (0, 9))
     )
@@ -104,7 +104,7 @@ async def test_finding_what_is_behind_looks_at_no_other_episode(file_log: EventL
     assert "episode_stopped" in stopped[0][3]
 
 
-async def test_events_are_read_also_if_together_they_are_more_than_one_value_can_be(file_log: EventLog) -> None:
+async def test_events_are_read_even_if_together_they_exceed_the_limit_of_one_value(file_log: EventLog) -> None:
     records = [record(episode(1), sequence, payload=b'"%s"' % (b"x" * 500)) for sequence in range(1, 11)]
     await file_log.append(records)
     whole = await file_log.spans([Span(1, 2, 9)])
@@ -116,21 +116,21 @@ async def test_events_are_read_also_if_together_they_are_more_than_one_value_can
         assert await dialect_of(file_log.engine).spans(connection, [Span(1, 2, 9)]) == whole
 
 
-async def test_a_reader_sees_what_is_committed_while_another_writes(file_log: EventLog) -> None:
+async def test_a_reader_sees_committed_events_while_another_process_writes(file_log: EventLog) -> None:
     await file_log.append(run_of(episode(1), 1, 3))
     reading = await EventLog.open(file_log.address, create=False)
     writer = sqlite3.connect(file_log.address.path, isolation_level=None)
     writer.execute("BEGIN IMMEDIATE")
     writer.execute("UPDATE episode SET folded = 1")
     assert [row.folded for row in await reading.episodes()] == [0]
-    assert [row.folded for row in await file_log.episodes()] == [0]  # nor does reading wait for the write lock
+    assert [row.folded for row in await file_log.episodes()] == [0]  # reading does not wait for the write lock either
     writer.execute("COMMIT")
     writer.close()
     assert [row.folded for row in await reading.episodes()] == [1]
     await reading.close()
 
 
-async def test_a_log_opened_for_reading_takes_nothing(file_log: EventLog) -> None:
+async def test_a_log_opened_for_reading_takes_no_lock(file_log: EventLog) -> None:
     reading = await EventLog.open(file_log.address, create=False)
     with pytest.raises(DatabaseUnavailable, match="attempt to write a readonly database"):
         await reading.append(run_of(episode(1), 1, 1))
@@ -138,7 +138,7 @@ async def test_a_log_opened_for_reading_takes_nothing(file_log: EventLog) -> Non
     assert ask(file_log.address.path, "SELECT count(*) FROM episode") == [(0,)]
 
 
-async def test_rows_come_whole_and_in_order_also_when_they_are_streamed(file_log: EventLog) -> None:
+async def test_streamed_rows_are_whole_and_in_order(file_log: EventLog) -> None:
     await file_log.append(run_of(episode(1), 1, 200))
     asked = text("SELECT sequence FROM event ORDER BY sequence")
     async with file_log.reading() as connection:

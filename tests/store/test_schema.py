@@ -24,11 +24,11 @@ ALL_OF_IT = "SELECT type, name, sql FROM sqlite_master ORDER BY type, name"
 
 @pytest.fixture
 def database_url(tmp_path: Path) -> str:
-    """All of this is about files."""
+    """Use SQLite alone: these tests are about files."""
     return f"sqlite:///{tmp_path / 'memory.db'}"
 
 
-async def test_a_new_log_has_an_id_that_stays(address: DatabaseAddress) -> None:
+async def test_a_new_log_has_an_id_that_does_not_change(address: DatabaseAddress) -> None:
     clock = Clock(wall_ns=lambda: 1_700_000_000_000_000_007, monotonic_ns=lambda: 1)
     log = await EventLog.open(address, create=True, clock=clock)
     await log.close()
@@ -42,8 +42,8 @@ async def test_a_new_log_has_an_id_that_stays(address: DatabaseAddress) -> None:
     assert ask(address.path, "PRAGMA journal_mode") == [("wal",)]
 
 
-async def test_opened_again_in_the_same_process_it_stays_locked_against_others(address: DatabaseAddress) -> None:
-    """They would take the log of a process that is at work for one that was left behind, and delete it."""
+async def test_a_log_opened_twice_in_one_process_stays_locked_against_others(address: DatabaseAddress) -> None:
+    """Another process would take the log of a live process for an abandoned one and delete it."""
     log = await EventLog.open(address, create=True)
     await log.append(run_of(episode(1), 1, 2))
     await (await EventLog.open(address, create=True)).close()
@@ -55,7 +55,7 @@ async def test_opened_again_in_the_same_process_it_stays_locked_against_others(a
     await log.close()
 
 
-async def test_a_link_to_a_file_that_is_not_there_yet_is_followed(tmp_path: Path) -> None:
+async def test_a_link_to_a_missing_file_is_followed(tmp_path: Path) -> None:
     (tmp_path / "link.db").symlink_to("memory.db")
     log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/link.db"), create=True)
     await log.close()
@@ -72,7 +72,7 @@ async def test_two_logs_have_two_ids(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b""])
-async def test_reading_where_there_is_no_log_says_how_to_make_one_and_makes_nothing(
+async def test_reading_a_missing_log_names_the_command_that_makes_one_and_makes_nothing(
     address: DatabaseAddress, content: bytes | None
 ) -> None:
     if content is not None:
@@ -112,7 +112,7 @@ async def test_a_log_of_a_newer_version_is_refused(address: DatabaseAddress, cre
         await EventLog.open(address, create=create)
 
 
-async def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+async def test_a_missing_folder_is_named(tmp_path: Path) -> None:
     address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/no/memory.db")
     with pytest.raises(DatabaseUnavailable, match=r"cannot be opened: No such file or directory \(.*/no/memory"):
         await EventLog.open(address, create=True)
@@ -120,7 +120,7 @@ async def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
         await EventLog.open(address, create=False)
 
 
-async def test_a_folder_in_the_place_of_the_file_is_unavailable(address: DatabaseAddress) -> None:
+async def test_a_folder_in_place_of_the_file_is_unavailable(address: DatabaseAddress) -> None:
     address.path.mkdir()
     with pytest.raises(DatabaseUnavailable, match="Is a directory"):
         await EventLog.open(address, create=True)
@@ -128,7 +128,7 @@ async def test_a_folder_in_the_place_of_the_file_is_unavailable(address: Databas
         await EventLog.open(address, create=False)
 
 
-async def test_an_older_log_is_brought_up_to_date_and_equals_a_new_one(tmp_path: Path) -> None:
+async def test_an_older_log_is_migrated_and_equals_a_new_one(tmp_path: Path) -> None:
     older = DatabaseAddress.parse(f"sqlite:///{tmp_path}/older.db")
     newer = DatabaseAddress.parse(f"sqlite:///{tmp_path}/newer.db")
     log = await EventLog.open(older, create=True)
@@ -161,7 +161,7 @@ async def test_a_migration_that_fails_leaves_the_log_as_it_was(address: Database
     assert ask(address.path, "SELECT format FROM pycrorm_log") == [(1,)]
 
 
-async def test_reading_does_not_bring_an_older_log_up_to_date(address: DatabaseAddress) -> None:
+async def test_reading_does_not_migrate_an_older_log(address: DatabaseAddress) -> None:
     await (await EventLog.open(address, create=True)).close()
     engine = address.engine(read_only=True)
     async with engine.connect() as connection:
@@ -170,7 +170,7 @@ async def test_reading_does_not_bring_an_older_log_up_to_date(address: DatabaseA
     await engine.dispose()
 
 
-def test_many_processes_that_open_a_new_log_at_once_agree_on_one(tmp_path: Path) -> None:
+def test_many_processes_that_open_a_new_log_concurrently_agree_on_one(tmp_path: Path) -> None:
     script = """
 import asyncio, sys
 from pycrorm_async.store.address import DatabaseAddress
@@ -198,7 +198,9 @@ asyncio.run(main())
 
 
 @pytest.mark.parametrize("hold", ["BEGIN IMMEDIATE", "BEGIN EXCLUSIVE"])
-async def test_whoever_opens_a_new_log_waits_for_another_who_does(address: DatabaseAddress, hold: str) -> None:
+async def test_a_process_that_opens_a_new_log_waits_for_another_that_makes_it(
+    address: DatabaseAddress, hold: str
+) -> None:
     address.path.touch()
     other = sqlite3.connect(address.path, isolation_level=None)
     other.execute(hold)
@@ -211,7 +213,7 @@ async def test_whoever_opens_a_new_log_waits_for_another_who_does(address: Datab
     assert ask(address.path, "PRAGMA journal_mode") == [("wal",)]
 
 
-async def test_logs_that_four_open_at_once_are_there_for_all_of_them(tmp_path: Path) -> None:
+async def test_four_logs_that_are_made_concurrently_all_exist(tmp_path: Path) -> None:
     for number in range(100):
         address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/{number}.db")
         logs = await asyncio.gather(*(EventLog.open(address, create=True) for _ in range(4)))
@@ -234,7 +236,7 @@ async def test_logs_that_four_open_at_once_are_there_for_all_of_them(tmp_path: P
         "DELETE FROM pycrorm_log",
     ],
 )
-async def test_the_database_itself_refuses_to_change_or_delete_what_was_appended(log: EventLog, statement: str) -> None:
+async def test_the_database_refuses_to_change_or_delete_an_event(log: EventLog, statement: str) -> None:
     await log.append([declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 3)])
     with pytest.raises(sqlite3.IntegrityError, match="the event log is append-only"):
         ask(log.address.path, statement)

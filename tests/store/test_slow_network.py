@@ -1,4 +1,4 @@
-"""A memory on a server at the end of a line that is slow, or breaks."""
+"""A memory on a server behind a connection that is slow, or breaks."""
 
 from urllib.parse import urlsplit
 
@@ -26,18 +26,18 @@ async def opened(proxy: Proxy, url: str) -> EventLog:
     return await EventLog.open(DatabaseAddress.parse(proxy.url(urlsplit(url).path[1:])), create=True)
 
 
-async def test_a_memory_is_made_in_far_fewer_messages_than_it_has_tables(server: Server) -> None:
+async def test_making_a_memory_takes_far_fewer_messages_than_it_has_tables(server: Server) -> None:
     url = server.new_database()
     async with proxy_before(server.folder) as proxy:
         log = await opened(proxy, url)
         await Projector(log).open()
         await log.close()
-    [[made]] = ask(url, MADE)
-    assert made > 200
-    assert proxy.requests < made / 2  # each takes as long as the line is, there and back
+    [[statements]] = ask(url, MADE)
+    assert statements > 200
+    assert proxy.requests < statements / 2  # each message takes the delay of the line in both directions
 
 
-async def test_a_line_that_breaks_while_replaced_views_are_cleared_away_is_told_as_such(server: Server) -> None:
+async def test_a_connection_that_breaks_while_replaced_views_are_dropped_is_reported_as_such(server: Server) -> None:
     url = server.new_database()
     async with proxy_before(server.folder) as proxy:
         log = await opened(proxy, url)

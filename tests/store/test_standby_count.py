@@ -1,4 +1,4 @@
-"""On how many machines a confirmed event is, as PostgreSQL says it with a real standby."""
+"""The number of machines that hold a confirmed event, as PostgreSQL reports it with a real standby."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ async def stored_on(url: str) -> StoredOn:
         await log.close()
 
 
-async def test_a_synchronous_standby_counts_as_a_machine_also_for_a_role_that_may_not_see_its_state() -> None:
+async def test_a_synchronous_standby_counts_as_a_machine_even_for_a_role_that_may_not_see_its_state() -> None:
     with (
         tempfile.TemporaryDirectory(prefix="pg") as folder,
         replicas_in(Path(folder), synchronous=True) as replicas,

@@ -35,7 +35,7 @@ def finish(process: subprocess.Popen[str]) -> None:
     process.communicate()
 
 
-def test_a_private_database_has_a_folder_while_it_is_used_and_none_afterwards() -> None:
+def test_a_temporary_database_has_a_folder_only_while_it_is_used() -> None:
     unlocated = DatabaseAddress.parse("sqlite://")
     assert unlocated.is_private
     with unlocated.located() as address:
@@ -49,20 +49,20 @@ def test_a_private_database_has_a_folder_while_it_is_used_and_none_afterwards() 
     assert not folder.exists()
 
 
-def test_two_private_databases_are_not_the_same() -> None:
+def test_two_temporary_databases_differ() -> None:
     one, two = DatabaseAddress.parse("sqlite://"), DatabaseAddress.parse("sqlite://")
     with one.located() as first, two.located() as second:
         assert first.path != second.path
 
 
-def test_an_address_with_a_path_is_located_as_it_is(tmp_path: Path) -> None:
+def test_an_address_with_a_path_is_used_as_it_is(tmp_path: Path) -> None:
     address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/x.db")
     with address.located() as located:
         assert located is address
     assert list(tmp_path.iterdir()) == []
 
 
-def test_the_folder_of_a_killed_process_is_swept_and_that_of_a_living_one_is_not(tmp_path: Path) -> None:
+def test_the_folder_of_a_killed_process_is_deleted_and_that_of_a_live_one_is_not(tmp_path: Path) -> None:
     killed, left_behind = held_by_another_process(tmp_path)
     living, in_use = held_by_another_process(tmp_path)
     killed.send_signal(signal.SIGKILL)
@@ -76,7 +76,7 @@ def test_the_folder_of_a_killed_process_is_swept_and_that_of_a_living_one_is_not
     assert not in_use.exists()
 
 
-def test_another_users_files_of_our_names_neither_hold_it_up_nor_are_touched(tmp_path: Path) -> None:
+def test_files_of_another_user_with_matching_names_neither_delay_it_nor_are_touched(tmp_path: Path) -> None:
     prefix = f"pycrorm-{os.geteuid()}-"
     victim = tmp_path / "victim"
     victim.mkdir()
@@ -93,7 +93,7 @@ def test_another_users_files_of_our_names_neither_hold_it_up_nor_are_touched(tmp
     os.close(held)
 
 
-def test_a_folder_without_a_mark_is_swept_only_while_it_is_empty(tmp_path: Path) -> None:
+def test_a_folder_without_a_lock_file_is_deleted_only_while_it_is_empty(tmp_path: Path) -> None:
     prefix = f"pycrorm-{os.geteuid()}-"
     (tmp_path / f"{prefix}empty").mkdir()
     (tmp_path / f"{prefix}kept").mkdir()
@@ -104,7 +104,7 @@ def test_a_folder_without_a_mark_is_swept_only_while_it_is_empty(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_many_processes_that_make_and_sweep_at_once_each_have_a_folder(tmp_path: Path) -> None:
+def test_many_processes_that_make_and_delete_concurrently_each_have_a_folder(tmp_path: Path) -> None:
     script = """
 import sys
 from pathlib import Path
@@ -120,7 +120,7 @@ for _ in range(200):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_forked_child_that_leaves_the_context_leaves_its_parents_folder(tmp_path: Path) -> None:
+def test_a_forked_child_that_leaves_the_context_keeps_its_parents_folder(tmp_path: Path) -> None:
     script = """
 import os, sys
 from pathlib import Path
@@ -136,6 +136,6 @@ with private_folder(Path(sys.argv[1])) as folder:
     assert list(tmp_path.glob("*/")) == []
 
 
-def test_a_place_that_is_not_there_is_an_unavailable_database(tmp_path: Path) -> None:
+def test_a_missing_place_is_an_unavailable_database(tmp_path: Path) -> None:
     with pytest.raises(DatabaseUnavailable, match="No such file or directory"), private_folder(tmp_path / "no"):
         pass

@@ -1,7 +1,7 @@
-"""TLS to a PostgreSQL server, as libpq names it: sslmode, sslrootcert, sslcert, sslkey.
+"""TLS to a PostgreSQL server, with libpq's parameters sslmode, sslrootcert, sslcert and sslkey.
 
-The server of the tests is built without TLS. A proxy ends the encryption before it, with the exchange of PostgreSQL's
-own SSLRequest, so that the driver does all that it does with a server that encrypts.
+The server of the tests is built without TLS. A proxy ends the encryption before it, with PostgreSQL's own SSLRequest
+exchange, so that the driver behaves as with a server that encrypts.
 """
 
 from __future__ import annotations
@@ -30,7 +30,9 @@ def openssl(folder: Path, *arguments: str) -> None:
 
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """`ca.crt`, another `other.crt`, and `server` and `client` signed by the first; the server's is for localhost."""
+    """Return `ca.crt`, another `other.crt`, and `server` and `client` signed by the first; the server's is for
+    localhost.
+    """
     folder = tmp_path_factory.mktemp("certificates")
     key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
     for name in ("ca", "other"):
@@ -45,7 +47,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @asynccontextmanager
 async def encrypting(server: Server, certificates: Path, *, asks: bool = False) -> AsyncIterator[int]:
-    """The port of a proxy before the server that takes encrypted connections alone; with `asks`, of known clients."""
+    """Yield the port of a proxy that accepts only encrypted connections; with `asks`, only of known clients."""
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(certificates / "ca.crt"))
     context.load_cert_chain(certificates / "server.crt", certificates / "server.key")
     context.verify_mode = ssl.CERT_REQUIRED if asks else ssl.CERT_NONE
@@ -116,7 +118,7 @@ async def opened(url: str) -> None:
         ("localhost", "sslmode=disable", False, ""),
     ],
 )
-async def test_a_server_is_reached_and_believed_as_the_url_says(
+async def test_a_connection_is_encrypted_and_verified_as_the_url_demands(
     server: Server, certificates: Path, host: str, parameters: str, asks: bool, refused: str | None
 ) -> None:
     database = urlsplit(server.new_database()).path
@@ -133,6 +135,6 @@ async def test_a_server_is_reached_and_believed_as_the_url_says(
         assert "\n" not in message
 
 
-def test_the_command_that_is_printed_encrypts_as_the_url_does() -> None:
+def test_the_printed_command_encrypts_as_the_url_demands() -> None:
     address = DatabaseAddress.parse("postgresql://u:s3cret@lab/m?sslmode=verify-full&sslrootcert=/ca.crt&passfile=x")
     assert address.to_type == "postgresql://u@lab/m?sslmode=verify-full&sslrootcert=%2Fca.crt"

@@ -1,4 +1,4 @@
-"""The two ends of a writer for its tests: a source in memory, and the real log with a fold that only counts."""
+"""Fakes for the ends of a writer: a source in memory, and the real log with a fold that only counts."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, advance_folded
 from pycrorm_async.writer.ports import Destination, Source
 
-__all__ = ["KeptSource", "CountingFold", "Passing", "LosesReplies", "opener"]
+__all__ = ["KeptSource", "CountingFold", "ForwardingDestination", "LosesReplies", "opener"]
 
 
 class KeptSource(Source):
-    """Keeps records until they are acknowledged; filled from one thread, drained in the loop of another.
+    """A source in memory that keeps records until they are acknowledged; one thread fills it, another's loop drains it.
 
-    `aside` is what was set aside, or None where what is refused is to stay.
+    `aside` holds the dead letters, or is None where refused records stay in the source.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class KeptSource(Source):
         self._name = name
         self.aside: list[Record] | None = None if stays else []
         self._kept = list(records)
-        self._given = 0  # how many of these were given out
+        self._given = 0  # the number of supplied records
         self._closed = closed
         self._lock = threading.Lock()
         self._wake: Callable[[], object] = lambda: None
@@ -52,7 +52,7 @@ class KeptSource(Source):
             self._wake()
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
-        del age_s_max  # what is there is given at once
+        del age_s_max  # records that are present are supplied at once
         while True:
             arrived = asyncio.Event()
             with self._lock:
@@ -85,13 +85,13 @@ class KeptSource(Source):
         self.given_up.append(reason)
 
     def reopened(self) -> KeptSource:
-        """What the next process finds: everything that was not acknowledged, closed."""
+        """Return the source that the next process opens: everything that was not acknowledged, closed."""
         with self._lock:
             return KeptSource(self._kept, closed=True, name=self._name, stays=self.aside is None)
 
     @property
     def kept(self) -> list[int]:
-        """The positions it still holds."""
+        """The positions that it still holds."""
         with self._lock:
             return [each.position for each in self._kept]
 
@@ -107,7 +107,7 @@ class KeptSource(Source):
 
 
 class CountingFold(Destination):
-    """The real log; folding only notes how far it came."""
+    """The real log, with a fold that only notes the position up to which it was called."""
 
     def __init__(self, log: EventLog) -> None:
         self.log = log
@@ -116,7 +116,7 @@ class CountingFold(Destination):
         return await self.log.append(records)
 
     async def confirm(self) -> None:
-        """What was stored is there."""
+        """Nothing has to be confirmed."""
 
     async def fold(self) -> int:
         behind = await self.log.behind()
@@ -133,8 +133,8 @@ class CountingFold(Destination):
         return {row.id: row.refused or row.parked or "" for row in await self.log.stopped()}
 
 
-class Passing(Destination):
-    """Does what another destination does; to be overridden in one place."""
+class ForwardingDestination(Destination):
+    """Forward every call to another destination; subclasses override one method."""
 
     def __init__(self, destination: Destination) -> None:
         self._destination = destination
@@ -155,8 +155,8 @@ class Passing(Destination):
         return await self._destination.stopped()
 
 
-class LosesReplies(Passing):
-    """Commits, and then says the database is away: the first time for every batch."""
+class LosesReplies(ForwardingDestination):
+    """Commit, and raise that the database is unavailable, the first time for every batch."""
 
     lost = False
 
@@ -175,7 +175,7 @@ def opener(
     busy_timeout_s: float = 5.0,
     closed: Callable[[], None] = lambda: None,
 ) -> Callable[[], AbstractAsyncContextManager[Destination]]:
-    """What opens the log of this address in the loop that enters it."""
+    """Return a function that opens the log of this address in the loop that enters it."""
 
     @asynccontextmanager
     async def opened() -> AsyncIterator[Destination]:

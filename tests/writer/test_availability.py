@@ -9,7 +9,7 @@ from pycrorm_async.writer.availability import Availability
 
 
 class Observed:
-    """A database whose calls take these seconds of a clock that the test moves."""
+    """A database whose calls take a given time by a clock that the test moves."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
@@ -37,7 +37,7 @@ async def test_an_outage_shorter_than_a_second_is_not_reported() -> None:
     await observed.fail(takes_s=0.5)
     await observed.fail(takes_s=0.4)
     assert await observed.call() == 7
-    await observed.fail(takes_s=0.9)  # another outage, which begins anew
+    await observed.fail(takes_s=0.9)  # another outage
     assert observed.reports == []
 
 

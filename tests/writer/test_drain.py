@@ -19,7 +19,7 @@ from pycrorm_async.writer.drain import Drain, run_to_completion
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import ask
 from tests.store.factories import episode, record, run_of
-from tests.writer.fakes import CountingFold, KeptSource, LosesReplies, Passing
+from tests.writer.fakes import CountingFold, ForwardingDestination, KeptSource, LosesReplies
 
 TENS = Settings(batch_events_max=10)
 STORED = "SELECT episode, count(*), min(sequence), max(sequence) FROM event GROUP BY episode ORDER BY episode"
@@ -30,10 +30,10 @@ def name(number: int) -> str:
 
 
 async def at_once(_: float) -> None:
-    """A sleep that does not."""
+    """Sleep without waiting."""
 
 
-async def test_everything_is_stored_and_then_forgotten_by_the_source(log: EventLog) -> None:
+async def test_a_stored_record_is_deleted_from_the_source(log: EventLog) -> None:
     source = KeptSource(run_of(episode(1), 1, 25), closed=True)
     drain = Drain(source, log.append, settings=TENS)
     await drain.run()
@@ -47,19 +47,19 @@ async def test_a_batch_is_acknowledged_after_it_is_committed_and_before_the_next
 ) -> None:
     seen: list[str] = []
 
-    class Watched(Passing):
+    class NotingLog(ForwardingDestination):
         async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
             seen.append(f"append to {records[-1].position} with {source.acknowledgements} acknowledged")
             return await super().append(records)
 
-    class Watching(KeptSource):
+    class NotingSource(KeptSource):
         async def acknowledge(self, position: int) -> None:
             [[stored]] = ask(log.address.path, "SELECT count(*) FROM event")
             seen.append(f"acknowledge {position} with {stored} stored")
             await super().acknowledge(position)
 
-    source = Watching(run_of(episode(1), 1, 20), closed=True)
-    await Drain(source, Watched(CountingFold(log)).append, settings=TENS).run()
+    source = NotingSource(run_of(episode(1), 1, 20), closed=True)
+    await Drain(source, NotingLog(CountingFold(log)).append, settings=TENS).run()
     assert seen == [
         "append to 10 with [] acknowledged",
         "acknowledge 10 with 10 stored",
@@ -78,7 +78,7 @@ async def test_a_commit_whose_reply_is_lost_is_stored_once(log: EventLog) -> Non
     assert drain.state.last_error == "the connection was closed before the reply came"
 
 
-async def test_a_database_locked_by_another_writer_is_asked_again_later_and_nothing_is_lost(
+async def test_an_append_to_a_locked_database_is_retried_and_loses_nothing(
     log: EventLog,
 ) -> None:
     holder = sqlite3.connect(log.address.path, isolation_level=None)
@@ -110,7 +110,7 @@ async def test_a_database_locked_by_another_writer_is_asked_again_later_and_noth
     assert source.kept == []
 
 
-async def test_a_drain_that_may_give_up_raises_and_its_source_keeps_everything(log: EventLog) -> None:
+async def test_a_drain_with_limited_retries_raises_and_its_source_keeps_everything(log: EventLog) -> None:
     holder = sqlite3.connect(log.address.path, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
     source = KeptSource(run_of(episode(1), 1, 25), closed=True)
@@ -124,7 +124,7 @@ async def test_a_drain_that_may_give_up_raises_and_its_source_keeps_everything(l
     assert source.given_up == [f"the writer stopped: {log.address}: database is locked"]
 
 
-async def test_a_state_that_was_taken_stays_as_it_was(log: EventLog) -> None:
+async def test_a_copied_state_does_not_change(log: EventLog) -> None:
     drain = Drain(
         KeptSource([*run_of(episode(1), 1, 4), *run_of(episode(1), 6, 9)], closed=True),
         log.append,
@@ -136,17 +136,17 @@ async def test_a_state_that_was_taken_stays_as_it_was(log: EventLog) -> None:
     assert before.refused == {}
 
 
-async def test_refused_records_are_set_aside_before_they_are_acknowledged_and_the_others_go_on(
+async def test_refused_records_become_dead_letters_before_they_are_acknowledged_and_the_others_are_stored(
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
-    class Watching(KeptSource):
+    class NotingSource(KeptSource):
         async def acknowledge(self, position: int) -> None:
             assert self.aside is not None
             seen.append((position, [each.sequence for each in self.aside]))
             await super().acknowledge(position)
 
     seen: list[tuple[int, list[int]]] = []
-    source = Watching(
+    source = NotingSource(
         [
             *run_of(episode(1), 1, 4, position=1),
             *run_of(episode(1), 6, 9, position=5),
@@ -167,7 +167,7 @@ async def test_refused_records_are_set_aside_before_they_are_acknowledged_and_th
     ]
 
 
-async def test_nothing_is_acknowledged_from_the_first_refused_record_on_that_is_to_stay(log: EventLog) -> None:
+async def test_a_refused_record_that_stays_in_the_source_stops_all_acknowledgements(log: EventLog) -> None:
     broken = [*run_of(episode(1), 1, 4, position=11), *run_of(episode(1), 6, 9, position=15)]
     records = [
         *run_of(episode(2), 1, 10, position=1),
@@ -190,7 +190,7 @@ async def test_nothing_is_acknowledged_from_the_first_refused_record_on_that_is_
     await Drain(again, log.append, settings=TENS).run()
     assert again.kept == list(range(11, 39))
 
-    await log.append([record(episode(1), 5)])  # the missing event is found after all
+    await log.append([record(episode(1), 5)])  # the missing event arrives
     last = source.reopened()
     await Drain(last, log.append, settings=TENS).run()
     assert last.kept == []
@@ -198,7 +198,7 @@ async def test_nothing_is_acknowledged_from_the_first_refused_record_on_that_is_
     assert await log.stopped() == []
 
 
-async def test_a_source_that_cannot_set_aside_is_told_once_and_at_once_that_it_cannot_be_emptied(
+async def test_a_source_without_dead_letters_is_reported_at_once_and_only_once(
     log: EventLog, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Full(KeptSource):
@@ -235,10 +235,10 @@ async def test_damage_ends_the_drain_and_nothing_of_its_batch_is_acknowledged(
     assert ask(log.address.path, STORED) == [(1, 1, 1, 1), (2, 10, 1, 10)]
     damage = f"the writer stopped: episode {name(1)}, event 1: another event is stored under this number already"
     assert source.given_up == [damage]
-    assert caplog.records == []  # whoever it is raised to tells it, once
+    assert caplog.records == []  # the caller of the drain reports the error
 
 
-async def test_whoever_waits_for_a_position_is_told_when_it_is_stored_or_never_will_be(log: EventLog) -> None:
+async def test_a_waiter_for_a_position_learns_when_it_is_stored_or_that_it_never_will_be(log: EventLog) -> None:
     source = KeptSource(run_of(episode(1), 1, 10))
     drain = Drain(source, log.append, settings=TENS)
     running = asyncio.create_task(drain.run())
@@ -252,7 +252,7 @@ async def test_whoever_waits_for_a_position_is_told_when_it_is_stored_or_never_w
 
 
 class Points:
-    """Where a cancellation may come in: each is a moment at which the drain is suspended."""
+    """The points at which the drain is suspended, so that a cancellation can arrive there."""
 
     def __init__(self, wanted: str, times: int) -> None:
         self._wanted, self._times = wanted, times
@@ -266,7 +266,7 @@ class Points:
         await asyncio.sleep(0)
 
 
-class PausingLog(Passing):
+class PausingLog(ForwardingDestination):
     def __init__(self, log: EventLog, points: Points) -> None:
         super().__init__(CountingFold(log))
         self._points = points
@@ -297,7 +297,7 @@ async def test_a_drain_cancelled_at_any_point_loses_nothing(log: EventLog, point
     running.cancel()
     with pytest.raises(asyncio.CancelledError):
         await running
-    # The batch that was on its way when the drain was cancelled went all the way into the log.
+    # The batch that was being appended when the drain was cancelled reached the log completely.
     assert ask(log.address.path, STORED) == [(1, 10 * times, 1, 10 * times)]
     rest = source.reopened()
     assert rest.kept[0] == (10 * times + 1 if point == "after acknowledge" else 10 * (times - 1) + 1)
@@ -322,7 +322,7 @@ async def test_a_drain_cancelled_at_any_moment_loses_nothing(log: EventLog) -> N
     assert source.kept == []
 
 
-async def test_what_is_not_to_be_left_half_done_is_done_also_when_it_is_cancelled_twice() -> None:
+async def test_uninterruptible_work_is_completed_even_when_it_is_cancelled_twice() -> None:
     may_end, ended = threading.Event(), threading.Event()
 
     def work() -> None:
@@ -333,7 +333,7 @@ async def test_what_is_not_to_be_left_half_done_is_done_also_when_it_is_cancelle
     for _ in range(3):
         await asyncio.sleep(0.01)
         task.cancel()
-        task.cancel()  # as a group that ends cancels who was cancelled by name
+        task.cancel()  # a task group that ends cancels a task that was already cancelled directly
     await asyncio.sleep(0.01)
     assert not task.done()
     may_end.set()

@@ -13,12 +13,12 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain_once import drain_once
 from tests.databases import ask
 from tests.store.factories import episode, run_of
-from tests.writer.fakes import CountingFold, KeptSource, Passing
+from tests.writer.fakes import CountingFold, ForwardingDestination, KeptSource
 
 SETTINGS = Settings(batch_events_max=10)
 
 
-async def test_all_there_is_is_stored_folded_and_reported(log: EventLog) -> None:
+async def test_one_round_stores_folds_and_reports_all_records(log: EventLog) -> None:
     sources = [KeptSource(run_of(episode(which), 1, 15), closed=True, name=f"robot {which}") for which in (1, 2)]
     recovered = await drain_once(sources, CountingFold(log), settings=SETTINGS)
     assert [(each.source, each.records) for each in recovered.drained] == [("robot 1", 15), ("robot 2", 15)]
@@ -27,12 +27,12 @@ async def test_all_there_is_is_stored_folded_and_reported(log: EventLog) -> None
     assert [each.kept for each in sources] == [[], []]
 
 
-async def test_nothing_there_is_nothing_done(log: EventLog) -> None:
+async def test_a_round_without_records_does_nothing(log: EventLog) -> None:
     recovered = await drain_once([], CountingFold(log), settings=SETTINGS)
     assert (recovered.drained, recovered.folded) == ((), 0)
 
 
-async def test_what_is_stored_already_is_not_counted_twice_in_the_log(log: EventLog) -> None:
+async def test_records_that_are_already_stored_are_counted_once(log: EventLog) -> None:
     await log.append(run_of(episode(1), 1, 12))
     recovered = await drain_once(
         [KeptSource(run_of(episode(1), 1, 15), closed=True)], CountingFold(log), settings=SETTINGS
@@ -58,14 +58,14 @@ async def test_a_damaged_source_is_reported_and_the_others_are_drained(log: Even
     assert ask(log.address.path, "SELECT head FROM episode ORDER BY number") == [(10,), (3,)]
 
 
-async def test_a_gap_is_reported_with_its_reason(log: EventLog) -> None:
+async def test_a_gap_in_an_episode_is_reported_with_its_reason(log: EventLog) -> None:
     source = KeptSource([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True)
     recovered = await drain_once([source], CountingFold(log), settings=SETTINGS)
     assert recovered.stopped == {"00000000-0000-0000-0000-000000000001": "event 4 did not arrive before event 5"}
     assert recovered.folded == 3
 
 
-async def test_what_is_refused_and_cannot_be_set_aside_is_a_failure_of_its_source(log: EventLog) -> None:
+async def test_a_refusal_without_dead_letters_is_a_failure_of_its_source(log: EventLog) -> None:
     class Full(KeptSource):
         def dead_letter(self, records: Sequence[Record]) -> bool:
             raise SpoolUnavailable(Path("/spool/1.refused"), "No space left on device")
@@ -80,7 +80,7 @@ async def test_what_is_refused_and_cannot_be_set_aside_is_a_failure_of_its_sourc
     assert (full.kept, healthy.kept) == ([1, 2, 3, 5, 6], [])
 
 
-async def test_a_database_that_stays_away_is_raised(log: EventLog) -> None:
+async def test_a_database_that_stays_unavailable_is_raised(log: EventLog) -> None:
     holder = sqlite3.connect(log.address.path, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
     source = KeptSource(run_of(episode(1), 1, 3), closed=True)
@@ -90,8 +90,8 @@ async def test_a_database_that_stays_away_is_raised(log: EventLog) -> None:
     assert source.kept == [1, 2, 3]
 
 
-class LockedAfterAppend(Passing):
-    """Another process writes into the database from the first fold on, until it was asked so often."""
+class LockedAfterAppend(ForwardingDestination):
+    """A second process that locks the database at the first fold, for a given number of attempts."""
 
     def __init__(self, log: EventLog, *, folds_met: int) -> None:
         super().__init__(CountingFold(log))
@@ -111,14 +111,14 @@ class LockedAfterAppend(Passing):
         self._holder.close()
 
 
-async def test_a_database_that_is_busy_when_it_is_to_fold_is_asked_again(log: EventLog) -> None:
+async def test_a_fold_on_a_locked_database_is_retried(log: EventLog) -> None:
     destination = LockedAfterAppend(log, folds_met=2)
     recovered = await drain_once([KeptSource(run_of(episode(1), 1, 3), closed=True)], destination, settings=SETTINGS)
     assert (recovered.folded, destination.folds) == (3, 3)
     assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 3)]
 
 
-async def test_a_database_that_stays_busy_when_it_is_to_fold_is_raised_and_what_was_stored_stays(log: EventLog) -> None:
+async def test_a_database_that_stays_locked_during_the_fold_is_raised_and_stored_records_remain(log: EventLog) -> None:
     destination = LockedAfterAppend(log, folds_met=99)
     source = KeptSource(run_of(episode(1), 1, 3), closed=True)
     with pytest.raises(DatabaseUnavailable, match="database is locked"):
@@ -128,8 +128,8 @@ async def test_a_database_that_stays_busy_when_it_is_to_fold_is_raised_and_what_
     assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 0)]
 
 
-async def test_a_database_that_is_away_when_asked_what_is_stopped_is_asked_again(log: EventLog) -> None:
-    class AwayTwice(Passing):
+async def test_a_query_for_stopped_episodes_on_an_unavailable_database_is_retried(log: EventLog) -> None:
+    class UnavailableTwice(ForwardingDestination):
         asked = 0
 
         async def stopped(self) -> Mapping[str, str]:
@@ -138,7 +138,7 @@ async def test_a_database_that_is_away_when_asked_what_is_stopped_is_asked_again
                 raise DatabaseUnavailable("the connection was closed")
             return await super().stopped()
 
-    destination = AwayTwice(CountingFold(log))
+    destination = UnavailableTwice(CountingFold(log))
     source = KeptSource([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True)
     recovered = await drain_once([source], destination, settings=SETTINGS)
     assert recovered.stopped == {"00000000-0000-0000-0000-000000000001": "event 4 did not arrive before event 5"}

@@ -1,4 +1,4 @@
-"""The writer between the real queue and the real log."""
+"""Checks of the writer between the real queue and the real log."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def payload(number: int) -> bytes:
     return b'{"kind":"action","parent":%d,"text":"%s"}' % (number, "é🤖\\u0007".encode() * 20)
 
 
-async def test_what_is_put_into_the_queue_is_in_the_log_byte_for_byte(tmp_path: Path, address: DatabaseAddress) -> None:
+async def test_the_log_holds_byte_for_byte_what_was_put(tmp_path: Path, address: DatabaseAddress) -> None:
     queue = queue_in(tmp_path / "spool")
     writer = WriterThread(source=queue, open_destination=opener(address), adopt=tuple, settings=SETTINGS)
     await writer.start()
@@ -77,18 +77,20 @@ SMALL = replace(SETTINGS, segment_bytes=2**14, spool_bytes_max=2**17, spool_rese
 
 
 async def refused_in(tmp_path: Path, address: DatabaseAddress) -> tuple[RecorderQueue, WriterThread]:
-    """Both at work, and the database has just forgotten two events of the first episode."""
+    """Yield a queue and a log that have worked together, after the database has lost two events of the first
+    episode.
+    """
     queue = queue_in(tmp_path / "spool", SMALL)
     writer = WriterThread(source=queue, open_destination=opener(address), adopt=tuple, settings=SMALL)
     for number in (1, 2, 3):
         queue.put_nowait(kind(episode(1), number), payload(number))
     await writer.start()
     await writer.flush(3)
-    ask_to_change(address.path, "UPDATE episode SET head = 1, folded = 1")  # as after a backup was put back
+    ask_to_change(address.path, "UPDATE episode SET head = 1, folded = 1")  # as after the restore of a backup
     return queue, writer
 
 
-async def put_when_there_is_room(queue: RecorderQueue, heading: Heading, content: bytes) -> None:
+async def put_when_space_is_free(queue: RecorderQueue, heading: Heading, content: bytes) -> None:
     async with asyncio.timeout(60):
         while True:
             try:
@@ -99,14 +101,14 @@ async def put_when_there_is_room(queue: RecorderQueue, heading: Heading, content
 
 
 @pytest.mark.slow
-async def test_a_refused_episode_is_set_aside_and_the_others_are_never_out_of_room(
+async def test_a_refused_episode_becomes_dead_letters_and_the_others_always_have_space(
     tmp_path: Path, address: DatabaseAddress
 ) -> None:
     queue, writer = await refused_in(tmp_path, address)
     queue.put_nowait(kind(episode(2), 1), payload(1))
-    for number in range(2, 2001):  # many times what the spool may hold
+    for number in range(2, 2001):  # many times the size of the spool
         for which in (1, 2):
-            await put_when_there_is_room(queue, kind(episode(which), number + 2 * (which == 1)), payload(number))
+            await put_when_space_is_free(queue, kind(episode(which), number + 2 * (which == 1)), payload(number))
     with pytest.raises(EpisodeParked, match="events 2 to 3 did not arrive before event 4"):
         await writer.flush(queue.written)
     for which in (1, 2):
@@ -119,7 +121,7 @@ async def test_a_refused_episode_is_set_aside_and_the_others_are_never_out_of_ro
     [kept] = Spool(tmp_path / "spool").recorders()
     assert kept.refused == episode_text(episode(1))
 
-    ask_to_change(address.path, "UPDATE episode SET head = 3 WHERE number = 1")  # they are found after all
+    ask_to_change(address.path, "UPDATE episode SET head = 3 WHERE number = 1")  # the missing events arrive
     failures: dict[str, PycrormError] = {}
     log = await EventLog.open(address, create=True)
     report = await drain_once(dead_queues(Spool(tmp_path / "spool"), failures), CountingFold(log), settings=SETTINGS)
@@ -131,7 +133,7 @@ async def test_a_refused_episode_is_set_aside_and_the_others_are_never_out_of_ro
     assert Spool(tmp_path / "spool").recorders() == []
 
 
-async def test_a_refused_episode_that_cannot_be_set_aside_ends_the_waiting_for_room_of_all_others(
+async def test_a_refused_episode_without_dead_letters_ends_the_wait_for_space_of_all_others(
     tmp_path: Path, address: DatabaseAddress
 ) -> None:
     queue, writer = await refused_in(tmp_path, address)
@@ -152,7 +154,7 @@ async def test_a_refused_episode_that_cannot_be_set_aside_ends_the_waiting_for_r
                 with contextlib.suppress(SpoolFull):
                     queue.put_nowait(kind(episode(2), 2), payload(put))
     assert put > 100
-    assert queue.block_until_room(60.0) is True  # the reserve is there still
+    assert queue.block_until_room(60.0) is True  # the reserve is still free
     queue.put_nowait(Heading(episode(2), "EpisodeEnded", 1), b'{"status":"FAILED"}', reserved=True)
     queue.close()
     with pytest.raises(EpisodeParked):
@@ -161,17 +163,17 @@ async def test_a_refused_episode_that_cannot_be_set_aside_ends_the_waiting_for_r
     assert [each.path for each in Spool(tmp_path / "spool").recorders()] == [queue.folder]
 
 
-async def test_what_a_dead_recorder_left_is_stored_in_one_round(tmp_path: Path, log: EventLog) -> None:
+async def test_the_folder_of_a_dead_recorder_is_stored_in_one_round(tmp_path: Path, log: EventLog) -> None:
     queue = queue_in(tmp_path / "spool")
     for number in range(1, 501):
         queue.put_nowait(kind(episode(1), number), payload(number))
     queue.close()
-    queue.release()  # nothing drained it
+    queue.release()  # no drainer took it
     recovered = open_dead(queue.folder)
     assert recovered is not None
     report = await drain_once([recovered], CountingFold(log), settings=SETTINGS)
     recovered.release()
     assert (report.failed, report.stopped, report.folded) == ({}, {}, 501)
-    assert ask(log.address.path, STORED) == [(1, 501, 1, 501)]  # recovery added that the episode was LOST
+    assert ask(log.address.path, STORED) == [(1, 501, 1, 501)]  # recovery added the end with the status LOST
     [[last]] = ask(log.address.path, "SELECT payload FROM event WHERE sequence = 501")
     assert last == '{"status":"LOST"}'

@@ -1,4 +1,4 @@
-"""What dead recorders left, drained by a writer beside its own queue."""
+"""A writer drains the folders of dead recorders beside its own queue."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from pycrorm_async.writer.ports import Source
 from tests.databases import ask
 from tests.store.factories import episode, record, run_of
 from tests.writer.fakes import KeptSource
-from tests.writer.writer_threads import QUICK, name, until, until_asked, writer_for, writers_alive
+from tests.writer.writer_threads import QUICK, name, until, until_answer, writer_for, writers_alive
 
 
-async def test_what_dead_recorders_left_is_stored_and_folded(address: DatabaseAddress) -> None:
+async def test_the_folders_of_dead_recorders_are_stored_and_folded(address: DatabaseAddress) -> None:
     dead = [KeptSource(run_of(episode(which), 1, 30), closed=True, name=f"dead {which}") for which in (2, 3)]
     source = KeptSource(run_of(episode(1), 1, 10))
     writer = writer_for(source, address, settings=QUICK, adopt=dead)
     await writer.start()
     folded = "SELECT id, folded FROM episode ORDER BY id"
-    await until_asked(address.path, folded, [(name(1), 10), (name(2), 30), (name(3), 30)])
+    await until_answer(address.path, folded, [(name(1), 10), (name(2), 30), (name(3), 30)])
     source.close()
     await writer.close()
     assert [each.kept for each in dead] == [[], []]
     assert [each.source for each in writer.state.adopted] == ["dead 2", "dead 3"]
 
 
-async def test_a_damaged_folder_of_somebody_else_is_shown_and_not_raised(address: DatabaseAddress) -> None:
+async def test_a_damaged_folder_of_another_recorder_is_shown_and_not_raised(address: DatabaseAddress) -> None:
     class Damaged(KeptSource):
         async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
             raise SpoolDamaged(Path("/spool/2/1.seg"), 4096, "a frame does not match its checksum")
 
     after = KeptSource(run_of(episode(3), 1, 4), closed=True, name="dead 3")
 
-    def found() -> Iterator[Source]:
+    def open_sources() -> Iterator[Source]:
         yield Damaged(name="dead 2")
         yield after
         raise SpoolDamaged(Path("/spool/4/1.seg"), 0, "no header")
 
     source = KeptSource(run_of(episode(1), 1, 3))
-    writer = writer_for(source, address, adopt=found())
+    writer = writer_for(source, address, adopt=open_sources())
     await writer.start()
     await until(lambda: len(writer.state.adoption_errors) == 2)
     await writer.flush(3)
@@ -60,7 +60,7 @@ async def test_a_damaged_folder_of_somebody_else_is_shown_and_not_raised(address
     assert after.kept == []
 
 
-async def test_what_a_dead_recorder_left_and_the_log_contradicts_is_told_once(
+async def test_a_contradiction_between_a_dead_recorder_and_the_log_is_reported_once(
     address: DatabaseAddress, caplog: pytest.LogCaptureFixture
 ) -> None:
     log = await EventLog.open(address, create=True)
@@ -77,7 +77,7 @@ async def test_what_a_dead_recorder_left_and_the_log_contradicts_is_told_once(
     assert line == (f"recorder dead 2: episode {name(2)}, event 1: another event is stored under this number already")
 
 
-async def test_what_is_refused_of_many_dead_recorders_is_told_in_one_line(
+async def test_refusals_in_many_dead_folders_are_reported_in_one_line(
     address: DatabaseAddress, caplog: pytest.LogCaptureFixture
 ) -> None:
     dead = [
@@ -99,20 +99,20 @@ async def test_what_is_refused_of_many_dead_recorders_is_told_in_one_line(
     assert [len(each.aside or []) for each in dead] == [4, 4, 4]
 
 
-async def test_closing_does_not_wait_for_somebody_elses_records(address: DatabaseAddress) -> None:
+async def test_closing_does_not_wait_for_the_records_of_other_recorders(address: DatabaseAddress) -> None:
     release_folder: list[str] = []
 
-    def found() -> Iterator[Source]:
+    def open_sources() -> Iterator[Source]:
         try:
             yield KeptSource(run_of(episode(2), 1, 5), name="never closed")
         finally:
             release_folder.append("never closed")
 
-    folders = found()
+    folders = open_sources()
     source = KeptSource(run_of(episode(1), 1, 3))
     writer = writer_for(source, address, adopt=folders)
     await writer.start()
-    await until_asked(address.path, "SELECT count(*) FROM event", [(8,)])
+    await until_answer(address.path, "SELECT count(*) FROM event", [(8,)])
     source.close()
     await writer.close()
     assert writers_alive() == []

@@ -24,14 +24,14 @@ from pycrorm_async.writer.ports import Destination
 from pycrorm_async.writer.writer_thread import WriterThread
 from tests.databases import ask
 from tests.store.factories import declaration, episode, record, run_of
-from tests.writer.fakes import KeptSource, LosesReplies, Passing, opener
+from tests.writer.fakes import ForwardingDestination, KeptSource, LosesReplies, opener
 from tests.writer.writer_threads import (
     NEVER_IDLE,
     QUICK,
     name,
-    nobody,
+    no_writer_alive,
     until,
-    until_asked,
+    until_answer,
     writer_for,
     writers_alive,
 )
@@ -39,7 +39,7 @@ from tests.writer.writer_threads import (
 HEADS = "SELECT id, head, folded FROM episode ORDER BY number"
 
 
-async def test_what_was_put_before_a_flush_is_stored_and_folded_after_it(address: DatabaseAddress) -> None:
+async def test_records_put_before_a_flush_are_stored_and_folded_after_it(address: DatabaseAddress) -> None:
     source = KeptSource()
     writer = writer_for(source, address)
     await writer.start()
@@ -62,7 +62,7 @@ async def test_events_are_stored_beside_a_plan_that_never_suspends(address: Data
     await writer.start()
     patience_ends = time.monotonic() + 60
     put = 0
-    while writer.state.queue.records < 5000:  # no await anywhere: the loop of the plan never turns
+    while writer.state.queue.records < 5000:  # without an await, so that the loop of the plan never runs
         assert time.monotonic() < patience_ends
         if put < 20_000:
             source.put(run_of(episode(1), put + 1, put + 100))
@@ -75,19 +75,19 @@ async def test_events_are_stored_beside_a_plan_that_never_suspends(address: Data
     assert ask(address.path, "SELECT count(*), max(sequence) FROM event") == [(put, put)]
 
 
-async def test_an_idle_plan_is_folded_without_being_asked(address: DatabaseAddress) -> None:
+async def test_events_of_an_idle_plan_are_folded_without_a_flush(address: DatabaseAddress) -> None:
     source = KeptSource()
     writer = writer_for(source, address, settings=QUICK)
     await writer.start()
     source.put(run_of(episode(1), 1, 100))
-    await until_asked(address.path, HEADS, [(name(1), 100, 100)])
+    await until_answer(address.path, HEADS, [(name(1), 100, 100)])
     source.put(run_of(episode(1), 101, 150))
-    await until_asked(address.path, HEADS, [(name(1), 150, 150)])
+    await until_answer(address.path, HEADS, [(name(1), 150, 150)])
     source.close()
     await writer.close()
 
 
-async def test_what_was_left_unfolded_before_is_folded_when_the_new_plan_is_idle(
+async def test_events_left_unfolded_by_a_predecessor_are_folded_when_the_new_plan_is_idle(
     address: DatabaseAddress,
 ) -> None:
     log = await EventLog.open(address, create=True)
@@ -96,7 +96,7 @@ async def test_what_was_left_unfolded_before_is_folded_when_the_new_plan_is_idle
     source = KeptSource()
     writer = writer_for(source, address, settings=QUICK)
     await writer.start()
-    await until_asked(address.path, HEADS, [(name(1), 7, 7)])
+    await until_answer(address.path, HEADS, [(name(1), 7, 7)])
     source.close()
     await writer.close()
 
@@ -104,7 +104,7 @@ async def test_what_was_left_unfolded_before_is_folded_when_the_new_plan_is_idle
 async def test_a_commit_whose_reply_is_lost_beside_a_plan_is_stored_once(address: DatabaseAddress) -> None:
     source = KeptSource(run_of(episode(1), 1, 1500))
     writer = WriterThread(
-        source=source, open_destination=opener(address, around=LosesReplies), adopt=nobody, settings=NEVER_IDLE
+        source=source, open_destination=opener(address, around=LosesReplies), adopt=no_writer_alive, settings=NEVER_IDLE
     )
     await writer.start()
     await writer.flush(1500)
@@ -117,7 +117,7 @@ async def test_a_commit_whose_reply_is_lost_beside_a_plan_is_stored_once(address
 # --- opening --------------------------------------------------------------------------------------------------
 
 
-async def test_starting_raises_when_the_database_is_not_ours_and_leaves_no_thread(
+async def test_starting_raises_on_a_foreign_database_and_leaves_no_thread(
     address: DatabaseAddress,
 ) -> None:
     ask(address.path, "CREATE TABLE bookmarks (url)")
@@ -139,7 +139,7 @@ async def test_starting_raises_when_the_database_does_not_answer_in_time(address
     assert writers_alive() == []
 
 
-async def test_starting_that_is_cancelled_leaves_no_thread(address: DatabaseAddress) -> None:
+async def test_a_cancelled_start_leaves_no_thread(address: DatabaseAddress) -> None:
     source = KeptSource()
     writer = writer_for(source, address)
     starting = asyncio.create_task(writer.start())
@@ -178,7 +178,7 @@ async def test_a_gap_is_raised_at_flush_and_at_close_and_other_episodes_are_visi
     assert writers_alive() == []
 
 
-async def test_an_episode_parked_by_someone_before_is_not_raised_again(address: DatabaseAddress) -> None:
+async def test_an_episode_that_was_parked_before_is_not_raised_again(address: DatabaseAddress) -> None:
     log = await EventLog.open(address, create=True)
     await log.append(run_of(episode(1), 1, 3))
     async with log.engine.begin() as connection:
@@ -193,7 +193,7 @@ async def test_an_episode_parked_by_someone_before_is_not_raised_again(address: 
     assert ask(address.path, HEADS) == [(name(1), 3, 0), (name(2), 3, 3)]
 
 
-async def test_damage_is_told_once_and_raised_at_every_flush_and_at_close_while_the_plan_goes_on(
+async def test_damage_is_reported_once_and_raised_at_every_flush_and_at_close_while_the_plan_continues(
     address: DatabaseAddress, caplog: pytest.LogCaptureFixture
 ) -> None:
     log = await EventLog.open(address, create=True)
@@ -219,7 +219,7 @@ async def test_damage_is_told_once_and_raised_at_every_flush_and_at_close_while_
 
 
 @pytest.mark.slow
-async def test_a_flush_that_takes_too_long_says_why_and_loses_nothing(address: DatabaseAddress) -> None:
+async def test_a_flush_that_times_out_gives_the_reason_and_loses_nothing(address: DatabaseAddress) -> None:
     source = KeptSource()
     settings = Settings(idle_ms=10**9, flush_timeout_s=1.0)
     writer = writer_for(source, address, settings=settings, busy_timeout_s=0.01)
@@ -238,17 +238,17 @@ async def test_a_flush_that_takes_too_long_says_why_and_loses_nothing(address: D
     assert ask(address.path, "SELECT count(*) FROM event") == [(0,)]
 
 
-async def test_a_log_that_cannot_say_what_is_stopped_is_told_at_once_at_flush_and_at_close(
+async def test_a_failing_query_for_stopped_episodes_is_reported_once_and_raised_at_flush_and_close(
     address: DatabaseAddress,
 ) -> None:
-    class Unreadable(Passing):
+    class Unreadable(ForwardingDestination):
         async def stopped(self) -> Mapping[str, str]:
             raise KeyError("no such column")
 
     source = KeptSource(run_of(episode(1), 1, 5))
     settings = Settings(flush_timeout_s=1000.0)
     writer = WriterThread(
-        source=source, open_destination=opener(address, around=Unreadable), adopt=nobody, settings=settings
+        source=source, open_destination=opener(address, around=Unreadable), adopt=no_writer_alive, settings=settings
     )
     await writer.start()
     async with asyncio.timeout(30):
@@ -264,7 +264,7 @@ async def test_a_log_that_cannot_say_what_is_stopped_is_told_at_once_at_flush_an
 
 
 @pytest.mark.slow
-async def test_flushes_that_meet_the_closing_end_with_it(address: DatabaseAddress) -> None:
+async def test_flushes_during_the_close_end_with_it(address: DatabaseAddress) -> None:
     for _ in range(15):
         source = KeptSource(run_of(episode(1), 1, 5))
         writer = writer_for(source, address)
@@ -280,10 +280,10 @@ async def test_flushes_that_meet_the_closing_end_with_it(address: DatabaseAddres
                 flushed.append(5)
                 await asyncio.sleep(0)
 
-        def beside(work: Callable[[], Coroutine[None, None, None]] = flush_all_the_time) -> None:
+        def flush_beside(work: Callable[[], Coroutine[None, None, None]] = flush_all_the_time) -> None:
             asyncio.run(work())
 
-        flushing = [asyncio.create_task(asyncio.to_thread(beside)) for _ in range(2)]
+        flushing = [asyncio.create_task(asyncio.to_thread(flush_beside)) for _ in range(2)]
         await until(lambda flushed=flushed: len(flushed) > 3)  # type: ignore[misc]
         source.close()
         await writer.close()
@@ -292,10 +292,10 @@ async def test_flushes_that_meet_the_closing_end_with_it(address: DatabaseAddres
             await asyncio.gather(*flushing)
 
 
-async def test_a_flush_that_closing_does_not_wait_for_any_longer_says_so(address: DatabaseAddress) -> None:
+async def test_a_flush_that_closing_stops_waiting_for_reports_that(address: DatabaseAddress) -> None:
     entered = threading.Event()
 
-    class Endless(Passing):
+    class Endless(ForwardingDestination):
         async def fold(self) -> int:
             entered.set()
             await asyncio.Event().wait()
@@ -304,7 +304,7 @@ async def test_a_flush_that_closing_does_not_wait_for_any_longer_says_so(address
     source = KeptSource(run_of(episode(1), 1, 5))
     settings = Settings(idle_ms=10**9, flush_timeout_s=1.0)
     writer = WriterThread(
-        source=source, open_destination=opener(address, around=Endless), adopt=nobody, settings=settings
+        source=source, open_destination=opener(address, around=Endless), adopt=no_writer_alive, settings=settings
     )
     await writer.start()
     source.close()
@@ -320,13 +320,13 @@ async def test_a_flush_that_closing_does_not_wait_for_any_longer_says_so(address
 
 
 async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) -> None:
-    class Unfoldable(Passing):
+    class Unfoldable(ForwardingDestination):
         async def fold(self) -> int:
             raise KeyError("no such column")
 
     source = KeptSource()
     writer = WriterThread(
-        source=source, open_destination=opener(address, around=Unfoldable), adopt=nobody, settings=QUICK
+        source=source, open_destination=opener(address, around=Unfoldable), adopt=no_writer_alive, settings=QUICK
     )
     await writer.start()
     source.put(run_of(episode(1), 1, 5))
@@ -340,8 +340,8 @@ async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) ->
     assert writers_alive() == []
 
 
-async def test_a_database_away_while_folding_is_asked_again(address: DatabaseAddress) -> None:
-    class OftenAway(Passing):
+async def test_a_fold_on_an_unavailable_database_is_retried(address: DatabaseAddress) -> None:
+    class OftenUnavailable(ForwardingDestination):
         asked = 0
 
         async def fold(self) -> int:
@@ -358,7 +358,10 @@ async def test_a_database_away_while_folding_is_asked_again(address: DatabaseAdd
 
     source = KeptSource(run_of(episode(1), 1, 5))
     writer = WriterThread(
-        source=source, open_destination=opener(address, around=OftenAway), adopt=nobody, settings=NEVER_IDLE
+        source=source,
+        open_destination=opener(address, around=OftenUnavailable),
+        adopt=no_writer_alive,
+        settings=NEVER_IDLE,
     )
     await writer.start()
     await writer.flush(5)
@@ -368,10 +371,10 @@ async def test_a_database_away_while_folding_is_asked_again(address: DatabaseAdd
     await writer.close()
 
 
-async def test_a_cancelled_flush_stops_the_waiting_and_not_the_work(address: DatabaseAddress) -> None:
+async def test_a_cancelled_flush_stops_the_wait_and_not_the_work(address: DatabaseAddress) -> None:
     entered, release = threading.Event(), threading.Event()
 
-    class Slow(Passing):
+    class Slow(ForwardingDestination):
         async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
             entered.set()
             await asyncio.to_thread(release.wait)
@@ -379,7 +382,7 @@ async def test_a_cancelled_flush_stops_the_waiting_and_not_the_work(address: Dat
 
     source = KeptSource(run_of(episode(1), 1, 5))
     writer = WriterThread(
-        source=source, open_destination=opener(address, around=Slow), adopt=nobody, settings=NEVER_IDLE
+        source=source, open_destination=opener(address, around=Slow), adopt=no_writer_alive, settings=NEVER_IDLE
     )
     await writer.start()
     flushing = asyncio.create_task(writer.flush(5))
@@ -388,7 +391,7 @@ async def test_a_cancelled_flush_stops_the_waiting_and_not_the_work(address: Dat
     with pytest.raises(asyncio.CancelledError):
         await flushing
     release.set()
-    await until_asked(address.path, HEADS, [(name(1), 5, 5)])
+    await until_answer(address.path, HEADS, [(name(1), 5, 5)])
     source.close()
     await writer.close()
 
@@ -402,7 +405,7 @@ async def test_the_database_is_closed_in_the_loop_that_opened_it(address: Databa
 
     source = KeptSource()
     opened = opener(address, around=around, closed=lambda: threads.append(threading.current_thread().name))
-    writer = WriterThread(source=source, open_destination=opened, adopt=nobody, settings=NEVER_IDLE)
+    writer = WriterThread(source=source, open_destination=opened, adopt=no_writer_alive, settings=NEVER_IDLE)
     await writer.start()
     source.close()
     await writer.close()

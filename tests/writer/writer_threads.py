@@ -1,4 +1,4 @@
-"""A writer in a thread, and how to wait for what it does."""
+"""Run a writer in a thread, and wait for its effects."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def writers_alive() -> list[str]:
     return [each.name for each in threading.enumerate() if each.name.startswith("pycrorm writer")]
 
 
-def nobody() -> Iterable[Source]:
+def no_writer_alive() -> Iterable[Source]:
     return ()
 
 
@@ -47,12 +47,12 @@ def writer_for(
 
 
 async def until(holds: Callable[[], bool]) -> None:
-    """Returns when that holds; the test's own patience ends after a minute."""
+    """Return when the condition holds; raise after a minute."""
     async with asyncio.timeout(60):
         while not holds():  # noqa: ASYNC110 - what is waited for happens in another thread
             await asyncio.sleep(0.005)
 
 
-async def until_asked(path: Path, statement: str, expected: list[tuple[object, ...]]) -> None:
-    """Returns when the database answers that."""
+async def until_answer(path: Path, statement: str, expected: list[tuple[object, ...]]) -> None:
+    """Return when the query returns this answer."""
     await until(lambda: ask(path, statement) == expected)
