@@ -203,11 +203,12 @@ class LocationResolved(Happening, frozen=True):
 
     Attributes:
         location: class of the location designator, e.g. `CostmapLocation`.
-        offered: the candidates it offered, in order.
+        offered: the first candidates it offered, in order, and the last one.
         taken: index into `offered` of the candidate that the plan used; None if it used none.
         considered: number of places the designator examined to find them.
         node: the node that resolved it.
         refused: the first examined places that it did not offer, in order; empty in events of older versions.
+        offered_beyond: number of further candidates it offered.
     """
 
     location: str
@@ -216,6 +217,7 @@ class LocationResolved(Happening, frozen=True):
     considered: int = 0
     node: int | None = None
     refused: tuple[RefusalValue, ...] = ()
+    offered_beyond: int = 0
 
 
 class ObjectDetected(Happening, frozen=True):

@@ -226,13 +226,14 @@ class Episode:
 
     def record_location(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
-        refused: tuple[Refusal, ...], node: TaskTreeNode | None,
+        refused: tuple[Refusal, ...], offered_beyond: int, node: TaskTreeNode | None,
     ) -> int:  # fmt: skip
         """Write which places a location designator offered, took and refused; return the sequence."""
         number = self._sequence_of(node)
         resolved = location_resolved(
-            location, offered, taken=taken, considered=considered, refused=refused, node=number
-        )
+            location, offered, taken=taken, considered=considered, refused=refused, offered_beyond=offered_beyond,
+            node=number,
+        )  # fmt: skip
         try:
             return self._emitter.put(self.id, resolved)
         except NotEncodable as error:

@@ -59,7 +59,7 @@ def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> Epi
 
 def location_resolved(
     location: str, offered: Sequence[Candidate], *, taken: int | None, considered: int, refused: Sequence[Refusal],
-    node: int | None,
+    offered_beyond: int, node: int | None,
 ) -> LocationResolved:  # fmt: skip
     """Build the event of a resolved location designator; `node` is the sequence of the node that resolved it."""
     return LocationResolved(
@@ -77,6 +77,7 @@ def location_resolved(
         considered=considered,
         node=node,
         refused=tuple(RefusalValue(pose_value(each.pose), clean(each.reason)) for each in refused),
+        offered_beyond=offered_beyond,
     )
 
 

@@ -254,15 +254,16 @@ class Recorder:
 
     def location_resolved(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
-        refused: tuple[Refusal, ...], node: TaskTreeNode | None,
+        refused: tuple[Refusal, ...], offered_beyond: int, node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
         episode = self._open_episode()
         if episode is None or self._emitter.is_closed:
             return
         try:
             sequence = episode.record_location(
-                location=location, offered=offered, taken=taken, considered=considered, refused=refused, node=node
-            )
+                location=location, offered=offered, taken=taken, considered=considered, refused=refused,
+                offered_beyond=offered_beyond, node=node,
+            )  # fmt: skip
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("LocationResolved", error)
         else:

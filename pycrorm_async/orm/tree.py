@@ -151,7 +151,8 @@ class LocationResolution(RowOfEvent, Base):
     Attributes:
         location: the designator's class.
         considered, offered: the number of places it checked, and of those it offered.
-        taken: the rank of the place that the plan used, whose pose is `pose`; None if it used none.
+        candidates: the first 999 places that it offered, and the last one.
+        taken: the rank among `candidates` of the place that the plan used, whose pose is `pose`; None if it used none.
         node: the node that made the request.
         refusals: the first 1,000 places that it refused. Not loaded by default: use
             `await resolution.awaitable_attrs.refusals`.

@@ -46,6 +46,14 @@ class CurrentRobot(NamedTuple):
         """Return the arm, or both for `Arms.BOTH`. Raises `CapabilityAbsenceFailure` for an arm the robot lacks."""
         return {each: self.one_arm(each) for each in ((Arms.LEFT, Arms.RIGHT) if arm is Arms.BOTH else (arm,))}
 
+    def base_links(self) -> tuple[str, ...]:
+        """Return the links with a shape that no arm moves: the base, and the torso and head on it."""
+        first_joints = {arm.joints[0] for arm in self.description.arms.values()}
+        body = self.body
+        return tuple(
+            link for link in body.links if body.body.solids[link] and first_joints.isdisjoint(body.joints_above(link))
+        )
+
     def with_load(self) -> frozenset[Object]:
         """Return the robot and all objects attached to it, directly or indirectly."""
         return frozenset({self.body, *self.body.world.attachments.below(self.body)})

@@ -135,12 +135,11 @@ class IKError(PlanFailure):
         reason: the cause that inverse kinematics reports.
     """
 
-    def __init__(self, pose: Pose, arm: Arms, tip_frame: str, reason: str = "") -> None:
-        x, y, z = pose.position
-        because = f": {reason}" if reason else ""
-        goal = f"({x:.3f}, {y:.3f}, {z:.3f})"
-        super().__init__(f"{tip_frame} cannot reach {goal} with the {arm.name} arm{because}")
-        self.args = (pose, arm, tip_frame, reason)
+    def __init__(self, pose: Pose, arm: Arms, tip_frame: str, reason: str = "", object_name: str = "") -> None:
+        goal = "({:.3f}, {:.3f}, {:.3f})".format(*pose.position)
+        message = f"{tip_frame} cannot reach {goal} with the {arm.name} arm{f': {reason}' if reason else ''}"
+        super().__init__(f"{message}, reaching for {object_name}" if object_name else message)
+        self.args = (pose, arm, tip_frame, reason, *([object_name] if object_name else []))
         self.pose = pose
         self.arm = arm
         self.tip_frame = tip_frame

@@ -230,6 +230,7 @@ async def test_a_resolved_location_is_remembered_with_its_node() -> None:
             taken=0,
             considered=7,
             refused=(Refusal(pose, "LEFT: too far"), Refusal(pose, "hidden\0")),
+            offered_beyond=0,
             node=None,
         )
     event = next(e for _, e in rig.sink.of(episode) if isinstance(e, LocationResolved))

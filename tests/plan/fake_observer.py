@@ -22,6 +22,7 @@ class Recording:
     def __init__(self) -> None:
         self.told: list[str] = []
         self.refused: list[tuple[Refusal, ...]] = []
+        self.offered_beyond: list[int] = []
         self.places: list[tuple[str, tuple[Candidate, ...], int | None, int, TaskTreeNode | None]] = []
         self.open: list[TaskTreeNode] = []
         self.ended: list[TaskTreeNode] = []
@@ -66,9 +67,11 @@ class Recording:
         taken: int | None,
         considered: int,
         refused: tuple[Refusal, ...],
+        offered_beyond: int,
         node: TaskTreeNode | None,
     ) -> None:
         self.refused.append(refused)
+        self.offered_beyond.append(offered_beyond)
         self.places.append((location, offered, taken, considered, node))
         self.told.append(f"place {location}")
 

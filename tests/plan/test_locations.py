@@ -35,6 +35,7 @@ from pycrorm_async.plan.failures import (
     PerceptionObjectNotInWorld,
     ReachabilityFailure,
 )
+from pycrorm_async.plan.locations.designators import CANDIDATES_MAX
 from pycrorm_async.plan.object_designators import designator_of
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.errors import UnknownLink
@@ -231,9 +232,20 @@ def test_a_loop_over_places_is_told_when_it_is_left_with_the_last_one_as_taken(s
 def test_a_loop_that_ends_took_none(scene: Scene) -> None:
     with Recording().listening() as recording:
         places = list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk))
+    reported = (*places[: CANDIDATES_MAX - 1], places[-1])
     assert recording.places == [
-        ("SemanticCostmapLocation", tuple(Candidate(each.pose) for each in places), None, len(places), None)
+        ("SemanticCostmapLocation", tuple(Candidate(each.pose) for each in reported), None, len(places), None)
     ]
+    assert recording.offered_beyond == [len(places) - CANDIDATES_MAX]
+
+
+def test_of_thousands_of_offered_places_the_first_and_the_one_taken_are_reported(scene: Scene) -> None:
+    with Recording().listening() as recording:
+        places = list(itertools.islice(iter(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen)), 1_500))
+    ((_, offered, taken, _, _),) = recording.places
+    assert (len(offered), taken, recording.offered_beyond) == (CANDIDATES_MAX, CANDIDATES_MAX - 1, [500])
+    assert [each.pose for each in offered[:-1]] == [each.pose for each in places[: CANDIDATES_MAX - 1]]
+    assert offered[-1].pose == places[-1].pose
 
 
 def test_a_search_that_was_never_asked_is_not_told(scene: Scene) -> None:

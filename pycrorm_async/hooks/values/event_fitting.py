@@ -109,7 +109,13 @@ def fit_resolution(resolved: LocationResolved, bytes_max: int) -> LocationResolv
     last = (taken,) if taken is not None and _is_finite(taken.pose, taken.torso_height) else ()
     while True:
         offered = (*others, *last)
-        shorter = replace(resolved, offered=offered, taken=len(offered) - 1 if last else None, refused=refused)
+        shorter = replace(
+            resolved,
+            offered=offered,
+            taken=len(offered) - 1 if last else None,
+            refused=refused,
+            offered_beyond=resolved.offered_beyond + len(resolved.offered) - len(offered),
+        )
         if not (others or refused) or fits(shorter, bytes_max):
             return shorter
         if refused:

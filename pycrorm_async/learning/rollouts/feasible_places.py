@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.learning.policies.evidence import Rectangle, Region
 from pycrorm_async.plan.current_robot import CurrentRobot
+from pycrorm_async.plan.locations.base_clearance import base_clearance
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.costmaps import Costmap, OccupancyCostmap, VisibilityCostmap
@@ -28,13 +29,22 @@ _VISIBLE_SHARE_MIN = 0.5
 
 
 def free_and_visible(robot: CurrentRobot, target: Object) -> Region:
-    """Return the places where the robot's base is clear of obstacles and its camera sees the object. Moves nothing."""
+    """Return the places where the robot's base is clear of obstacles and its camera sees the object. Moves nothing.
+
+    Where collisions count, the base is clear of the places outside with any heading; `MoveAndPickUp` checks the heading
+    of each of its samples.
+    """
     world, ignored = target.world, robot.with_load()
     ground = Pose((target.pose.position.x, target.pose.position.y, 0.0))
     low, high = robot.description.camera_height_m
     # The maps are not turned with the object, so the square in its frame needs up to √2 times the side: 1.5 is enough.
     size = {"size_cells": 2 * round(0.75 * _CELLS), "resolution_m": _RESOLUTION_M}
-    free = OccupancyCostmap(world, ground, distance_to_obstacle_m=CLEARANCE_M, ignore=ignored, **size)  # type: ignore[arg-type]
+    clearance = base_clearance([robot])
+    free = (
+        OccupancyCostmap(world, ground, distance_to_obstacle_m=CLEARANCE_M, ignore=ignored, **size)  # type: ignore[arg-type]
+        if clearance is None
+        else clearance.costmap(ground, **size)  # type: ignore[arg-type]
+    )
     visible = VisibilityCostmap(
         world,
         target,

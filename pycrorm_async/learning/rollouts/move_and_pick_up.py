@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from sqlalchemy import Select, select
@@ -18,6 +18,8 @@ from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
 from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
+from pycrorm_async.plan.locations.base_clearance import base_clearance
+from pycrorm_async.plan.locations.base_poses import face
 from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, designator_of, in_world
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
@@ -27,6 +29,8 @@ __all__ = ["MoveAndPickUp", "HEIGHT_TOLERANCE_M"]
 
 HEIGHT_TOLERANCE_M = 0.05
 """Experience with objects up to this much higher or lower, measured from the torso, applies to the object at hand."""
+_DRAWS_MAX = 10
+"""Bounds how often samples are drawn again because the base would collide, so that a search without a place ends."""
 _UPRIGHT_MIN = 0.1
 """Minimum vertical component of the object's own z axis (a cosine); below it the object lies on its side and its x-y
 plane no longer maps to the floor."""
@@ -136,9 +140,30 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             yield self.chosen(choice)
 
     def _likeliest_first(self, policy: Policy) -> Iterator[MoveAndPickUpPerformable]:
-        choices = policy.sample(self._rng, self.samples)
+        choices = self._clear_choices(policy)
         for number in np.argsort(-policy.likelihood(choices), kind="stable"):
             yield self.chosen(choices[number])
+
+    def _clear_choices(self, policy: Policy) -> Sequence[PickUpChoice]:
+        """Draw samples; where collisions count, only those where the base is clear before and after it turns.
+
+        Raises `ObjectUnreachable` if collisions count and none of `_DRAWS_MAX` times as many samples is clear.
+        """
+        clearance = base_clearance()
+        if clearance is None:
+            return policy.sample(self._rng, self.samples)
+        clear: list[PickUpChoice] = []
+        for _ in range(_DRAWS_MAX):
+            for choice in policy.sample(self._rng, self.samples):
+                place = self.chosen(choice).standing_position
+                if all(clearance.refusal(each) is None for each in (place, face(place, self.target.pose))):
+                    clear.append(choice)
+            if len(clear) >= self.samples:
+                break
+        if not clear:
+            message = f"the base would be in collision at every place to pick up {self.target.name}"
+            raise ObjectUnreachable(message, self.target.name)
+        return clear[: self.samples]
 
     def chosen(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
         """Return the action for this choice and the object's current pose.

@@ -17,8 +17,8 @@ from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.plan.field_types import check_properties
-from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retract
-from pycrorm_async.plan.geometry.gripper_checks import check_takable, take
+from pycrorm_async.plan.geometry.grasp_poses import grasp_orientation, pick_up_poses, place_pose, retract
+from pycrorm_async.plan.geometry.gripper_checks import check_fits, check_takable, take
 from pycrorm_async.plan.language.resources import Resource, arms, reaching
 from pycrorm_async.plan.motions.motions import (
     LookingMotion,
@@ -28,6 +28,7 @@ from pycrorm_async.plan.motions.motions import (
     MoveMotion,
     MoveTCPMotion,
 )
+from pycrorm_async.plan.motions.process_modules import collisions_count
 from pycrorm_async.plan.object_designators import ObjectDesignator, designator_of, in_world
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.objects import Object
@@ -142,7 +143,8 @@ class PickUpActionPerformable(CheckedAction):
         EndEffectorFailure: the gripper holds another object.
         PerceptionObjectNotInWorld: the object is not in the robot's world.
         IllPosedGoalFailure: `arm` is not a single arm, or the object is furniture or a robot.
-        CapabilityAbsenceFailure: the robot has no such arm.
+        CapabilityAbsenceFailure: the robot has no such arm; or collisions count, and the object is wider than the
+            gripper's opening.
     """
 
     concept: ClassVar[str | None] = "PickingUp"
@@ -159,13 +161,15 @@ class PickUpActionPerformable(CheckedAction):
         target = in_world(self.object_designator)
         check_takable(robot, self.arm, target)
         tool_frame = robot.one_arm(self.arm).tool_frame
+        if collisions_count():
+            check_fits(robot, self.arm, target, grasp_orientation(target.pose, self.grasp))
         before, at, above = pick_up_poses(target.pose, self.grasp, robot.body.link_pose(tool_frame))
-        await MoveTCPMotion(before, self.arm, allow_gripper_collision=True).perform()
+        await MoveTCPMotion(before, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
-        await MoveTCPMotion(at, self.arm, allow_gripper_collision=True).perform()
+        await MoveTCPMotion(at, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
         await MoveGripperMotion(GripperState.CLOSE, self.arm).perform()
         take(robot, self.arm, target)
-        await MoveTCPMotion(above, self.arm, allow_gripper_collision=True).perform()
+        await MoveTCPMotion(above, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
 
 
 @dataclass
@@ -194,10 +198,10 @@ class PlaceActionPerformable(CheckedAction):
         if body.attachments.get(held) != tool_frame:
             raise ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
         goal = place_pose(self.target_location, held.pose, body.link_pose(tool_frame))
-        await MoveTCPMotion(goal, self.arm).perform()
+        await MoveTCPMotion(goal, self.arm, _object_name=held.name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         body.detach(held)
-        await MoveTCPMotion(retract(goal), self.arm).perform()
+        await MoveTCPMotion(retract(goal), self.arm, _object_name=held.name).perform()
 
 
 @dataclass

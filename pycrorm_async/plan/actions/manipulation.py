@@ -14,9 +14,10 @@ from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import GripperClosedCompletely, IllPosedGoalFailure, ObjectLost
 from pycrorm_async.plan.geometry.articulation import grasp_pose, handle_of
 from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, approach, distance_to_box
-from pycrorm_async.plan.geometry.gripper_checks import check_free, check_takable, take
+from pycrorm_async.plan.geometry.gripper_checks import check_fits, check_free, check_takable, take
 from pycrorm_async.plan.language.resources import Resource, reaching
 from pycrorm_async.plan.motions.motions import ClosingMotion, MoveGripperMotion, MoveTCPMotion, OpeningMotion
+from pycrorm_async.plan.motions.process_modules import collisions_count
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart, in_world
 from pycrorm_async.world.enums import Arms, GripperState
 from pycrorm_async.world.objects import Object
@@ -43,7 +44,8 @@ class GripActionPerformable(CheckedAction):
         PerceptionObjectNotInWorld: the object is not in the robot's world.
         IllPosedGoalFailure: `gripper` is not a single arm, the effort is below 0, or the object is furniture or a
             robot.
-        CapabilityAbsenceFailure: the robot has no such arm.
+        CapabilityAbsenceFailure: the robot has no such arm; or collisions count, and the object is wider than the
+            gripper's opening.
     """
 
     concept: ClassVar[str | None] = "Holding"
@@ -69,6 +71,8 @@ class GripActionPerformable(CheckedAction):
                 f"the {self.gripper.name} gripper would close on nothing: {target.name} is {distance:.3f} m from it"
             )
             raise GripperClosedCompletely(message, target.name, distance)
+        if collisions_count():
+            check_fits(robot, self.gripper, target, tool.orientation)
         await MoveGripperMotion(GripperState.CLOSE, self.gripper).perform()
         take(robot, self.gripper, target)
 
@@ -125,11 +129,11 @@ class GraspingActionPerformable(CheckedAction):
 
     async def perform(self) -> None:
         robot = require_robot()
-        goal = grasp_pose(self.object_desig)
+        goal, name = grasp_pose(self.object_desig), self.object_desig.name
         check_free(robot, self.arm)
-        await MoveTCPMotion(approach(goal), self.arm).perform()
+        await MoveTCPMotion(approach(goal), self.arm, _object_name=name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
-        await MoveTCPMotion(goal, self.arm, allow_gripper_collision=True).perform()
+        await MoveTCPMotion(goal, self.arm, allow_gripper_collision=True, _object_name=name).perform()
         await MoveGripperMotion(GripperState.CLOSE, self.arm, allow_gripper_collision=True).perform()
 
 

@@ -18,10 +18,12 @@ from pycrorm_async.plan.actions.basic import (
 )
 from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnfetchable, ObjectUnreachable
-from pycrorm_async.plan.geometry.gripper_checks import check_takable
+from pycrorm_async.plan.geometry.grasp_poses import grasp_orientation
+from pycrorm_async.plan.geometry.gripper_checks import check_fits, check_takable
 from pycrorm_async.plan.language.resources import Resource, reaching
 from pycrorm_async.plan.locations.designators import CostmapLocation
 from pycrorm_async.plan.motions.motions import DetectingMotion
+from pycrorm_async.plan.motions.process_modules import collisions_count
 from pycrorm_async.plan.object_designators import ObjectDesignator, in_world
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.objects import Object
@@ -62,7 +64,7 @@ class TransportActionPerformable(CheckedAction):
         EndEffectorFailure: the arm holds another object.
         PerceptionObjectNotInWorld: the object is not in the robot's world.
         IllPosedGoalFailure, CapabilityAbsenceFailure: `arm` is not a single arm, or a gripper cannot hold the object;
-            the robot has no such arm.
+            the robot has no such arm, or collisions count and the object is wider than the gripper's opening.
     """
 
     concept: ClassVar[str | None] = "Transporting"
@@ -79,8 +81,11 @@ class TransportActionPerformable(CheckedAction):
         tool_frame = robot.one_arm(self.arm).tool_frame
         target = in_world(self.object_designator)
         check_takable(robot, self.arm, target)
+        is_held = robot.body.attachments.get(target) == tool_frame
+        if collisions_count() and not is_held:
+            check_fits(robot, self.arm, target, grasp_orientation(target.pose, Grasp.FRONT))
         await self._park_arms()
-        if robot.body.attachments.get(target) != tool_frame:
+        if not is_held:
             await NavigateActionPerformable(self._fetching_pose(robot.body)).perform()
             await PickUpActionPerformable(self.object_designator, self.arm, Grasp.FRONT).perform()
             await self._park_arms()

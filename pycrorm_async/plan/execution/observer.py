@@ -109,16 +109,18 @@ class PlanObserver(Protocol):
         taken: int | None,
         considered: int,
         refused: tuple[Refusal, ...],
+        offered_beyond: int,
         node: TaskTreeNode | None,
     ) -> None:
         """Called after a location designator was resolved or iterated.
 
         Args:
             location: the designator's class name.
-            offered: the places it offered.
+            offered: the first places it offered, and the last one.
             taken: index of the offered place that was taken; None if none was.
             considered: number of places it tried.
             refused: the first places that it tried in vain, in the order of the search.
+            offered_beyond: number of further places that it offered.
 
         Called once per resolution, in another context if a loop over places was dropped.
         """

@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 from pycrorm_async.world.enums import Grasp
-from pycrorm_async.world.pose import Pose, product, rotated
+from pycrorm_async.world.pose import Pose, Quaternion, product, rotated
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS
 
@@ -21,6 +21,7 @@ __all__ = [
     "PickUpPoses",
     "approach",
     "distance_to_box",
+    "grasp_orientation",
     "pick_up_poses",
     "place_pose",
     "retract",
@@ -46,7 +47,7 @@ def pick_up_poses(object_pose: Pose, grasp: Grasp, tool: Pose) -> PickUpPoses:
 
     The approach follows the gripper's *current* direction, not the direction it will have at the object.
     """
-    orientation = product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
+    orientation = grasp_orientation(object_pose, grasp)
     back = rotated(tool.orientation, (-APPROACH_M, 0.0, 0.0))
     x, y, z = object_pose.position
     frame = object_pose.frame
@@ -55,6 +56,11 @@ def pick_up_poses(object_pose: Pose, grasp: Grasp, tool: Pose) -> PickUpPoses:
         Pose((x, y, z), orientation, frame),
         Pose((x, y, z + LIFT_M), orientation, frame),
     )
+
+
+def grasp_orientation(object_pose: Pose, grasp: Grasp) -> Quaternion:
+    """Return the tool frame's orientation in a grasp of an object at this pose."""
+    return product(object_pose.orientation, GRASP_ORIENTATIONS[grasp])
 
 
 def place_pose(target: Pose, held: Pose, tool: Pose) -> Pose:

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from pycrorm_async.plan.current_robot import CurrentRobot
-from pycrorm_async.plan.failures import EndEffectorFailure, IllPosedGoalFailure, PerceptionObjectNotInWorld
+from pycrorm_async.plan.failures import (
+    CapabilityAbsenceFailure,
+    EndEffectorFailure,
+    IllPosedGoalFailure,
+    PerceptionObjectNotInWorld,
+)
 from pycrorm_async.world.enums import Arms, ObjectType
 from pycrorm_async.world.objects import Object
+from pycrorm_async.world.pose import Pose, Quaternion
+from pycrorm_async.world.queries.bounding_boxes import box_around
 
-__all__ = ["check_same_world", "check_free", "check_takable", "take"]
+__all__ = ["check_fits", "check_same_world", "check_free", "check_takable", "take"]
 
 
 def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
@@ -37,6 +44,20 @@ def check_free(robot: CurrentRobot, arm: Arms, *but: Object) -> None:
     for obj, link in robot.body.attachments.items():
         if link == tool_frame and obj not in but:
             raise EndEffectorFailure(f"the {arm.name} gripper holds {obj.name}: place or release it", obj.name)
+
+
+def check_fits(robot: CurrentRobot, arm: Arms, target: Object, tool: Quaternion) -> None:
+    """Raise `CapabilityAbsenceFailure` if the object is wider than the opening of a gripper with this orientation.
+
+    The width, m, is that of the whole object along the direction in which the fingers close.
+    """
+    across = Pose((0.0, 0.0, 0.0), tool).inverse()
+    frames = [(across @ target.link_pose(link), target.body.solids[link]) for link in target.links]
+    box = box_around([((frame.position, frame.orientation), solids) for frame, solids in frames])
+    width, opening = box.size.y if box is not None else 0.0, robot.one_arm(arm).opening_m
+    if width > opening:
+        message = f"{target.name} is {width:.3f} m wide between the fingers, the {arm.name} gripper opens {opening:g} m"
+        raise CapabilityAbsenceFailure(message, target.name, width, opening)
 
 
 def take(robot: CurrentRobot, arm: Arms, target: Object) -> None:

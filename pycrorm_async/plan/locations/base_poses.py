@@ -14,6 +14,7 @@ from typing import NamedTuple
 from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_world
 from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retract
+from pycrorm_async.plan.locations.base_clearance import BaseClearance, base_clearance
 from pycrorm_async.plan.motions.process_modules import chosen_limits
 from pycrorm_async.plan.object_designators import ObjectLike, in_world, pose_of
 from pycrorm_async.world.enums import Arms, Grasp
@@ -24,7 +25,7 @@ from pycrorm_async.world.robots.kinematics import Unreachable, solve
 __all__ = ["Reach", "face", "reaching_arms", "resolve_robot", "base_poses"]
 
 CELLS_MAX = 600
-"""Bounds the cells checked per search, so that a search without a solution ends."""
+"""Bounds the cells per search at which kinematics is checked, so that a search without a solution ends."""
 VISIBLE_SHARE_MIN = 0.5
 """Minimum visible share of an object that counts as seen from a place."""
 
@@ -48,9 +49,17 @@ def base_poses(
     viewer = resolve_robot(visible_for) if visible_for is not None else None
     goal = target if isinstance(target, Pose) else pose_of(target)
     check_in_map(goal)
-    costmap = _costmap(target, goal, [each for each in (reacher, viewer) if each is not None], viewer)
-    for cell in costmap.best(CELLS_MAX):
+    robots = [each for each in (reacher, viewer) if each is not None]
+    clearance = base_clearance(robots)
+    costmap = _costmap(target, goal, robots, viewer, clearance)
+    clear = 0
+    for cell in costmap.best(costmap.map.size if clearance is not None else CELLS_MAX):
         base_pose = face(cell, goal)
+        if clearance is not None and (collision := clearance.refusal(base_pose)) is not None:
+            yield base_pose, Reach(refusal=collision)
+            continue
+        if (clear := clear + 1) > CELLS_MAX:
+            return
         if viewer is not None and not _sees(viewer, base_pose, target, goal):
             yield base_pose, Reach(refusal="the target is not visible from here")
         elif reacher is not None:
@@ -109,11 +118,18 @@ def reaching_arms(
     return Reach(tuple(reaching)) if enough else Reach(refusal="; ".join(refusals))
 
 
-def _costmap(target: Pose | ObjectLike, goal: Pose, robots: list[CurrentRobot], viewer: CurrentRobot | None) -> Costmap:
+def _costmap(
+    target: Pose | ObjectLike,
+    goal: Pose,
+    robots: list[CurrentRobot],
+    viewer: CurrentRobot | None,
+    clearance: BaseClearance | None,
+) -> Costmap:
     world = require_world()
     origin = Pose((goal.position.x, goal.position.y, 0.0))
     ignored = {part for robot in robots for part in robot.with_load()}
-    costmap = OccupancyCostmap(world, origin, ignore=ignored) * GaussianCostmap(origin)
+    free = OccupancyCostmap(world, origin, ignore=ignored) if clearance is None else clearance.costmap(origin)
+    costmap = free * GaussianCostmap(origin)
     if viewer is None:
         return costmap
     low, high = viewer.description.camera_height_m

@@ -1,8 +1,8 @@
 """Location designators search places for the robot's base or for objects, and report the search to the observer.
 
 `resolve()` returns the best place; iterating yields one after another. Both search in the current state of the world.
-Each resolution or iteration is reported once: the places offered, the one taken, the number considered, and the first
-refused ones with the reason for each.
+Each resolution or iteration is reported once: the first places offered and the number of further ones, the one taken,
+the number considered, and the first refused ones with the reason for each.
 
 >>> stand = CostmapLocation(target=cereal, reachable_for=robot).resolve()
 >>> stand.reachable_arms
@@ -44,6 +44,9 @@ __all__ = [
     "SemanticCostmapLocation",
 ]
 
+CANDIDATES_MAX = 1_000
+"""Bounds the offered places that are reported of one search: the first ones, and the last, which may be the one taken.
+A loop over the places of a large surface may ask for thousands."""
 REFUSALS_MAX = 1_000
 """Bounds the refused places that are reported of one search. A search for a pick-up tries at most 600 places, one for
 opening 9,600, whose record would be larger than a record may be."""
@@ -92,6 +95,7 @@ class LocationDesignator(ABC):
         """Yield suitable places; the last one yielded counts as taken, or none if the iteration is exhausted."""
         observer, node = recorder.get(), current_node.get()
         offered: list[Candidate] = []
+        offered_beyond = 0
         refused: list[Refusal] = []
         taken: int | None = None
         considered = 0
@@ -102,6 +106,9 @@ class LocationDesignator(ABC):
                     if len(refused) < REFUSALS_MAX:
                         refused.append(place)
                 elif place is not None:
+                    if len(offered) == CANDIDATES_MAX:
+                        offered.pop()
+                        offered_beyond += 1
                     taken = len(offered)
                     offered.append(Candidate(place.pose, place.reachable_arms, place.grasp, place.torso_height))
                     yield place
@@ -114,6 +121,7 @@ class LocationDesignator(ABC):
                     taken=taken,
                     considered=considered,
                     refused=tuple(refused),
+                    offered_beyond=offered_beyond,
                     node=node,
                 )
 
@@ -163,7 +171,8 @@ class CostmapLocation(LocationDesignator):
         visible_for: the robot that must see the target.
         reachable_arm: the arm that must reach the target; BOTH requires each of the two.
 
-    The search considers up to 600 places, best first. Resolving raises `ObjectUnreachable` (for an object),
+    Where collisions count, the base with its heading is clear of obstacles; elsewhere its middle is 0.32 m away from
+    them. The search considers up to 600 such places, best first. Resolving raises `ObjectUnreachable` (for an object),
     `ReachabilityFailure` (for a pose), `LookingHighLevelFailure` (if only visibility is required) or
     `PerceptionObjectNotInWorld`.
     """
@@ -206,7 +215,8 @@ class AccessingLocation(LocationDesignator):
             (`simulated_robot_within`).
         arm: the arm that must reach; BOTH requires each of the two.
 
-    Places are 0.4 m clear of obstacles; places that the drawer or door sweeps come last. Resolving raises
+    Places are 0.4 m clear of obstacles, and where collisions count the base with its heading is clear of them; places
+    that the drawer or door sweeps come last. Resolving raises
     `EnvironmentUnreachable`, `EnvironmentManipulationImpossible` (no joint moves the handle),
     `PerceptionObjectNotInWorld`, `CapabilityAbsenceFailure` and `UnknownLink`.
     """

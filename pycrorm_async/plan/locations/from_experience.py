@@ -19,6 +19,7 @@ from pycrorm_async.plan.experience import Experience, PastSuccess, experience
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses
+from pycrorm_async.plan.locations.base_clearance import base_clearance
 from pycrorm_async.plan.locations.base_poses import Reach, reaching_arms, resolve_robot
 from pycrorm_async.plan.locations.designators import Location, LocationDesignator
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectLike, designator_of, pose_of
@@ -47,9 +48,9 @@ class DatabaseCostmapLocation:
         reachable_arm: use only successes with this arm, LEFT or RIGHT.
         experience: the source of past successes; None means the open memory.
 
-    Each place has the arm, the grasp and the torso height of the past success, and is 0.3 m clear of obstacles. The
-    experience covers what is visible in the memory's tables; `await memory.flush()` makes everything performed so far
-    visible.
+    Each place has the arm, the grasp and the torso height of the past success, and is 0.3 m clear of obstacles; where
+    collisions count, the base with its heading is clear of them instead. The experience covers what is visible in the
+    memory's tables; `await memory.flush()` makes everything performed so far visible.
 
     Raises `CallerError` without a memory or for `Arms.BOTH`; `NoWorld`, `NoRobotHere` and
     `PerceptionObjectNotInWorld`.
@@ -125,6 +126,7 @@ class _ExperienceLocation(LocationDesignator):
         robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
         origin = Pose((target_pose.position.x, target_pose.position.y, 0.0))
         ignored = robot.with_load() if robot is not None else None
+        clearance = base_clearance([robot] if robot is not None else [])
         free = OccupancyCostmap(
             require_world(), origin, distance_to_obstacle_m=CLEARANCE_M, size_cells=_CELLS, ignore=ignored
         )
@@ -134,10 +136,13 @@ class _ExperienceLocation(LocationDesignator):
             if base_pose is None:
                 yield Refusal(pose, "the base would lean")
                 continue
-            if not free.value_at(*base_pose.position[:2]):
-                yield Refusal(base_pose, f"an obstacle is nearer than {CLEARANCE_M} m")
-                continue
-            refusal = None if robot is None else _reach(robot, base_pose, target_pose, each).refusal
+            if clearance is not None:
+                refusal = clearance.refusal(base_pose)
+            else:
+                is_free = free.value_at(*base_pose.position[:2])
+                refusal = None if is_free else f"an obstacle is nearer than {CLEARANCE_M} m"
+            if refusal is None and robot is not None:
+                refusal = _reach(robot, base_pose, target_pose, each).refusal
             if refusal is not None:
                 yield Refusal(base_pose, refusal)
             else:

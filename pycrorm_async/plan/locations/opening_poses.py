@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pycrorm_async.plan.current_robot import CurrentRobot
 from pycrorm_async.plan.geometry.articulation import Handle, closed_position, hand_poses, handle_of, opened_position
 from pycrorm_async.plan.geometry.grasp_poses import approach
+from pycrorm_async.plan.locations.base_clearance import base_clearance
 from pycrorm_async.plan.locations.base_poses import Reach, face, reaching_arms, resolve_robot
 from pycrorm_async.plan.object_designators import ObjectLike
 from pycrorm_async.world.enums import Arms
@@ -40,12 +41,17 @@ def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iter
     handle, reacher = handle_of(part), resolve_robot(robot)
     handle_pose = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
     goals = _goals(handle)
+    clearance = base_clearance([reacher])
     for costmap in _costmaps(handle, handle_pose, reacher):
         cells = costmap.best(CELLS_MAX)
         for number in range(HEADINGS):
             for cell in cells:
                 base_pose = face(cell, handle_pose, turned=number * math.tau / HEADINGS)
-                yield base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals)
+                collision = clearance.refusal(base_pose) if clearance is not None else None
+                if collision is not None:
+                    yield base_pose, Reach(refusal=collision)
+                else:
+                    yield base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals)
 
 
 def _goals(handle: Handle) -> list[Pose]:

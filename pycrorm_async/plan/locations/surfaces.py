@@ -6,6 +6,7 @@ import random
 from collections.abc import Iterator
 
 from pycrorm_async.plan.execution.observer import Refusal
+from pycrorm_async.plan.motions.process_modules import collisions_count
 from pycrorm_async.plan.object_designators import ObjectLike, in_world
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, yaw_quaternion
@@ -30,6 +31,9 @@ def surface_poses(link: str, whole: ObjectLike, obj: ObjectLike | None) -> Itera
         for each in support.world.objects
         if each is not support and not _moves_along(each, obj_to_put)
     ]
+    if collisions_count():
+        others = (each for each in support.links if each != link and support.body.solids[each])
+        occupied += [(each, support.bounding_box(each)) for each in others]
     for x, y in _grid_points(surface, extent):
         placed_box = _translate(extent, x, y, z)
         pose = Pose((x, y, z), heading)

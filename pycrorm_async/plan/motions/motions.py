@@ -9,11 +9,12 @@ ones of SOMA.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 from pycrorm_async.plan.designator import BaseMotion
 from pycrorm_async.plan.errors import ResolutionError
+from pycrorm_async.plan.exceptions import reaching_for
 from pycrorm_async.plan.language.resources import NOTHING, Resource, arms, moving, reaching
 from pycrorm_async.plan.motions.perception import report_perception
 from pycrorm_async.plan.motions.process_modules import chosen_robot
@@ -68,12 +69,15 @@ class MoveTCPMotion(BaseMotion):
     target: Pose
     arm: Arms
     allow_gripper_collision: bool | None = None
+    _object_name: str | None = field(default=None, repr=False, compare=False)
+    """The object for which the arm reaches; not recorded with the motion, but with its failure."""
 
     def resources(self) -> frozenset[Resource]:
         return reaching(self.arm)
 
     async def perform(self) -> None:
-        await chosen_robot(self, "move_tcp").move_tcp(self)
+        with reaching_for(self._object_name):
+            await chosen_robot(self, "move_tcp").move_tcp(self)
 
 
 @dataclass
@@ -212,7 +216,8 @@ class OpeningMotion(BaseMotion):
         return reaching(self.arm)
 
     async def perform(self) -> None:
-        await chosen_robot(self, "open").open(self)
+        with reaching_for(self.object_part.name):
+            await chosen_robot(self, "open").open(self)
 
 
 @dataclass
@@ -228,7 +233,8 @@ class ClosingMotion(BaseMotion):
         return reaching(self.arm)
 
     async def perform(self) -> None:
-        await chosen_robot(self, "close").close(self)
+        with reaching_for(self.object_part.name):
+            await chosen_robot(self, "close").close(self)
 
 
 @dataclass
@@ -258,4 +264,5 @@ class AccessingMotion(BaseMotion):
         return reaching(self.arm)
 
     async def perform(self) -> None:
-        await chosen_robot(self, "accessing").accessing(self)
+        with reaching_for(self.drawer_handle):
+            await chosen_robot(self, "accessing").accessing(self)

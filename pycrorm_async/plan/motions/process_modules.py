@@ -43,6 +43,7 @@ __all__ = [
     "simulated_robot_within",
     "chosen_robot",
     "chosen_limits",
+    "collisions_count",
 ]
 
 
@@ -94,12 +95,17 @@ class ChosenRobot:
         name: used in messages.
         modules: the robot's modules; a method of `ProcessModules` that they lack is a motion the robot cannot execute.
         limits: joint limits of its arms, used by searches that check reachability (`CostmapLocation`).
+        collisions: whether searches refuse places where its base would collide, and grippers refuse objects that are
+            wider than their opening.
     """
 
-    def __init__(self, name: str, modules: MovingModules, *, limits: Limits = Limits.SOFT) -> None:
+    def __init__(
+        self, name: str, modules: MovingModules, *, limits: Limits = Limits.SOFT, collisions: bool = False
+    ) -> None:
         self.name = name
         self.modules = modules
         self.limits = limits
+        self.collisions = collisions
 
     def __enter__(self) -> Self:
         _chosen.set((*_chosen.get(), self))
@@ -122,14 +128,16 @@ def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> Chose
 
     Args:
         limits: limits of the arms' joints.
-        collisions: whether a goal at which the arm or the held object collides raises `ManipulationGoalInCollision`. A
-            motion may allow collisions of the gripper. Paths are not checked.
+        collisions: whether a goal at which the arm or the held object collides raises `ManipulationGoalInCollision`,
+            and one at which the base collides `NavigationGoalInCollision`. A motion may allow collisions of the
+            gripper. Paths are not checked. Location designators then offer only places where the base, with its
+            heading, is clear, and a gripper refuses an object wider than its opening.
 
     >>> with simulated_robot_within(Limits.HARD):
     ...     await MoveTCPMotion(Pose([0.9495, 0.188, 0.790675]), Arms.LEFT).perform()
     """
     name = f"simulated ({limits.name.lower()} limits{', minding collisions' if collisions else ''})"
-    return ChosenRobot(name, SimulatedModules(limits, collisions=collisions), limits=limits)
+    return ChosenRobot(name, SimulatedModules(limits, collisions=collisions), limits=limits, collisions=collisions)
 
 
 simulated_robot = simulated_robot_within(Limits.SOFT)
@@ -158,3 +166,9 @@ def chosen_limits() -> Limits:
     """Return the arm limits of the innermost choice; soft limits without a choice."""
     chosen = _chosen.get()
     return chosen[-1].limits if chosen else Limits.SOFT
+
+
+def collisions_count() -> bool:
+    """Return whether collisions count for the innermost choice; False without a choice."""
+    chosen = _chosen.get()
+    return bool(chosen) and chosen[-1].collisions

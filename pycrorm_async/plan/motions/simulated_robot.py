@@ -18,6 +18,7 @@ from pycrorm_async.plan.failures import (
     IKError,
     IllPosedGoalFailure,
     ManipulationGoalInCollision,
+    NavigationGoalInCollision,
     TorsoGoalUnreachable,
 )
 from pycrorm_async.plan.geometry.articulation import (
@@ -59,8 +60,9 @@ __all__ = ["SimulatedModules"]
 class SimulatedModules:
     """The process modules of `with simulated_robot:`; inverse kinematics keeps the arms within `limits`.
 
-    With `collisions` a goal is refused at which the arm or the held object collides with another object; the gripper
-    itself may collide if the motion allows it.
+    With `collisions` a goal is refused at which the arm or the held object, or the base, collides with another object;
+    the gripper itself may collide if the motion allows it. Driving moves the whole robot, but arms and what they hold
+    are checked only by their own motions.
     """
 
     def __init__(self, limits: Limits, *, collisions: bool = False) -> None:
@@ -68,7 +70,10 @@ class SimulatedModules:
         self._collisions = collisions
 
     async def navigate(self, motion: MoveMotion) -> None:
-        require_robot().body.set_pose(motion.target)
+        robot = require_robot()
+        if self._collisions:
+            _check_base_clear(robot, motion.target)
+        robot.body.set_pose(motion.target)
 
     async def move_tcp(self, motion: MoveTCPMotion) -> None:
         robot = require_robot()
@@ -162,6 +167,18 @@ class SimulatedModules:
             part, obj = collisions[0]
             message = f"at its goal the {motion.arm.name} arm would be in {obj.name} with {part}"
             raise ManipulationGoalInCollision(message, part, obj.name)
+
+
+def _check_base_clear(robot: CurrentRobot, goal: Pose) -> None:
+    """Raise `NavigationGoalInCollision` if the base, the torso or the head collides at this pose of the base."""
+    check_in_map(goal)
+    links = robot.base_links()
+    carried = [obj for obj, link in robot.body.attachments.items() if (link or robot.body.body.root) in links]
+    collisions = collisions_at(robot.body, {}, links=links, carried=carried, base=goal)
+    if collisions:
+        part, obj = collisions[0]
+        message = f"at its goal the base would be in {obj.name} with {part}"
+        raise NavigationGoalInCollision(message, part, obj.name)
 
 
 def head_joints(robot: CurrentRobot, target: Pose) -> dict[str, float]:

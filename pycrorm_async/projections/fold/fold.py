@@ -253,6 +253,7 @@ def _joints_moved(event: StoredEvent, moved: JointsMoved, _designators: Designat
 def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designators: Designators, rows: Rows) -> None:
     own, number = _own(event)
     offered, taken = resolved.offered, resolved.taken
+    count = len(offered) + resolved.offered_beyond
     if taken is not None and not 0 <= taken < len(offered):
         raise CannotFold(f"candidate {taken} was taken, but only {len(offered)} were offered")
     node, time = _node(event, resolved.node), microseconds(event.wall_ns)
@@ -260,7 +261,7 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
     if taken is not None:
         rows.inserts["pose"].append(pose_row(own, number, offered[taken].pose))
     rows.inserts["location_resolution"].append(
-        (own, number, node, resolved.location, resolved.considered, len(offered), taken, pose_id, time)
+        (own, number, node, resolved.location, resolved.considered, count, taken, pose_id, time)
     )
     rows.inserts["location_candidate"].extend(
         (own, rank, number, *pose_columns(each.pose), ",".join(each.arms), rank == taken, each.grasp, each.torso_height)

@@ -29,7 +29,16 @@ from pycrorm_async.world.robots.acting_robot import acting_robot
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = ["Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"]
+__all__ = [
+    "Costmap",
+    "OccupancyCostmap",
+    "GaussianCostmap",
+    "VisibilityCostmap",
+    "SemanticCostmap",
+    "cell_steps",
+    "ignored_objects",
+    "is_obstacle",
+]
 
 Map = NDArray[np.float64]
 _TALLEST_M = 2.0  # boxes that begin above this height are above every robot
@@ -79,7 +88,7 @@ class Costmap:
         Cells of equal value are ordered by their distance from the origin, then by x, then by y.
         """
         values = self.map.ravel()
-        steps = _steps(self.size_cells)
+        steps = cell_steps(self.size_cells)
         distance = (steps[:, None] ** 2 + steps[None, :] ** 2).ravel()
         order = np.lexsort((distance, -values))[:count_max]
         chosen = order[values[order] > 0]
@@ -114,7 +123,7 @@ class OccupancyCostmap(Costmap):
         also: Iterable[BoundingBox] = (),
     ) -> None:
         values = np.ones((size_cells, size_cells))
-        for box in (*_obstacles(world, ignore), *filter(_is_obstacle, also)):
+        for box in (*_obstacles(world, ignore), *filter(is_obstacle, also)):
             cells = _cells(box, origin, size_cells, resolution_m, grown_m=distance_to_obstacle_m)
             values[cells] = 0.0
         super().__init__(values, origin, resolution_m=resolution_m)
@@ -126,7 +135,7 @@ class GaussianCostmap(Costmap):
     def __init__(
         self, origin: Pose, *, sigma_cells: float = 15.0, size_cells: int = 200, resolution_m: float = 0.02
     ) -> None:
-        along = np.exp(-0.5 * (_steps(size_cells) / sigma_cells) ** 2)
+        along = np.exp(-0.5 * (cell_steps(size_cells) / sigma_cells) ** 2)
         super().__init__(np.outer(along, along), origin, resolution_m=resolution_m)
 
 
@@ -151,10 +160,10 @@ class VisibilityCostmap(Costmap):
     ) -> None:
         target_point = target.bounding_box().centre if isinstance(target, Object) else target.position
         origin = origin if origin is not None else Pose((target_point.x, target_point.y, 0.0))
-        ignored = _ignored_objects(world, ignore) | ({target} if isinstance(target, Object) else set())
+        ignored = ignored_objects(world, ignore) | ({target} if isinstance(target, Object) else set())
         boxes = list(_obstacles(world, ignored))
-        x = origin.position.x + _steps(size_cells)[:, None] * resolution_m
-        y = origin.position.y + _steps(size_cells)[None, :] * resolution_m
+        x = origin.position.x + cell_steps(size_cells)[:, None] * resolution_m
+        y = origin.position.y + cell_steps(size_cells)[None, :] * resolution_m
         heights = np.linspace(min_height_m, max_height_m, 5)
         visible = [~_hidden(x, y, float(height), target_point, boxes) for height in heights]
         super().__init__(np.mean(visible, axis=0), origin, resolution_m=resolution_m)
@@ -175,7 +184,7 @@ class SemanticCostmap(Costmap):
         super().__init__(values, origin, resolution_m=resolution_m)
 
 
-def _steps(size_cells: int) -> Map:
+def cell_steps(size_cells: int) -> Map:
     """Return the distances of the cells' middles from the origin along one axis, in cells."""
     return np.arange(size_cells, dtype=np.float64) + (0.5 - size_cells / 2)
 
@@ -194,20 +203,22 @@ def _cells(
 
 def _obstacles(world: BulletWorld, ignore: Iterable[Object] | None) -> Iterator[BoundingBox]:
     """Yield the boxes of all links that are obstacles."""
-    ignored = _ignored_objects(world, ignore)
+    ignored = ignored_objects(world, ignore)
     for obj in world.objects:
         if obj not in ignored:
             for link in obj.links:
                 box = obj.bounding_box(link)
-                if _is_obstacle(box):
+                if is_obstacle(box):
                     yield box
 
 
-def _is_obstacle(box: BoundingBox) -> bool:
+def is_obstacle(box: BoundingBox) -> bool:
+    """Return whether a box rises above the floor, begins at most 2 m above it, and has a size."""
     return any(box.size) and box.max.z > 0.0 and box.min.z < _TALLEST_M
 
 
-def _ignored_objects(world: BulletWorld, ignore: Iterable[Object] | None) -> set[Object]:
+def ignored_objects(world: BulletWorld, ignore: Iterable[Object] | None) -> set[Object]:
+    """Return the objects that are no obstacles; None means the robot and the objects it carries."""
     if ignore is not None:
         return set(ignore)
     robot = acting_robot(world)

@@ -71,6 +71,8 @@ class ArmDescription:
     soft_limits: Mapping[str, Bounds]
     hard_limits: Mapping[str, Bounds]
     gripper_joints: Mapping[GripperState, Mapping[str, float]]
+    opening_m: float
+    """Distance between the fingers of the open gripper; they close along y of the tool frame."""
     park: Mapping[str, float]
     """Posture with the arm folded. Continuous joints may be several turns from zero."""
 
@@ -181,6 +183,7 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> ArmDescriptio
                 GripperState.CLOSE: MappingProxyType(dict.fromkeys(fingers, 0.0)),
             }
         ),
+        opening_m=0.086,
         park=MappingProxyType(dict(zip(joints, park, strict=True))),
     )
 
