@@ -6,10 +6,10 @@ object, so that reading an attribute never waits for the database.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 from sqlalchemy import BigInteger, Boolean, ColumnElement, Double, ForeignKey, Text, inspect, literal_column
 from sqlalchemy.exc import MissingGreenlet, StatementError
@@ -28,12 +28,16 @@ __all__ = [
     "Base",
     "RowOfEvent",
     "named_if_unloaded",
+    "on_request",
+    "HybridOnRequest",
     "ProcessMetaData",
     "Position",
     "Quaternion",
     "Pose",
     "RobotState",
 ]
+
+_Value = TypeVar("_Value")
 
 
 class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
@@ -82,17 +86,52 @@ class RowOfEvent:
 
 @contextmanager
 def named_if_unloaded(row: Base, name: str) -> Iterator[None]:
-    """Raise `CallerError` with the remedy where a relationship that is not loaded is read without awaiting it."""
+    """Raise `CallerError` with the remedy where an attribute that is not loaded is read without awaiting it."""
     try:
         yield
     except (StatementError, MissingGreenlet, DetachedInstanceError) as error:
         if isinstance(error, StatementError) and not isinstance(error.orig, MissingGreenlet):
             raise
-        class_, key = type(row).__name__, inspect(row).identity
+        state, class_ = inspect(row), type(row).__name__
+        key, option = state.identity, "undefer" if f"_{name}" in state.mapper.column_attrs else "selectinload"
         raise CallerError(
             f"{name} of {class_} {key} is not loaded: in its session use `await row.awaitable_attrs.{name}`,"
-            f" or select with `selectinload({class_}.{name})`"
+            f" or select with `{option}({class_}.{name})`"
         ) from None
+
+
+def on_request(name: str) -> property:
+    """Return the descriptor of a synonym whose relationship or deferred column, `_name`, is loaded on request only.
+
+    Reading it raises `CallerError` if it is not loaded.
+    """
+    return property(_reader(name))
+
+
+def _reader(name: str) -> Callable[[Any], Any]:
+    def value(row: Base) -> Any:
+        with named_if_unloaded(row, name):
+            return getattr(row, f"_{name}")
+
+    return value
+
+
+class HybridOnRequest(hybrid_property[_Value]):
+    """The same for a class with joined inheritance, of which a query may select any subclass.
+
+    A synonym in a query of a subclass would be that of the base, without a join to it.
+    """
+
+    def __init__(self, read: Callable[[Any], _Value]) -> None:
+        name = read.__name__
+        super().__init__(_reader(name), expr=lambda class_: getattr(class_, f"_{name}"))
+        self.__name__, self.__doc__ = name, read.__doc__
+
+    def __get__(self, instance: Any, owner: Any) -> Any:
+        attribute = super().__get__(instance, owner)
+        if instance is None:  # `undefer` asks an attribute for its columns, which SQLAlchemy 2.1 cannot answer here
+            attribute._column_strategy_attrs = lambda: [getattr(owner, f"_{self.__name__}")]  # noqa: SLF001
+        return attribute
 
 
 class ProcessMetaData(Base):

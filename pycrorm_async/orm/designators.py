@@ -26,7 +26,7 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RobotState, RowOfEvent
+from pycrorm_async.orm.base import Base, HybridOnRequest, Pose, ProcessMetaData, RobotState, RowOfEvent
 from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import JsonText
@@ -172,7 +172,7 @@ class Designator(RowOfEvent, Base):
     dtype: Mapped[str]
     kind: Mapped[str]
     robot_state_id: Mapped[int | None] = mapped_column(ForeignKey("robot_state.id"))
-    parameters: Mapped[dict[str, Any]] = mapped_column(JsonText(), deferred=True)
+    _parameters: Mapped[dict[str, Any]] = mapped_column("parameters", JsonText(), deferred=True)
     _lineage: Mapped[str] = mapped_column("lineage", ClassOfRow())
     _status: Mapped[TaskStatus] = mapped_column("status")
     _start_time: Mapped[datetime] = mapped_column("start_time")
@@ -187,7 +187,7 @@ class Designator(RowOfEvent, Base):
         viewonly=True, lazy="selectin", order_by=(ParameterItem.field, ParameterItem.position)
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
-    node: Mapped[TaskTreeNode] = relationship(
+    _node: Mapped[TaskTreeNode] = relationship(
         primaryjoin="foreign(Designator.id) == TaskTreeNode.id", viewonly=True, lazy="select"
     )
 
@@ -232,6 +232,16 @@ class Designator(RowOfEvent, Base):
     def episode(self) -> ProcessMetaData:
         """The episode that it belongs to."""
         return self.process_metadata
+
+    @HybridOnRequest
+    def parameters(self) -> dict[str, Any]:
+        """Its fields as recorded. Raises `CallerError` if they are not loaded."""
+        return self._parameters
+
+    @HybridOnRequest
+    def node(self) -> TaskTreeNode:
+        """Its node of the task tree. Raises `CallerError` if it is not loaded."""
+        return self._node
 
     def entries(self, field: str) -> list[Any]:
         """Return the values of a list field, in order."""

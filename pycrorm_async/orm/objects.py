@@ -11,10 +11,9 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import ForeignKey
-from sqlalchemy.ext.hybrid import hybrid_property
-from sqlalchemy.orm import Mapped, mapped_column, relationship
+from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, named_if_unloaded
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, on_request
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
 
@@ -57,16 +56,7 @@ class Object(RowOfEvent, Base):
 
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
 
-    @hybrid_property
-    def node(self) -> TaskTreeNode | None:
-        """The node that moved or added it. Raises `CallerError` if it is not loaded."""
-        with named_if_unloaded(self, "node"):
-            return self._node
-
-    @node.inplace.expression
-    @classmethod
-    def _node_of_class(cls) -> Any:
-        return cls._node
+    node: Mapped[TaskTreeNode | None] = synonym("_node", descriptor=on_request("node"))
 
 
 class ObjectPart(Object):

@@ -6,10 +6,9 @@ from datetime import datetime
 from typing import Any
 
 from sqlalchemy import ForeignKey
-from sqlalchemy.ext.hybrid import hybrid_property
-from sqlalchemy.orm import Mapped, mapped_column, relationship
+from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, named_if_unloaded
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, named_if_unloaded, on_request
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.task_status import TaskStatus
@@ -65,32 +64,24 @@ class TaskTreeNode(RowOfEvent, Base):
     duration: Mapped[float | None]
 
     action: Mapped[Designator | None] = relationship(viewonly=True, lazy="selectin")
-    parent: Mapped[TaskTreeNode | None] = relationship(
+    _parent: Mapped[TaskTreeNode | None] = relationship(
         remote_side="TaskTreeNode.id", viewonly=True, lazy="selectin", join_depth=1
     )
     _children: Mapped[list[TaskTreeNode]] = relationship(viewonly=True, lazy="select", order_by="TaskTreeNode.id")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
-    @hybrid_property
-    def children(self) -> list[TaskTreeNode]:
-        """The nodes that it performed, in order. Raises `CallerError` if they are not loaded."""
-        with named_if_unloaded(self, "children"):
-            return self._children
-
-    @children.inplace.expression
-    @classmethod
-    def _children_of_class(cls) -> Any:
-        return cls._children
+    parent: Mapped[TaskTreeNode | None] = synonym("_parent", descriptor=on_request("parent"))
+    children: Mapped[list[TaskTreeNode]] = synonym("_children", descriptor=on_request("children"))
 
     @property
     def ancestors(self) -> list[TaskTreeNode]:
         """Its parent, the parent of that, and so on to the root. Raises `CallerError` if one is not loaded."""
         nodes: list[TaskTreeNode] = []
         with named_if_unloaded(self, "ancestors"):
-            node = self.parent
+            node = self._parent
             while node is not None:
                 nodes.append(node)
-                node = node.parent
+                node = node._parent  # noqa: SLF001  so that an error names `ancestors`
         return nodes
 
     @property
@@ -175,7 +166,9 @@ class LocationResolution(RowOfEvent, Base):
     candidates: Mapped[list[LocationCandidate]] = relationship(
         viewonly=True, lazy="selectin", order_by=LocationCandidate.position
     )
-    refusals: Mapped[list[LocationRefusal]] = relationship(
+    _refusals: Mapped[list[LocationRefusal]] = relationship(
         viewonly=True, lazy="select", order_by=LocationRefusal.position
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+    refusals: Mapped[list[LocationRefusal]] = synonym("_refusals", descriptor=on_request("refusals"))

@@ -5,9 +5,9 @@ from __future__ import annotations
 from datetime import datetime
 
 from sqlalchemy import ForeignKey
-from sqlalchemy.orm import Mapped, mapped_column, relationship
+from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent
+from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent, on_request
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
@@ -30,10 +30,10 @@ class PickUpWithContextView(Base):
         node_id: the node; the same number as `id`.
         object_x, object_y, object_z: of the robot's base in the object's own frame, m.
         object_qx, object_qy, object_qz, object_qw: of the robot's base in the object's own frame. They and `object_z`
-            are deferred: select them by name, as in `select(PickUpWithContextView.object_z)`.
+            are loaded on request: `select(PickUpWithContextView.object_z)`, `undefer` or `awaitable_attrs`.
         height_over_torso: height of the object above the robot's torso, m: its z minus that of the robot's base minus
-            `torso_height`. The reach of an arm depends on it. Deferred.
-        robot: the name of the robot; None if a memory of version 0.1.0 recorded it. Deferred.
+            `torso_height`. The reach of an arm depends on it. Loaded on request.
+        robot: the name of the robot; None if a memory of version 0.1.0 recorded it. Loaded on request.
     """
 
     __tablename__ = "PickUpWithContextView"
@@ -54,13 +54,21 @@ class PickUpWithContextView(Base):
     node_id: Mapped[int] = mapped_column(ForeignKey("task_tree_node.id"))
     object_x: Mapped[float]
     object_y: Mapped[float]
-    object_z: Mapped[float] = mapped_column(deferred=True)
-    object_qx: Mapped[float] = mapped_column(deferred=True)
-    object_qy: Mapped[float] = mapped_column(deferred=True)
-    object_qz: Mapped[float] = mapped_column(deferred=True)
-    object_qw: Mapped[float] = mapped_column(deferred=True)
-    height_over_torso: Mapped[float | None] = mapped_column(deferred=True)
-    robot: Mapped[str | None] = mapped_column(deferred=True)
+    _object_z: Mapped[float] = mapped_column("object_z", deferred=True)
+    _object_qx: Mapped[float] = mapped_column("object_qx", deferred=True)
+    _object_qy: Mapped[float] = mapped_column("object_qy", deferred=True)
+    _object_qz: Mapped[float] = mapped_column("object_qz", deferred=True)
+    _object_qw: Mapped[float] = mapped_column("object_qw", deferred=True)
+    _height_over_torso: Mapped[float | None] = mapped_column("height_over_torso", deferred=True)
+    _robot: Mapped[str | None] = mapped_column("robot", deferred=True)
+
+    object_z: Mapped[float] = synonym("_object_z", descriptor=on_request("object_z"))
+    object_qx: Mapped[float] = synonym("_object_qx", descriptor=on_request("object_qx"))
+    object_qy: Mapped[float] = synonym("_object_qy", descriptor=on_request("object_qy"))
+    object_qz: Mapped[float] = synonym("_object_qz", descriptor=on_request("object_qz"))
+    object_qw: Mapped[float] = synonym("_object_qw", descriptor=on_request("object_qw"))
+    height_over_torso: Mapped[float | None] = synonym("_height_over_torso", descriptor=on_request("height_over_torso"))
+    robot: Mapped[str | None] = synonym("_robot", descriptor=on_request("robot"))
 
 
 class RootFailure(RowOfEvent, Base):
