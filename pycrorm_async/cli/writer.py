@@ -64,7 +64,7 @@ def writer(
     collect_seldom()
     if once:
         return store_once(url, spool, projections, settings, as_json=as_json)
-    with forked(WORKERS) as processes:
+    with forked(WORKERS, url) as processes:
         summary = asyncio.run(_serve_until_signal(url, spool, projections, settings, processes))
     if as_json:
         print_json(summary._asdict())
