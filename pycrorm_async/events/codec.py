@@ -119,7 +119,8 @@ def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise _first_fault(event) or NotEncodable("", str(error)) from None
     # The encoder writes NaN as null and U+0000 as an escape, so only payloads that hold one of these need a search.
-    if b"null" in payload or b"\\u0000" in payload:
+    # A search for one byte takes a third of the time of a search for six, and few payloads hold an escape.
+    if b"null" in payload or (b"\\" in payload and b"\\u0000" in payload):
         fault = _first_fault(event)
         if fault is not None:
             raise fault

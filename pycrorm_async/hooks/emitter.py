@@ -76,7 +76,11 @@ class Emitter:
     def put(self, episode: EpisodeId, event: Happening) -> int:
         """Append an event and return its sequence. Raises `NotEncodable` before anything is written."""
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
-        sequence = self.put_payload(self._heading(episode, type(event)), payload)
+        heading = self._heading(episode, type(event))
+        try:
+            sequence = self.sink.put_nowait(heading, payload, reserved=True)
+        except SpoolFull:
+            sequence = self.put_payload(heading, payload)
         if self.feed.observers:
             self.feed.publish(episode, sequence, event)
         return sequence

@@ -191,7 +191,7 @@ class Episode:
         missing: dict[str, str] = {}
         event = NodeStarted(
             kind=node.kind,
-            parent=self._parent_of(node.parent),
+            parent=self._sequence_of(node.parent) or self._root,
             designator=declared.fingerprint or None,
             parameters=read_parameters(node.designator, declared, self, missing),
             robot=self._robot_state(),
@@ -218,7 +218,7 @@ class Episode:
             if self._open_nodes.get(record.sequence) is node:
                 failure = failure_value(node.failure, self) if node.failure is not None else None
                 result = encode_or_missing(node.result, self) if node.result is not None else None
-                status: NodeStatus = node.status.value
+                status: NodeStatus = node.status._value_  # `value` takes 0.1 µs longer
                 assert node.designator is not None
                 self._close_node(NodeEnded(record.sequence, status, failure, result), node.designator.dtype)
         finally:
@@ -344,7 +344,8 @@ class Episode:
     def _robot_state(self) -> RobotValue | None:
         if self.world is None:
             return None
-        if not self.acts_in_recorded_world:
+        current = current_world.get()
+        if current is not self.world.world and current is not None:
             self._emitter.missing.note("Episode", "robot of a second world", "the episode records only the first world")
             return None
         try:

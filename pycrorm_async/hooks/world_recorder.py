@@ -107,7 +107,7 @@ class WorldRecorder:
         torso = description.torso_joint if description is not None else None
         return RobotValue(
             recorded[1],
-            robot.object_type.name,
+            robot.object_type._name_,  # `name` takes 0.1 µs longer
             robot.joint_position(torso) if torso is not None else None,
             self._references.get(robot),
             recorded[2],

@@ -75,9 +75,9 @@ def wrap_perform(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable
         calls = called_performs.get()
         if calls is None:
             return run(self, None)
-        unstarted: Unstarted = [calls]
+        unstarted: Unstarted = [calls, None]
         coroutine = run(self, unstarted)
-        unstarted.append(ref(coroutine, calls.callbacks[type(self)]))
+        unstarted[1] = ref(coroutine, calls.callbacks[type(self)])
         calls.waiting += 1
         return coroutine
 
