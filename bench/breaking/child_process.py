@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import multiprocessing
 import os
@@ -30,8 +31,9 @@ class ChildProcess:
 
     def __init__(self, target: Callable[..., None], *arguments: object) -> None:
         reader, writer = SPAWN.Pipe(duplex=False)
-        self._process = SPAWN.Process(target=_run, args=(writer, target, *arguments), daemon=True)
+        self._process = SPAWN.Process(target=_run, args=(writer, target, *arguments))
         self._process.start()
+        atexit.register(self._process.kill)  # not daemonic, because a daemonic process must not start fold workers
         writer.close()
         self._output = bytearray()
         self._reader = threading.Thread(target=self._read, args=(reader,), daemon=True)

@@ -58,7 +58,12 @@ class ChildProcess(NamedTuple):
 
         `fork_beside`: fork, and close the child's copies of the connections to these children. The calling process must
         have one thread.
+
+        Raises `OSError` if the system starts no process, and in a daemonic process of multiprocessing (such as a worker
+        of its `Pool`), which must not start any.
         """
+        if multiprocessing.current_process().daemon:
+            raise OSError("a daemonic process of multiprocessing cannot start processes")
         context: Any = multiprocessing.get_context("spawn" if fork_beside is None else "fork")
         ours, theirs = context.Pipe()
         inherited = [] if fork_beside is None else [ours, *(each.connection for each in fork_beside)]

@@ -1,0 +1,30 @@
+"""A rebuild with fold workers in a daemonic process of multiprocessing, which must not start processes."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.operations.rebuild import rebuild_memory
+from tests.projections.rebuild_cases import TYPES, picking, store
+from tests.table_comparison import differences, tables_of
+
+pytestmark = pytest.mark.slow
+
+
+def rebuild_with_two_workers(url: str) -> None:
+    asyncio.run(rebuild_memory(url, workers=2))
+
+
+def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    asyncio.run(store(url, [*TYPES, *picking(1).records]))
+    before = tables_of(url)
+    process = multiprocessing.get_context("spawn").Process(target=rebuild_with_two_workers, args=(url,), daemon=True)
+    process.start()
+    process.join(120)
+    assert process.exitcode == 0
+    assert differences(before, tables_of(url)) == []
