@@ -23,6 +23,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.logging import RichHandler
+from typer.exceptions import TyperException
 
 from pycrorm_async import __version__
 from pycrorm_async.cli.output import problem, stderr, stdout
@@ -148,4 +149,18 @@ def main() -> None:
     except KeyboardInterrupt:  # while the verb's module was being loaded
         problem("interrupted before the command started")
         sys.exit(130)
-    command()
+    try:
+        code = command(standalone_mode=False)
+    except TyperException as error:
+        _print_usage_error(error)
+        code = 2
+    sys.exit(code)
+
+
+def _print_usage_error(error: TyperException) -> None:
+    """Print the fault of the command line as one line; nothing if typer has printed the help instead of an error."""
+    line = error.format_message().rstrip().removesuffix(".").replace("Value error, ", "")
+    if line:
+        context = getattr(error, "ctx", None)
+        verb = context.command_path if context is not None else "pycrorm"
+        problem(f"{line[0].lower()}{line[1:]}; `{verb} --help` lists the arguments")

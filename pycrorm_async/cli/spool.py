@@ -31,30 +31,36 @@ from pycrorm_async.queue.maintenance.inspection import Damage, RecorderReport, S
 from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
 from pycrorm_async.queue.maintenance.salvage import Range
 from pycrorm_async.settings import Settings
+from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["inspect", "repair", "rebind"]
 
-FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="The spool: `memory.db.spool` beside `memory.db`.")]
+FolderArgument = Annotated[
+    Path | None, typer.Argument(metavar="DIR", help="The spool; default: that of --spool, or the one of --url.")
+]
 
 
-def inspect(folder: FolderArgument, as_json: JsonOption = False) -> int:
+def inspect(
+    folder: FolderArgument = None, url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False
+) -> int:
     """List the contents of a spool, reading only its files. Changes nothing.
 
     Exit code 4 if a file is damaged, 3 if a folder cannot be read, 1 if the spool contains files of other programs.
     """
-    report = inspect_spool(folder)
+    place = _spool_folder(folder, url, spool)
+    report = inspect_spool(place)
     if as_json:
         print_json(_document(report))
     else:
         _print(report)
     for each in report.recorders:
         if each.damage is not None:
-            remedy = "stop its process first" if each.alive else f"repair it with: pycrorm spool repair {folder}"
+            remedy = "stop its process first" if each.alive else f"repair it with: pycrorm spool repair {place}"
             problem(f"{_damage_text(each.damage)}; {remedy}")
         if each.refused is not None:
             problem(each.refused)
     for name in report.strangers:
-        problem(f"{folder / name} does not belong to a spool and is ignored")
+        problem(f"{place / name} does not belong to a spool and is ignored")
     if any(each.damage for each in report.recorders):
         return 4
     if any(each.refused for each in report.recorders):
@@ -62,17 +68,20 @@ def inspect(folder: FolderArgument, as_json: JsonOption = False) -> int:
     return 1 if report.strangers or any(each.foreign for each in report.recorders) else 0
 
 
-def repair(folder: FolderArgument, as_json: JsonOption = False) -> int:
+def repair(
+    folder: FolderArgument = None, url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False
+) -> int:
     """Repair damaged folders of dead recorders, so that their readable records can be stored.
 
     The original of a repaired folder is kept beside it under the name that is printed. Exit code 1 if records could
     not be kept, 3 if a damaged folder cannot be repaired.
     """
-    inspect_spool(folder)
-    finished = finish_repairs(folder)
+    place = _spool_folder(folder, url, spool)
+    inspect_spool(place)
+    finished = finish_repairs(place)
     repaired: list[RepairReport] = []
     refused: dict[str, PycrormError] = {}
-    for each in inspect_spool(folder).recorders:
+    for each in inspect_spool(place).recorders:
         if each.damage is None and each.refused is None:
             continue
         try:
@@ -93,10 +102,14 @@ def repair(folder: FolderArgument, as_json: JsonOption = False) -> int:
     for error in refused.values():
         problem(str(error))
     if repaired and not as_json:
-        note(f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {folder}")
+        note(f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {place}")
     if refused:
         return 3
     return 0 if all(each.complete for each in repaired) else 1
+
+
+def _spool_folder(folder: Path | None, url: str, spool: Path | None) -> Path:
+    return folder or spool or DatabaseAddress.parse(url).default_spool
 
 
 def rebind(

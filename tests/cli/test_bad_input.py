@@ -126,6 +126,11 @@ def folder(tmp_path: Path) -> Path:
         (["run", "turtle.py"], 2, "turtle.py has the name of a standard or already loaded module"),
         (["writer", "--once", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["run", "plans.py", "--spool", "plans.py"], 3, "plans.py"),
+        (["run", "plans.py", "--seed", "x"], 2, "invalid value for '--seed'"),
+        (["run", "plans.py", "--writer", "x"], 2, "'x' is not one of 'thread', 'daemon'; `pycrorm run --help` lists"),
+        (["run", "plans.py", "--colour", "x"], 2, "no such option: --colour"),
+        (["run"], 2, "missing argument 'PLAN.py[:function]'"),
+        (["ran", "plans.py"], 2, "no such command 'ran'"),
     ],
 )
 def test_a_call_that_cannot_be_carried_out_is_one_line(

@@ -152,8 +152,15 @@ def test_what_is_no_spool_is_one_line(tmp_path: Path, verb: str) -> None:
         done = pycrorm("spool", verb, name, cwd=tmp_path)
         assert (done.returncode, done.stdout) == (3, "")
         assert reason in one_line_of(done)
-    nothing = pycrorm("spool", verb, cwd=tmp_path)
-    assert nothing.returncode == 2
+    for arguments, folder in (
+        ((), "pycrorm.db.spool"),
+        (("--url", "sqlite:///a.db"), "a.db.spool"),
+        (("--spool", "b"), "b"),
+        (("c", "--spool", "b"), "c"),
+    ):
+        done = pycrorm("spool", verb, *arguments, cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (3, "")
+        assert f"{folder}: does not exist" in one_line_of(done)
 
 
 def test_what_the_database_refused_is_told_with_its_place_by_status_and_inspect(tmp_path: Path) -> None:
