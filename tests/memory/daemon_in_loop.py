@@ -1,4 +1,4 @@
-"""A daemon in the test's own loop, and what it says."""
+"""Run a daemon in the test's own loop, and keep its messages."""
 
 import asyncio
 import re
@@ -11,19 +11,19 @@ QUICK = Settings(sync_interval_ms=5, flush_timeout_s=60)
 
 
 class Daemon:
-    """A daemon in this loop, and what it said."""
+    """A daemon in this loop, and the lines that it reported."""
 
     def __init__(self, url: str, spool: Path, settings: Settings = QUICK) -> None:
-        self.said: list[str] = []
+        self.lines: list[str] = []
         self.leave = asyncio.Event()
-        serving = serve(url, spool=spool, stop=self.leave, report=self.said.append, settings=settings)
+        serving = serve(url, spool=spool, stop=self.leave, report=self.lines.append, settings=settings)
         self.task = asyncio.create_task(serving)
 
-    async def says(self, pattern: str) -> None:
+    async def wait_for_line(self, pattern: str) -> None:
         async with asyncio.timeout(60):
-            while not any(re.search(pattern, line) for line in self.said):  # noqa: ASYNC110
+            while not any(re.search(pattern, line) for line in self.lines):  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
 
-    async def leaves(self) -> None:
+    async def stop(self) -> None:
         self.leave.set()
         await self.task

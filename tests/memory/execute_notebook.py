@@ -1,6 +1,6 @@
-"""Executes a notebook in a kernel of this interpreter, in a process of its own: `execute_notebook.py IN FOLDER`.
+"""Execute a notebook in a kernel of this interpreter, in a process of its own: `execute_notebook.py IN FOLDER`.
 
-The kernel is described in that folder, so none of the user's is needed; nor is a network.
+The folder holds the kernel's specification, so that neither the user's kernels nor a network are needed.
 """
 
 import json

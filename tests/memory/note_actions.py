@@ -1,4 +1,4 @@
-"""What the tests of a memory perform: notes, and what a memory remembers of them."""
+"""Actions that write notes, and queries for the notes that a memory holds."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ class NoteActionPerformable(ActionAbstract):
     text: str
 
     async def perform(self) -> None:
-        """Noted."""
+        """Succeed without doing anything."""
 
 
 async def texts(memory: Memory | Reading) -> list[str]:

@@ -100,7 +100,7 @@ async def test_parallel_branches_of_two_robots_do_not_wait_for_each_others_parts
             if len(driving) == 2:
                 both.set()
             async with asyncio.timeout(30):
-                await both.wait()  # for ever, if one of the two waited for the other's base
+                await both.wait()  # blocks for ever if one of the two waits for the other's base
 
     async def meet(robot: Object) -> None:
         with robot_acting(robot):

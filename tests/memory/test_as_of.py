@@ -1,7 +1,7 @@
-"""Real plans in a real world: at every moment the memory knows what was being done and how the world was.
+"""Perform real plans in a real world: the memory has the task tree and the world of every moment.
 
-The oracle is kept by the tests while the plan runs: by observers of their own, who ask the world and the plan's nodes
-themselves, and by actions that save the world's state in the middle of a plan.
+The tests keep their own oracle while the plan runs: observers that query the world and the nodes of the plan, and
+actions that save the state of the world in the middle of a plan.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ pytestmark = pytest.mark.slow
 ARM = "l_gripper_tool_frame"
 
 
-class Keeper:
-    """Hears of every node and every change of the world after the memory did, and notes how all is then.
+class StateObserver:
+    """Observe every change of nodes and world after the memory did, and note the state that results.
 
-    Of what a change touches it asks the object itself; the rest is as it was at the change before.
+    The observer queries only the objects that a change touches; the rest is as it was at the change before.
     """
 
     def __init__(self, behind: PlanObserver) -> None:
@@ -104,8 +104,8 @@ def _dtype(node: Node) -> str:
     return type(node.designator).dtype
 
 
-def told(then: Moment) -> tuple[list[tuple[str | None, str, str | None]], dict[str, Any]]:
-    """The same of a moment, without the episode's root."""
+def state_at(then: Moment) -> tuple[list[tuple[str | None, str, str | None]], dict[str, Any]]:
+    """Return the same state from a snapshot, without the episode's root."""
     dtypes = {each.id: each.dtype for each in then.tree}
     nodes = sorted(then.tree, key=lambda each: each.sequence)[1:]
     tree = [(each.dtype, each.status, dtypes[each.parent_id or 0]) for each in nodes]
@@ -117,11 +117,11 @@ def told(then: Moment) -> tuple[list[tuple[str | None, str, str | None]], dict[s
 
 
 @contextmanager
-def kept() -> Iterator[Keeper]:
-    """A keeper between the plans of this context and their memory."""
+def observed() -> Iterator[StateObserver]:
+    """Place a state observer between the plans of this context and their memory."""
     behind = recorder.get()
     assert behind is not None
-    keeper = Keeper(behind)
+    keeper = StateObserver(behind)
     token = recorder.set(keeper)
     try:
         yield keeper
@@ -130,11 +130,13 @@ def kept() -> Iterator[Keeper]:
 
 
 @pytest.mark.parametrize("sampled", [False, True], ids=["plain", "sampled"])
-async def test_after_every_event_of_a_plan_tree_and_world_are_as_they_were(tmp_path: Path, *, sampled: bool) -> None:
+async def test_snapshots_equal_the_observed_tree_and_world_after_every_event_of_a_plan(
+    tmp_path: Path, *, sampled: bool
+) -> None:
     settings = Settings(sample_interval_ms=1) if sampled else Settings()
     async with Memory.open(url_of(tmp_path), settings=settings) as memory:
         async with memory.episode(description="a test") as episode:
-            with kept() as keeper, lab(keeper) as scene:
+            with observed() as keeper, lab(keeper) as scene:
                 spoon = Object("spoon", ObjectType.SPOON, pose=Pose([1.3, 1, 1.05]))
                 await (ParkArmsActionPerformable(Arms.RIGHT) | MoveTorsoActionPerformable(0.1)).perform()
                 await NavigateActionPerformable(WITHIN_REACH).perform()
@@ -152,11 +154,11 @@ async def test_after_every_event_of_a_plan_tree_and_world_are_as_they_were(tmp_p
         assert memory.status.faults.total == 0
         end = await memory.as_of(episode, time=1e9)
         moments = [await memory.as_of(episode, sequence=each) for each in range(1, end.sequence + 1)]
-    # The story begins with the episode and its root, and ends with them, after a world that was left.
-    changes = [then for before, then in itertools.pairwise(moments) if told(before) != told(then)]
+    # The events begin and end with the episode and its root, and the world is left before the end.
+    changes = [then for before, then in itertools.pairwise(moments) if state_at(before) != state_at(then)]
     assert len(keeper.notes) > 60
     expected = [note for before, note in zip([([], {}), *keeper.notes], keeper.notes, strict=False) if before != note]
-    assert [told(then) for then in changes[: len(expected)]] == expected
+    assert [state_at(then) for then in changes[: len(expected)]] == expected
     assert (end.status, end.tree[0].status, end.world.objects) == ("SUCCEEDED", "SUCCEEDED", ())
     assert {then.status for then in moments[:-1]} == {"RUNNING"}
     assert [then.time_s for then in moments] == sorted(then.time_s for then in moments)
@@ -164,7 +166,7 @@ async def test_after_every_event_of_a_plan_tree_and_world_are_as_they_were(tmp_p
 
 @dataclass
 class SavingActionPerformable(ActionAbstract):
-    """Saves the state of the world, and when that was."""
+    """Save the state of the world, and the time."""
 
     _saved: list[tuple[int, WorldState]] = field(default_factory=list)
 
@@ -175,7 +177,7 @@ class SavingActionPerformable(ActionAbstract):
 
 
 def clock_from(start: list[int]) -> Clock:
-    """The system's; the first reading of its monotonic side after `start` was emptied is put there."""
+    """Return the system's clock; it appends the first monotonic reading after `start` was emptied."""
 
     def read() -> int:
         now = monotonic_ns()
@@ -186,7 +188,7 @@ def clock_from(start: list[int]) -> Clock:
     return Clock(SYSTEM_CLOCK.wall_ns, read)
 
 
-async def test_at_any_time_the_world_is_as_it_was_saved_then(tmp_path: Path) -> None:
+async def test_a_snapshot_at_any_time_equals_the_state_that_was_saved_then(tmp_path: Path) -> None:
     saved: list[tuple[int, WorldState]] = []
     start: list[int] = [0]
     async with Memory.open(url_of(tmp_path), clock=clock_from(start)) as memory:
@@ -211,7 +213,7 @@ async def test_at_any_time_the_world_is_as_it_was_saved_then(tmp_path: Path) -> 
             assert robot is not None
             assert (robot.pose, robot.torso_height) == (pose, state.objects["pr2"].joints["torso_lift_joint"])
     assert len({numbers(state.objects["milk"].pose) for _, state in saved}) == 4
-    # And a world of today can be made as it was then.
+    # A world of today can be restored to that state.
     await assert_restored(then.world, saved[-1][1])
 
 
@@ -226,7 +228,7 @@ async def assert_restored(then: WorldThen, state: WorldState) -> None:
         assert scene.robot.attachments == {scene.milk: ARM}
         before = scene.milk.pose
         await NavigateActionPerformable(Pose([5, 5, 0])).perform()
-        assert scene.milk.pose.distance(before) > 5  # it is in the hand again
+        assert scene.milk.pose.distance(before) > 5  # the hand holds it again
 
 
 @dataclass
@@ -240,10 +242,10 @@ class WaitingActionPerformable(ActionAbstract):
         await self._go_on.wait()
 
 
-async def test_while_an_episode_runs_the_memory_tells_what_is_being_done(tmp_path: Path) -> None:
+async def test_a_snapshot_of_a_running_episode_has_its_running_node(tmp_path: Path) -> None:
     begun, go_on = asyncio.Event(), asyncio.Event()
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode(description="running") as episode:
-        with pytest.raises(UnknownEpisode):  # nothing of it is in the database yet
+        with pytest.raises(UnknownEpisode):  # no event of it is in the database yet
             await memory.as_of("00000000-0000-7000-8000-000000000001", time=0)
         both = asyncio.create_task(
             (WaitingActionPerformable("a", begun, go_on) | WaitingActionPerformable("b", begun, go_on)).perform()
@@ -260,12 +262,12 @@ async def test_while_an_episode_runs_the_memory_tells_what_is_being_done(tmp_pat
         go_on.set()
         await both
         await memory.flush()
-        assert await memory.as_of(episode, sequence=now.sequence) == now  # what was, stays
+        assert await memory.as_of(episode, sequence=now.sequence) == now  # earlier snapshots do not change
         later = await memory.as_of(episode, time=1e9)
         assert [each.status for each in later.tree] == ["RUNNING", "SUCCEEDED", "SUCCEEDED", "SUCCEEDED"]
 
 
-async def test_a_thought_has_its_own_moments_and_the_episode_that_thinks_it_has_none_of_them(tmp_path: Path) -> None:
+async def test_a_simulation_has_moments_of_its_own_and_its_episode_has_none_of_them(tmp_path: Path) -> None:
     saved: list[tuple[int, WorldState]] = []
     async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode(description="thinking"):
@@ -291,7 +293,7 @@ async def test_a_thought_has_its_own_moments_and_the_episode_that_thinks_it_has_
         assert then.world.state == saved[1][1] == real
 
 
-async def test_a_robot_that_is_not_known_here_has_a_base_and_no_torso(tmp_path: Path) -> None:
+async def test_a_robot_without_a_local_description_has_a_base_and_no_torso(tmp_path: Path) -> None:
     urdf = tmp_path / "cart.urdf"
     urdf.write_text('<robot name="cart"><link name="base"/></robot>')
     async with Memory.open(url_of(tmp_path)) as memory:

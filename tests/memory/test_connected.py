@@ -1,4 +1,4 @@
-"""A memory and a world that are connected are found by every context without its own: cells, tasks, threads."""
+"""A connected memory and world serve every context without its own: cells, tasks and threads."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ HERE = Path(__file__).parent
 
 
 async def in_a_cell(text: str) -> None:
-    """As a cell of a notebook does it: in a task with a context of its own, which knows of none before."""
+    """Run it as a cell of a notebook does: in a task with a new context, which has no memory yet."""
     await asyncio.get_running_loop().create_task(NoteActionPerformable(text).perform(), context=Context())
 
 
-async def test_what_finds_no_memory_in_its_context_uses_the_one_connected_last(tmp_path: Path) -> None:
+async def test_a_context_without_a_memory_uses_the_one_that_was_connected_last(tmp_path: Path) -> None:
     folders = [tmp_path / name for name in "abc"]
     for each in folders:
         each.mkdir()
@@ -53,11 +53,11 @@ async def test_what_finds_no_memory_in_its_context_uses_the_one_connected_last(t
     await first.close()
     await in_a_cell("7")
     assert recorder.get() is None
-    found = []
+    texts_of_episodes = []
     for each in folders:
         async with Reading.open(url_of(each)) as reading:
-            found.append(await texts(reading))
-    assert found == [["1", "6"], ["2", "4", "5"], ["3"]]
+            texts_of_episodes.append(await texts(reading))
+    assert texts_of_episodes == [["1", "6"], ["2", "4", "5"], ["3"]]
 
 
 async def test_closing_while_an_episode_is_open_ends_it_as_interrupted(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ async def test_closing_while_an_episode_is_open_ends_it_as_interrupted(tmp_path:
             assert (await session.scalars(select(ProcessMetaData.status))).all() == ["INTERRUPTED"]
 
 
-def test_a_connected_world_is_that_of_every_context_until_it_is_closed() -> None:
+def test_a_connected_world_serves_every_context_until_it_is_closed() -> None:
     outer = BulletWorld().connect()
     milk = Context().run(Object, "milk", ObjectType.MILK)
     assert milk.world is outer

@@ -1,4 +1,4 @@
-"""A folder whose content nobody foresaw does not keep the folders beside it from being stored, whoever drains."""
+"""A folder with crafted content does not prevent the folders beside it from being stored, in any mode of draining."""
 
 import logging
 import os
@@ -22,7 +22,7 @@ from tests.queue.forged_segments import change_a_frame
 from tests.writer.writer_threads import until
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 STORED = "SELECT count(*) FROM event"
 
@@ -34,7 +34,7 @@ def spool(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def crafted(spool: Path) -> FolderWriter:
-    """Its only event's name is no text. It is the oldest folder, so that others come after it."""
+    """Its only event has a name that is no text. It is the oldest folder, so that others are drained after it."""
     author = FolderWriter(spool, settings=QUICK)
     author.put(started(), encode(EpisodeStarted("crafted", "me", "host", "1.0", "3.11")))
     author.sync()
@@ -66,13 +66,13 @@ async def test_the_daemon_drains_the_next_folder(
     database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter
 ) -> None:
     running = Daemon(database_url, spool)
-    await running.says("is not UTF-8; retrying with pauses$")
-    await running.says(f"{whole.folder.name} is recovered")
-    await running.leaves()
+    await running.wait_for_line("is not UTF-8; retrying with pauses$")
+    await running.wait_for_line(f"{whole.folder.name} is recovered")
+    await running.stop()
     assert ask(database_url, STORED) == [(2,)]
 
 
-async def test_a_plan_that_starts_beside_them_adopts_the_next_folder(
+async def test_a_new_plan_adopts_the_next_folder(
     database_url: str, spool: Path, crafted: FolderWriter, whole: FolderWriter, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Memory.open(database_url, spool=spool, settings=QUICK) as memory:
@@ -82,7 +82,7 @@ async def test_a_plan_that_starts_beside_them_adopts_the_next_folder(
     assert len([each for each in caplog.records if each.levelno >= logging.WARNING]) == 1
 
 
-def test_every_verb_says_it_in_one_line(
+def test_every_verb_reports_it_in_one_line(
     tmp_path: Path, spool: Path, crafted: FolderWriter, whole: FolderWriter
 ) -> None:
     (spool / os.fsdecode(b"\xff")).touch()
@@ -107,7 +107,7 @@ def test_every_verb_says_it_in_one_line(
     assert ask(url, STORED) == [(2,)]
 
 
-async def test_an_episode_of_nonsense_is_stopped_and_the_one_beside_it_is_in_the_tables(
+async def test_a_crafted_episode_is_stopped_and_the_one_beside_it_is_in_the_tables(
     database_url: str, spool: Path
 ) -> None:
     author = FolderWriter(spool, settings=QUICK)

@@ -1,4 +1,6 @@
-"""A dead recorder's folder that is damaged further on: whoever drains it says so, and stores what was safe before."""
+"""A dead recorder's folder with damage in the middle: every drainer reports it, and stores what was synced before
+it.
+"""
 
 import logging
 import uuid
@@ -23,7 +25,7 @@ from tests.queue.factories import WALL_NS, FolderWriter, episode, overwrite, sta
 from tests.writer.writer_threads import until
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 STORED = "SELECT max(sequence), count(*) FROM event"
 MISSING = "position 13 is missing"
@@ -36,7 +38,7 @@ def spool(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def damaged(spool: Path) -> FolderWriter:
-    """Of twenty events, each safe and two in a file, the thirteenth is not what it was."""
+    """Twenty synced events, two in each file, of which the thirteenth is changed."""
     author = FolderWriter(spool)
     author.put(started(), encode(EpisodeStarted("damaged further on", "me", "host", "1.0", "3.11")))
     added, here = Heading(episode(1), "ObjectAdded", 1), PoseValue((0, 0, 0), (0, 0, 0, 1), "map", WALL_NS)
@@ -48,25 +50,25 @@ def damaged(spool: Path) -> FolderWriter:
     return author
 
 
-async def test_the_daemon_tells_it_once_and_stores_what_a_repair_keeps_of_the_rest(
+async def test_the_daemon_reports_damage_once_and_stores_what_a_repair_keeps_of_the_rest(
     database_url: str, spool: Path, damaged: FolderWriter
 ) -> None:
     running = Daemon(database_url, spool)
-    await running.says("is dead: recovering")
-    await running.says(f"{MISSING}, although .* retrying with pauses$")
-    await running.leaves()
+    await running.wait_for_line("is dead: recovering")
+    await running.wait_for_line(f"{MISSING}, although .* retrying with pauses$")
+    await running.stop()
     assert ask(database_url, STORED) == [(12, 12)]
-    assert len([line for line in running.said if MISSING in line]) == 1
+    assert len([line for line in running.lines if MISSING in line]) == 1
     assert len(damaged.segments) > len(list(damaged.folder.glob("*.segment"))) > 1
     assert repair_folder(damaged.folder) is not None
     running = Daemon(database_url, spool)
-    await running.says(r"is recovered \(1 episode LOST\)")
-    await running.leaves()
+    await running.wait_for_line(r"is recovered \(1 episode LOST\)")
+    await running.stop()
     assert ask(database_url, STORED) == [(13, 13)]
     assert Spool(spool).recorders() == []
 
 
-async def test_one_round_reports_it_and_stores_what_a_repair_keeps_of_the_rest(
+async def test_one_round_reports_damage_and_stores_what_a_repair_keeps_of_the_rest(
     database_url: str, spool: Path, damaged: FolderWriter
 ) -> None:
     for _ in range(2):
@@ -82,7 +84,7 @@ async def test_one_round_reports_it_and_stores_what_a_repair_keeps_of_the_rest(
     assert Spool(spool).recorders() == []
 
 
-async def test_a_plan_that_starts_beside_it_tells_it_once_and_goes_on(
+async def test_a_new_plan_reports_damage_once_and_continues(
     database_url: str, spool: Path, damaged: FolderWriter, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with Memory.open(database_url, spool=spool, settings=QUICK) as memory:
@@ -97,7 +99,7 @@ async def test_a_plan_that_starts_beside_it_tells_it_once_and_goes_on(
     assert [each.name for each in Spool(spool).recorders()] == [damaged.folder.name]
 
 
-def test_where_damage_was_met_all_is_looked_at_before_any_of_it_is_given_again(
+def test_a_folder_with_damage_is_scanned_whole_before_any_of_it_is_supplied_again(
     tmp_path: Path, spool: Path, damaged: FolderWriter
 ) -> None:
     look = _Folders(Spool(spool), str(uuid.uuid4()), DatabaseAddress.parse(f"sqlite:///{tmp_path / 'memory.db'}"))

@@ -1,6 +1,6 @@
-"""The four tests of the reference system's resolver, under their names: what went well is stored, and done again.
+"""The four tests of the reference system's resolver, under their names: what succeeded is stored, and repeated.
 
-A first plan picks the milk up and remembers it. A second one, in a fresh world, knows nothing but that memory.
+A first plan picks the milk up and records it. A second one, in a new world, uses only that memory.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Scene(NamedTuple):
 
 @contextmanager
 def scene(*, kitchen: bool = False, milk: Pose | None = None) -> Iterator[Scene]:
-    """A fresh world with robot and milk."""
+    """A new world with robot and milk."""
     with BulletWorld(), simulated_robot:
         robot = Object("pr2", ObjectType.ROBOT)
         if kitchen:
@@ -64,8 +64,8 @@ async def memory(tmp_path: Path) -> AsyncIterator[Memory]:
         yield memory
 
 
-async def taken_up(place: Location | None, milk: Object) -> Location:
-    """Pick it up as the place says."""
+async def picked_up(place: Location | None, milk: Object) -> Location:
+    """Pick it up from the resolved location."""
     assert place is not None
     assert place.grasp is not None
     assert place.torso_height is not None
@@ -77,7 +77,7 @@ async def taken_up(place: Location | None, milk: Object) -> Location:
 
 async def test_costmap_no_obstacles(memory: Memory) -> None:
     with scene() as here:
-        place = await taken_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
+        place = await picked_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
         assert place.pose.distance(STAND) < 1e-9
         assert (place.reachable_arms, place.grasp, place.torso_height) == ((Arms.LEFT,), Grasp.FRONT, TORSO)
         assert here.robot.pose.distance(STAND) < 1e-9
@@ -86,10 +86,10 @@ async def test_costmap_no_obstacles(memory: Memory) -> None:
 
 async def test_costmap_with_obstacles(memory: Memory) -> None:
     with scene(kitchen=True) as here:
-        await taken_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
+        await picked_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
         assert here.milk.attached_to is here.robot
         here.robot.detach(here.milk)
-        # Turned round, the stand would be at (2.0, 1.1): less than 0.3 m behind the kitchen's wall.
+        # Rotated with the object, the base would be at (2.0, 1.1): less than 0.3 m behind the kitchen's wall.
         here.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(math.pi)))
         assert await DatabaseCostmapLocation(here.milk, here.robot).resolve() is None
 
@@ -97,8 +97,8 @@ async def test_costmap_with_obstacles(memory: Memory) -> None:
 async def test_object_at_different_location(memory: Memory) -> None:
     turned = yaw_quaternion(math.pi)
     with scene(kitchen=True, milk=Pose([-1.35, 1.1, 0.95], turned)) as here:
-        place = await taken_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
-        # On the island, turned round: 0.7 m from it on the other side, 0.1 m to the other hand.
+        place = await picked_up(await DatabaseCostmapLocation(here.milk, here.robot).resolve(), here.milk)
+        # Rotated on the island: 0.7 m from it on the other side, 0.1 m to the other hand.
         assert place.pose.position == pytest.approx((-1.35 + 0.7, 1.1 + 0.1, 0.0))
         assert abs(place.pose.yaw) == pytest.approx(math.pi)
         await PlaceActionPerformable(here.milk, Arms.LEFT, Pose([-1.3, 1.2, 0.95], turned)).perform()
@@ -112,14 +112,14 @@ async def test_multiple_objects(memory: Memory) -> None:
         bowl = Object("bowl", ObjectType.BOWL, pose=Pose([1.3, 0.6, 0.9]))
         before = here.robot.world.save_state()
         for milk in (here.milk, other):
-            place = await taken_up(await DatabaseCostmapLocation(milk, here.robot).resolve(), milk)
+            place = await picked_up(await DatabaseCostmapLocation(milk, here.robot).resolve(), milk)
             assert place.pose.position == pytest.approx((0.6, milk.original_pose.position.y - 0.1, 0.0))
             assert here.robot.attachments == {milk: "l_gripper_tool_frame"}
             here.robot.world.restore_state(before)
         assert await DatabaseCostmapLocation(bowl, here.robot).resolve() is None
 
 
-async def test_the_choice_is_remembered_with_grasp_and_torso_height(memory: Memory) -> None:
+async def test_the_choice_is_recorded_with_grasp_and_torso_height(memory: Memory) -> None:
     async with memory.episode(description="doing it again"):
         with scene(kitchen=True) as here:
             await ParkArmsActionPerformable(Arms.BOTH).perform()

@@ -1,4 +1,6 @@
-"""A memory whose events a daemon writes: the same promises, no connection for writing, plain words when it is away."""
+"""A memory whose events a daemon stores: the same promises, no connection for writing, clear errors without a
+daemon.
+"""
 
 import asyncio
 import logging
@@ -34,7 +36,7 @@ from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 
 @pytest.fixture
@@ -61,7 +63,7 @@ def memory_at(url: str, spool: Path, settings: Settings = QUICK) -> Memory:
     return Memory.open(url, spool=spool, writer="daemon", settings=settings)
 
 
-async def test_what_is_flushed_is_in_the_tables_and_closing_leaves_nothing_behind(
+async def test_flushed_records_are_in_the_tables_and_closing_leaves_no_folder(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
     async with memory_at(database_url, spool) as memory:
@@ -84,13 +86,13 @@ async def test_what_is_flushed_is_in_the_tables_and_closing_leaves_nothing_behin
             async with Reading.open(database_url) as reading:
                 assert await texts(reading) == ["a", "b", "c"]
             assert Spool(spool).recorders() == []
-            await started.says("has ended")
-    assert [line.split("; ")[-1] for line in started.said if "has ended" in line] == [
+            await started.wait_for_line("has ended")
+    assert [line.split("; ")[-1] for line in started.lines if "has ended" in line] == [
         f"{status.written + 6} events stored"
     ]
 
 
-async def test_the_database_need_not_be_there_before_the_daemon(tmp_path: Path, spool: Path) -> None:
+async def test_the_daemon_may_start_before_the_database_exists(tmp_path: Path, spool: Path) -> None:
     url = f"sqlite:///{tmp_path / 'memory.db'}"
     async with memory_at(url, spool) as memory:
         await NoteActionPerformable("early").perform()
@@ -109,7 +111,7 @@ async def test_the_database_need_not_be_there_before_the_daemon(tmp_path: Path, 
     await started.task
 
 
-async def test_without_a_daemon_flush_says_so_and_closing_leaves_the_events_to_whoever_comes(
+async def test_without_a_daemon_flush_says_so_and_closing_leaves_the_events_to_the_next_drainer(
     database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
@@ -125,7 +127,7 @@ async def test_without_a_daemon_flush_says_so_and_closing_leaves_the_events_to_w
         assert await texts(reading) == ["a"]
 
 
-async def test_closing_says_so_when_all_is_stored_and_the_tables_are_behind(
+async def test_closing_reports_that_all_is_stored_and_the_tables_are_behind(
     database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
@@ -161,7 +163,7 @@ async def test_a_flush_returns_when_a_daemon_died_between_storing_and_folding_an
             assert await texts(memory) == ["a"]
 
 
-async def test_one_round_stores_what_a_living_process_has_synced_and_its_flush_returns(
+async def test_one_round_stores_what_a_live_process_has_synced_and_its_flush_returns(
     database_url: str, spool: Path
 ) -> None:
     async with memory_at(database_url, spool) as memory:
@@ -178,7 +180,7 @@ async def test_one_round_stores_what_a_living_process_has_synced_and_its_flush_r
         assert await texts(memory) == ["a", "b"]
 
 
-async def test_a_full_spool_is_emptied_by_the_daemon_and_the_plan_goes_on(
+async def test_the_daemon_drains_a_full_spool_and_the_plan_continues(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
     tiny = replace(QUICK, segment_bytes=2**14, record_bytes_max=2**12, spool_bytes_max=2**17, spool_reserve_bytes=2**15)
@@ -198,7 +200,7 @@ async def test_a_full_spool_is_emptied_by_the_daemon_and_the_plan_goes_on(
             assert memory.status.faults.total == 0
 
 
-async def test_an_episode_that_is_parked_is_told_by_flush_once_and_the_others_go_on(
+async def test_a_flush_reports_a_parked_episode_once_and_the_others_continue(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
     async with memory_at(database_url, spool) as memory, daemon():
@@ -215,24 +217,28 @@ async def test_an_episode_that_is_parked_is_told_by_flush_once_and_the_others_go
         assert await texts(memory) == ["a", "c"]
 
 
-async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later_daemon_when_it_can_be(
+async def test_a_refused_episode_is_reported_and_kept_and_stored_by_a_later_daemon_when_possible(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
-    settings = replace(QUICK, keep_stored_s=0)  # a daemon that keeps nothing heals nothing
+    settings = replace(QUICK, keep_stored_s=0)  # a daemon that keeps no stored segments repairs nothing
     async with memory_at(database_url, spool, settings) as memory:
         async with memory.episode(description="refused") as refused:
             async with daemon(settings):
                 await NoteActionPerformable("a").perform()
                 await memory.flush()
                 [[head]] = ask(database_url, "SELECT head FROM episode")
-                ask_to_change(database_url, "UPDATE episode SET folded = 1, head = 1")  # as after an older backup
+                ask_to_change(
+                    database_url, "UPDATE episode SET folded = 1, head = 1"
+                )  # as after the restore of an older backup
                 await NoteActionPerformable("b").perform()
                 with pytest.raises(EpisodeParked, match=f"{refused}: events 2 to .* did not arrive before"):
                     await memory.flush()
-            async with daemon(settings) as started:  # which goes on where the one before was
+            async with daemon(settings) as started:  # continues where its predecessor ended
                 await NoteActionPerformable("c").perform()
                 await memory.flush()
-                await started.says(f"episode {refused} was refused: events 2 to .*; its events are kept in the spool")
+                await started.wait_for_line(
+                    f"episode {refused} was refused: events 2 to .*; its events are kept in the spool"
+                )
         async with daemon(settings) as started:
             async with memory.episode(description="other"):
                 await NoteActionPerformable("d").perform()
@@ -242,7 +248,7 @@ async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later
             await memory.__aexit__(None, None, None)
             [kept] = Spool(spool).recorders()
             assert kept.refused == str(refused)
-            await started.says(f"recorder {kept.name}: episode {refused} .*; the next writer retries")
+            await started.wait_for_line(f"recorder {kept.name}: episode {refused} .*; the next writer retries")
             segments = {path: path.read_bytes() for path in kept.path.glob("*.segment")}
     assert (len(segments), kept.alive) == (3, False)
     report = await recover(database_url, spool=spool)
@@ -250,13 +256,13 @@ async def test_an_episode_that_is_refused_is_told_and_kept_and_stored_by_a_later
     assert {path: path.read_bytes() for path in kept.path.glob("*.segment")} == segments
     ask_to_change(database_url, f"UPDATE episode SET folded = {head}, head = {head} WHERE number = 1")
     async with daemon(settings) as started:
-        await started.says(f"recorder {kept.name} is recovered; ")
+        await started.wait_for_line(f"recorder {kept.name} is recovered; ")
     assert Spool(spool).recorders() == []
     async with Reading.open(database_url) as reading:
         assert sorted(await texts(reading)) == ["a", "b", "c", "d"]
 
 
-async def test_one_round_tells_a_living_recorder_which_of_its_own_episodes_are_refused_or_parked(
+async def test_one_round_reports_to_a_live_recorder_its_refused_and_parked_episodes(
     database_url: str, spool: Path
 ) -> None:
     settings = replace(QUICK, connect_timeout_s=60)
@@ -274,12 +280,12 @@ async def test_one_round_tells_a_living_recorder_which_of_its_own_episodes_are_r
         await NoteActionPerformable("c").perform()
         await memory.synced()
         await recover(database_url, spool=spool)
-        with pytest.raises(EpisodeParked) as told:
+        with pytest.raises(EpisodeParked) as caught:
             await memory.flush()
-        assert told.value.reasons == {str(parked): "by hand"}
+        assert caught.value.reasons == {str(parked): "by hand"}
 
 
-async def test_a_daemon_whose_file_is_replaced_by_another_ends_and_one_whose_file_is_only_gone_waits(
+async def test_a_daemon_ends_when_its_database_file_is_replaced_and_waits_when_the_file_is_deleted(
     tmp_path: Path, spool: Path
 ) -> None:
     file = tmp_path / "memory.db"
@@ -287,19 +293,19 @@ async def test_a_daemon_whose_file_is_replaced_by_another_ends_and_one_whose_fil
     started = Daemon(url, spool)
     async with memory_at(url, spool, replace(QUICK, flush_timeout_s=0.5)):
         await NoteActionPerformable("a").perform()
-        await started.says("appeared")
+        await started.wait_for_line("appeared")
         file.rename(tmp_path / "away.db")
         await NoteActionPerformable("b").perform()
-        await started.says("the database is unavailable: .*removed or replaced")
+        await started.wait_for_line("the database is unavailable: .*removed or replaced")
         (tmp_path / "away.db").rename(file)
-        await started.says("the database is available again")
+        await started.wait_for_line("the database is available again")
         shutil.copy(file, tmp_path / "copy.db")
         (tmp_path / "copy.db").replace(file)
         await NoteActionPerformable("c").perform()
         async with asyncio.timeout(60):
             with pytest.raises(DatabaseForeign, match=r"memory\.db was replaced while it was open: start"):
                 await started.task
-    assert not any("Traceback" in line for line in started.said)
+    assert not any("Traceback" in line for line in started.lines)
     report = await recover(url, spool=spool)
     assert report.failed == {}
 
@@ -308,15 +314,15 @@ async def test_a_second_daemon_on_the_same_spool_is_refused_in_one_line(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
     async with daemon() as started:
-        await started.says("draining")
+        await started.wait_for_line("draining")
         with pytest.raises(SpoolUnavailable, match="another `pycrorm writer` drains it already") as refused:
             await serve(database_url, spool=spool, stop=asyncio.Event(), report=print)
         assert "\n" not in str(refused.value)
     async with daemon() as started:
-        await started.says("draining")
+        await started.wait_for_line("draining")
 
 
-async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folders_to_the_next(
+async def test_a_daemon_that_is_cancelled_during_a_scan_leaves_the_folders_to_the_next(
     database_url: str, spool: Path, daemon: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looking, cancelled = threading.Event(), threading.Event()
@@ -344,7 +350,7 @@ async def test_a_daemon_that_is_cancelled_while_it_looks_round_leaves_the_folder
             assert await texts(memory) == ["a"]
 
 
-async def test_a_spool_of_another_database_is_refused_and_nothing_of_it_is_moved(
+async def test_a_spool_of_another_database_is_refused_and_left_unchanged(
     database_url: str, spool: Path, tmp_path: Path
 ) -> None:
     async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.1)):
@@ -359,7 +365,7 @@ async def test_a_spool_of_another_database_is_refused_and_nothing_of_it_is_moved
     assert ask(f"sqlite:///{tmp_path}/other.db", "SELECT count(*) FROM event") == [(0,)]
 
 
-async def test_a_damaged_folder_is_told_and_the_others_are_drained(
+async def test_damage_in_one_folder_is_reported_and_the_others_are_drained(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
     for text in ("damaged", "whole"):
@@ -371,8 +377,8 @@ async def test_a_damaged_folder_is_told_and_the_others_are_drained(
     content[content.index(b"damaged")] ^= 1
     segment.write_bytes(content)
     async with daemon() as started:
-        await started.says(f"{first.name}: .*00000001.segment is damaged at byte .*; retrying")
-        await started.says(f"{second.name} is recovered")
+        await started.wait_for_line(f"{first.name}: .*00000001.segment is damaged at byte .*; retrying")
+        await started.wait_for_line(f"{second.name} is recovered")
     async with Reading.open(database_url) as reading:
         assert await texts(reading) == ["whole"]
     assert [each.name for each in Spool(spool).recorders()] == [first.name]
@@ -390,12 +396,12 @@ async def test_a_damaged_folder_is_told_and_the_others_are_drained(
         (lambda: Memory.open("sqlite:///x.db", settings=Settings(writer="cron")), "use 'thread' or 'daemon'"),  # type: ignore[arg-type]
     ],
 )
-def test_what_no_daemon_can_do_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
+def test_an_impossible_daemon_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
     with pytest.raises(CallerError, match=words):
         open_it()
 
 
-async def test_a_locked_database_is_away_for_the_daemon_and_closing_does_not_wait_for_it(
+async def test_a_locked_database_is_unavailable_to_the_daemon_and_closing_does_not_wait_for_it(
     tmp_path: Path, spool: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     url = f"sqlite:///{tmp_path / 'memory.db'}"
@@ -406,13 +412,13 @@ async def test_a_locked_database_is_away_for_the_daemon_and_closing_does_not_wai
         other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
         other.execute("BEGIN IMMEDIATE")
         await NoteActionPerformable("b").perform()
-        await started.says("the database is unavailable: .*locked; retrying")
+        await started.wait_for_line("the database is unavailable: .*locked; retrying")
     [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
     assert "the daemon reports that the database is unavailable" in line
     other.execute("COMMIT")
     other.close()
-    await started.says("the database is available again after")
-    await started.says("is recovered")
+    await started.wait_for_line("the database is available again after")
+    await started.wait_for_line("is recovered")
     started.leave.set()
     await started.task
     async with Reading.open(url) as reading:

@@ -1,4 +1,4 @@
-"""A deleted or replaced database is noticed, nothing is acknowledged to it, and `rebind` stores what is left."""
+"""A deleted or replaced database is noticed, no record is acknowledged to it, and `rebind` stores the rest."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NOTES = "SELECT count(*) FROM event WHERE type = 'NodeEnded'"
 
 
 @pytest.mark.parametrize("replaced", [False, True])
-async def test_a_file_deleted_or_replaced_during_a_run_is_named_and_all_events_come_into_the_new_one(
+async def test_a_file_deleted_or_replaced_during_a_run_is_named_and_all_events_are_stored_in_the_new_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, *, replaced: bool
 ) -> None:
     file, other = tmp_path / "memory.db", tmp_path / "other.db"
@@ -51,13 +51,13 @@ async def test_a_file_deleted_or_replaced_during_a_run_is_named_and_all_events_c
             assert memory.status.stored < memory.status.written
     with pytest.raises((SpoolForeign, DatabaseUnavailable), match="pycrorm spool rebind"):
         await recover(url)
-    said: list[Rebinding] = []
-    done = await rebind(url, on_rebinding=said.append)
-    assert (said, done.recorders, done.before != done.after) == ([done], 1, True)
+    reports: list[Rebinding] = []
+    done = await rebind(url, on_rebinding=reports.append)
+    assert (reports, done.recorders, done.before != done.after) == ([done], 1, True)
     report = await recover(url)
     assert (report.drained.stopped, report.failed, report.dead_letters) == ({}, {}, {})
     assert ask(file, NOTES) == [(5 if replaced else 3,)]
-    async with Memory.open(url):  # and the spool is this database's from now on
+    async with Memory.open(url):  # from now on the spool belongs to this database
         await NoteActionPerformable("the next day").perform()
     assert ask(file, "SELECT count(*) FROM episode") == [(3 if replaced else 2,)]
 
@@ -68,7 +68,7 @@ async def _logged(caplog: pytest.LogCaptureFixture, text: str) -> None:
             await asyncio.sleep(0.02)
 
 
-async def test_events_of_a_database_that_was_made_anew_are_stored_by_rebind_and_not_before(
+async def test_events_of_a_replaced_database_are_stored_by_rebind_and_not_before(
     database_url: str, server: Server, tmp_path: Path
 ) -> None:
     spool = tmp_path / "spool"
@@ -112,7 +112,7 @@ def test_a_spool_in_use_is_not_rebound(tmp_path: Path, holder: str) -> None:
     assert spool.log_id() == "b"
 
 
-def test_what_is_kept_of_the_log_before_goes_along(tmp_path: Path) -> None:
+def test_rebind_moves_kept_segments_of_the_former_log(tmp_path: Path) -> None:
     spool = Spool(tmp_path)
     spool.bind("a")
     (tmp_path / "stored" / "a" / RECORDER).mkdir(parents=True)

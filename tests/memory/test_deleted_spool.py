@@ -1,4 +1,6 @@
-"""A spool that is deleted under a running plan: the plan goes on, and what happened is said in every place."""
+"""A spool that is deleted under a running plan: the plan continues, and the log, `status` and `flush` report the
+loss.
+"""
 
 import asyncio
 import logging
@@ -18,7 +20,7 @@ from tests.memory.daemon_in_loop import QUICK, Daemon
 from tests.memory.note_actions import NoteActionPerformable, texts
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 GONE = "was deleted or replaced"
 
@@ -28,20 +30,20 @@ async def drained_by(writer: Writer, url: str, spool: Path) -> AsyncIterator[Non
     daemon = Daemon(url, spool) if writer == "daemon" else None
     yield
     if daemon is not None:
-        await daemon.leaves()
+        await daemon.stop()
 
 
 async def until_noticed(memory: Memory) -> None:
-    """The queue has moved; who waited for a sync meanwhile was told."""
+    """Wait until the queue has moved; a sync that waited meanwhile raised."""
     async with asyncio.timeout(60):
         while "continues in" not in (memory.status.spool_fault or ""):
-            await asyncio.sleep(0)  # `synced` need not suspend, and then no timeout could end this
+            await asyncio.sleep(0)  # `synced` need not suspend, so that no timeout could end this loop
             with suppress(SpoolUnavailable):
                 await memory.synced()
 
 
 @pytest.mark.parametrize("writer", ["thread", "daemon"])
-async def test_the_plan_goes_on_and_everything_is_stored(
+async def test_the_plan_continues_in_a_new_spool_and_everything_is_stored(
     database_url: str, tmp_path: Path, writer: Writer, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = tmp_path / "spool"
@@ -78,7 +80,7 @@ async def test_the_plan_goes_on_and_everything_is_stored(
     assert ask(database_url, "SELECT count(*) FROM event")[0][0] > 6
 
 
-async def test_a_spool_whose_root_is_deleted_belongs_to_its_database_again(tmp_path: Path) -> None:
+async def test_a_spool_whose_root_is_deleted_is_bound_to_its_database_again(tmp_path: Path) -> None:
     url, spool = f"sqlite:///{tmp_path / 'memory.db'}", tmp_path / "spool"
     async with Memory.open(url, spool=spool, settings=QUICK) as memory:
         await NoteActionPerformable("a").perform()

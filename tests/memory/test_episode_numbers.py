@@ -1,4 +1,4 @@
-"""A memory that has used up its episode numbers keeps what comes then in its spool; before, it warns."""
+"""A memory that has used up its episode numbers keeps further episodes in its spool; it warns before."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.store.factories import episode, run_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 
 def take_numbers_up_to(url: str, last: int) -> None:
-    """The database has given this episode number."""
+    """Make the database assign episode numbers up to this one."""
     ask_to_change(url, f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({last}, 'x', 0, 0)")
-    if url.startswith("postgresql"):  # there, numbers come from a sequence
+    if url.startswith("postgresql"):  # PostgreSQL takes the numbers from a sequence
         ask_to_change(url, f"SELECT setval('pycrorm.episode_number', {last})")
 
 
@@ -35,7 +35,7 @@ async def made(url: str) -> None:
     await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
 
 
-async def test_the_last_number_serves_and_what_comes_after_it_is_kept_in_the_spool_and_offered_again(
+async def test_the_last_number_is_used_and_further_episodes_are_kept_in_the_spool_and_tried_again(
     database_url: str, tmp_path: Path
 ) -> None:
     await made(database_url)
@@ -62,14 +62,16 @@ async def test_the_last_number_serves_and_what_comes_after_it_is_kept_in_the_spo
     assert [each.refused for each in Spool(spool).recorders() if each.refused is not None] == [beyond]
     other = f"sqlite:///{tmp_path}/other.db"
     await copy_episodes(database_url, other)
-    assert ask(other, f"SELECT number, head FROM episode WHERE id = '{last}'") == [(1, 6)]  # a new memory numbers anew
+    assert ask(other, f"SELECT number, head FROM episode WHERE id = '{last}'") == [
+        (1, 6)
+    ]  # a new memory assigns new numbers
     done = pycrorm("spool", "rebind", "--url", other, "--spool", spool, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert ask(other, f"SELECT number, head, refused FROM episode WHERE id = '{beyond}'") == [(2, 6, None)]
     assert [each for each in Spool(spool).recorders() if each.refused is not None] == []
 
 
-async def test_from_nine_tenths_of_the_numbers_on_status_warns_and_the_log_has_one_line(
+async def test_status_and_log_warn_once_nine_tenths_of_the_episode_numbers_are_used(
     database_url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     await made(database_url)
@@ -89,7 +91,7 @@ async def test_from_nine_tenths_of_the_numbers_on_status_warns_and_the_log_has_o
     assert f"warning: {warning.format('3,774,874')}" in pycrorm("status", *asked, cwd=tmp_path).stderr
 
 
-async def test_from_nine_tenths_of_an_episodes_sequences_on_status_warns_and_the_log_has_one_line(
+async def test_status_and_log_warn_once_nine_tenths_of_an_episodes_sequences_are_used(
     database_url: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)

@@ -1,4 +1,4 @@
-"""Which memory a plan asks for experience, and what of it is known when."""
+"""The memory that a plan queries for experience, and the experience that is visible in it."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ async def pick_up(stand: Pose = STAND, *, torso: float = TORSO) -> None:
         await PickUpActionPerformable(here.milk, Arms.LEFT, Grasp.FRONT).perform()
 
 
-async def asked(known: PickUpExperience | None = None) -> Location | None:
+async def asked(experience: PickUpExperience | None = None) -> Location | None:
     with BulletWorld():
         milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9]))
-        return await DatabaseCostmapLocation(milk, experience=known).resolve()
+        return await DatabaseCostmapLocation(milk, experience=experience).resolve()
 
 
-def place_of(found: Location | None) -> tuple[float, float]:
-    assert found is not None
-    return found.pose.position.x, found.pose.position.y
+def place_of(location: Location | None) -> tuple[float, float]:
+    assert location is not None
+    return location.pose.position.x, location.pose.position.y
 
 
-async def test_experience_is_there_after_a_flush_also_in_the_same_episode(tmp_path: Path) -> None:
+async def test_experience_is_visible_after_a_flush_even_in_the_same_episode(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory, memory.episode(description="trying"):
         assert await asked() is None
         await pick_up()
@@ -50,7 +50,7 @@ async def test_experience_is_there_after_a_flush_also_in_the_same_episode(tmp_pa
         assert place_of(await asked()) == pytest.approx((0.6, 0.9))
 
 
-async def test_experience_outlives_the_process_that_made_it(tmp_path: Path) -> None:
+async def test_experience_outlives_the_process_that_recorded_it(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
         await pick_up()
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
@@ -59,7 +59,9 @@ async def test_experience_outlives_the_process_that_made_it(tmp_path: Path) -> N
         assert place_of(await asked(PickUpExperience(reading))) == pytest.approx((0.6, 0.9))
 
 
-async def test_of_two_memories_the_one_opened_last_is_asked_or_the_one_whose_episode_is_open(tmp_path: Path) -> None:
+async def test_of_two_memories_the_one_with_an_open_episode_is_queried_or_else_the_one_opened_last(
+    tmp_path: Path,
+) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/old.db") as old:
         await pick_up()
         await old.flush()
@@ -72,7 +74,7 @@ async def test_of_two_memories_the_one_opened_last_is_asked_or_the_one_whose_epi
     assert experience.get() is None
 
 
-async def test_a_memory_that_is_closed_is_no_longer_asked(tmp_path: Path) -> None:
+async def test_a_closed_memory_is_no_longer_queried(tmp_path: Path) -> None:
     closed = asyncio.Event()
 
     async def later() -> Location | None:
@@ -89,7 +91,7 @@ async def test_a_memory_that_is_closed_is_no_longer_asked(tmp_path: Path) -> Non
         await asked()
 
 
-async def test_the_better_way_comes_first(tmp_path: Path) -> None:
+async def test_the_location_with_the_better_success_rate_comes_first(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         async with memory.episode(description="trying"):
             await pick_up(Pose([0.65, 1.0, 0]))

@@ -1,4 +1,4 @@
-"""A memory whose episodes come near their last sequence: asked, rebuilt, verified and copied."""
+"""A memory whose episodes were continued in follow-ups: queried, rebuilt, verified and copied."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class PatrolActionPerformable(ActionAbstract):
 
 
 async def recorded(url: str, spool: Path) -> list[str]:
-    """A patrol of a thousand notes in a world with one object; the ids of its episodes."""
+    """Record a patrol of a thousand notes in a world with one object; return the ids of its episodes."""
     async with Memory.open(url, spool=spool, settings=SMALL) as memory:
         async with memory.episode(description="patrol", seed=7):
             with BulletWorld():
@@ -53,7 +53,7 @@ async def recorded(url: str, spool: Path) -> list[str]:
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_every_perform_is_there_once_with_its_outcome_and_the_parts_name_each_other(
+async def test_every_perform_is_stored_once_with_its_outcome_and_the_parts_name_each_other(
     database_url: str, tmp_path: Path
 ) -> None:
     first, second, third = await recorded(database_url, tmp_path / "spool")

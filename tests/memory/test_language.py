@@ -1,4 +1,4 @@
-"""Plans of the language as a memory holds them: expressions with their fields, outcomes, failures, interruptions."""
+"""Plans of the language in a memory: expressions with their fields, outcomes, failures and interruptions."""
 
 from __future__ import annotations
 
@@ -60,19 +60,19 @@ async def every(memory: Memory | Reading, question: Any) -> list[Any]:
 
 
 def named(nodes: list[TaskTreeNode]) -> list[tuple[str | None, str | None, str]]:
-    """Of each node its type, that of its parent, and its status."""
+    """Return for each node its type, its parent's type, and its status."""
     types = {node.id: node.dtype for node in nodes}
     return [(node.dtype, types.get(node.parent_id or 0), node.status.name) for node in nodes if node.dtype is not None]
 
 
-async def test_expressions_are_nodes_with_their_fields_above_what_they_performed(tmp_path: Path) -> None:
+async def test_expressions_are_nodes_with_their_fields_and_are_parents_of_what_they_performed(tmp_path: Path) -> None:
     def never() -> bool:
         return False
 
     plan = (note("a") + Calling(len, obj=[]) - note("b")) + (note("c") * 2 >> Watching(never, interval_s=0.5))
     async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode(description="plan"):
-            with pytest.raises(TypeError):  # len takes no keywords: a bug, and no outcome
+            with pytest.raises(TypeError):  # len takes no keywords: a bug in the plan, and no outcome
                 await plan.perform()
             await (note("d") + Calling(dict, a=1, b="two") + note("c") * 2).perform()
             await (note("e") >> Watching(never, interval_s=0.5)).perform()
@@ -110,7 +110,7 @@ async def test_expressions_are_nodes_with_their_fields_above_what_they_performed
         assert results["Code"] == {"a": 1, "b": "two"}
 
 
-async def test_actions_and_motions_stay_free_of_expressions(tmp_path: Path) -> None:
+async def test_the_classes_of_actions_and_motions_return_no_expressions(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode(description="plan"):
             with BulletWorld(), simulated_robot:
@@ -148,7 +148,7 @@ async def test_several_failures_are_kept_with_class_message_and_arguments(tmp_pa
         assert episode.status == "FAILED"
 
 
-async def test_a_retry_keeps_its_tries(tmp_path: Path) -> None:
+async def test_a_retry_keeps_its_attempts(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         with pytest.raises(ObjectLost):
             await Trying(Lost("milk"), max_tries=4).perform()
@@ -161,7 +161,7 @@ async def test_a_retry_keeps_its_tries(tmp_path: Path) -> None:
         ] * 4
 
 
-async def test_an_interruption_is_remembered_as_one(tmp_path: Path) -> None:
+async def test_an_interruption_is_recorded_as_one(tmp_path: Path) -> None:
     begun = asyncio.Event()
 
     async def waits() -> None:
@@ -189,7 +189,7 @@ async def test_an_interruption_is_remembered_as_one(tmp_path: Path) -> None:
         assert episode.status == "SUCCEEDED"
 
 
-async def test_a_memory_that_is_only_read_knows_the_expressions(tmp_path: Path) -> None:
+async def test_a_memory_opened_for_reading_has_the_expressions(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         await (note("a") * 3).perform()
         await memory.flush()

@@ -1,4 +1,4 @@
-"""A memory as its user meets it: opened, recorded into, asked, closed."""
+"""The life of a memory: opened, recorded into, queried, and closed."""
 
 import asyncio
 import os
@@ -20,7 +20,7 @@ from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 
 @pytest.mark.slow
-async def test_a_private_memory_answers_and_leaves_nothing_behind() -> None:
+async def test_a_temporary_memory_answers_queries_and_leaves_no_files() -> None:
     place = Path("/dev/shm")
     before = {path.name for path in place.glob("pycrorm-*/")}
     async with Memory.open("sqlite://") as memory:
@@ -32,7 +32,7 @@ async def test_a_private_memory_answers_and_leaves_nothing_behind() -> None:
 
 
 @pytest.mark.slow
-async def test_what_is_flushed_is_in_the_tables_and_in_the_database_file(tmp_path: Path) -> None:
+async def test_flushed_records_are_in_the_tables_and_in_the_database_file(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode(description="e"):
             await NoteActionPerformable("a").perform()
@@ -50,7 +50,7 @@ async def test_what_is_flushed_is_in_the_tables_and_in_the_database_file(tmp_pat
         assert await texts(reading) == ["a", "b"]
 
 
-async def test_an_exception_of_the_plan_leaves_the_memory_unchanged_and_is_recorded(tmp_path: Path) -> None:
+async def test_an_exception_leaves_the_plan_unchanged_and_is_recorded(tmp_path: Path) -> None:
     with pytest.raises(PlanFailure, match="spilled"):
         async with Memory.open(url_of(tmp_path)) as memory, memory.episode(description="e"):
             await NoteActionPerformable("a").perform()
@@ -65,7 +65,7 @@ async def test_an_exception_of_the_plan_leaves_the_memory_unchanged_and_is_recor
 
 
 @pytest.mark.slow
-async def test_a_cancelled_node_says_so(tmp_path: Path) -> None:
+async def test_a_cancelled_node_has_the_status_cancelled(tmp_path: Path) -> None:
     @dataclass
     class WaitActionPerformable(ActionAbstract):
         async def perform(self) -> None:
@@ -87,7 +87,7 @@ async def test_a_cancelled_node_says_so(tmp_path: Path) -> None:
             assert node.reason == "CancelledError"
 
 
-async def test_importing_the_package_loads_nothing_else() -> None:
+async def test_importing_the_package_loads_no_optional_library() -> None:
     script = (
         "import sys, pycrorm_async; print([name for name in sys.modules if 'sqlalchemy' in name or 'bullet' in name])"
     )

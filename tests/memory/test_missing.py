@@ -1,4 +1,4 @@
-"""What cannot be recorded is missing in the tables as well, and what can be is there; nothing of it stops a plan."""
+"""A value that cannot be recorded is missing in the tables, all others are there, and no plan stops."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from pycrorm_async.plan import ActionAbstract
 from tests.memory.note_actions import NoteActionPerformable
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 
 @dataclass
 class SurveyActionPerformable(ActionAbstract):
-    """One field that can be recorded among those that cannot."""
+    """A designator with one recordable field among others that are not."""
 
     text: str
     weight: float
@@ -35,12 +35,12 @@ class SurveyActionPerformable(ActionAbstract):
 
 
 class HailActionPerformable(ActionAbstract):
-    """No dataclass: its arguments are its parameters."""
+    """A designator that is no dataclass: its fields are the parameters of its constructor."""
 
     def __init__(self, text: str, *names: str, loud: bool = False, tone=None) -> None:  # type: ignore[no-untyped-def]
         self.greeting = f"{text} {' '.join(names)}"
         self.tone = tone
-        self.loud = not loud  # what was given is recorded, and not what was made of it
+        self.loud = not loud  # the argument is recorded, and not the attribute made of it
 
     async def perform(self) -> str:
         return self.greeting
@@ -54,7 +54,7 @@ class BellowActionPerformable(HailActionPerformable):
 
 @dataclass
 class PoseActionPerformable(ActionAbstract):
-    """Its table would be one of the memory's own."""
+    """A designator whose table would have the name of one of the memory's own."""
 
     dtype = "Pose"
     text: str
@@ -63,7 +63,9 @@ class PoseActionPerformable(ActionAbstract):
         await NoteActionPerformable(self.text).perform()
 
 
-async def test_what_cannot_be_recorded_is_null_and_all_else_is_in_the_tables(database_url: str, tmp_path: Path) -> None:
+async def test_an_unrecordable_value_is_null_and_all_others_are_in_the_tables(
+    database_url: str, tmp_path: Path
+) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         async with memory.episode(description="d" * 20_000):
             photo = b"\xff" * 2**21
@@ -89,7 +91,7 @@ async def test_what_cannot_be_recorded_is_null_and_all_else_is_in_the_tables(dat
     assert nodes[-1].parent.id == nodes[-2].id
 
 
-async def test_a_designator_that_is_no_dataclass_is_recorded_with_the_arguments_it_was_built_from(
+async def test_a_designator_that_is_no_dataclass_is_recorded_with_its_constructor_arguments(
     database_url: str, tmp_path: Path
 ) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:

@@ -1,4 +1,6 @@
-"""Objects that a plan only speaks of, believed, part of another or told relative to one, are remembered as such."""
+"""Objects that a plan believes in, that are parts of others, or that are located relative to others, are recorded
+so.
+"""
 
 from __future__ import annotations
 
@@ -46,11 +48,11 @@ class RememberActionPerformable(ActionAbstract):
     thing: ObjectDesignator
 
     async def perform(self) -> None:
-        """That is all."""
+        """Succeed without doing anything."""
 
 
 def about_objects() -> Iterator[Designator]:
-    """One of each built-in action that is about an object: about the believed cup."""
+    """Return one of each built-in action with an object: all about the believed cup."""
     waiting: list[Any] = [ActionAbstract]
     while waiting:
         kind: Any = waiting.pop()
@@ -65,13 +67,13 @@ def about_objects() -> Iterator[Designator]:
 
 
 def place(row: ObjectRow | None) -> tuple[str, float, float, float]:
-    """Name and position of an object as it was."""
+    """Name and position of an object at that time."""
     assert row is not None
     assert row.pose is not None
     return row.name, row.pose.x, row.pose.y, row.pose.z
 
 
-async def test_a_believed_object_can_be_named_by_every_action_and_is_remembered(tmp_path: Path) -> None:
+async def test_a_believed_object_can_be_an_argument_of_every_action_and_is_recorded(tmp_path: Path) -> None:
     with BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)
         async with Memory.open(url_of(tmp_path)) as memory:
@@ -95,7 +97,7 @@ async def test_a_believed_object_can_be_named_by_every_action_and_is_remembered(
         assert status[action.dtype] in (TaskStatus.FAILED, TaskStatus.SUCCEEDED), action
 
 
-async def test_a_located_object_is_remembered_with_its_reference_as_it_was(tmp_path: Path) -> None:
+async def test_a_located_object_is_recorded_with_its_reference_at_that_time(tmp_path: Path) -> None:
     noon = datetime(2024, 7, 30, 12, 0, 0, 123456, UTC)
     with BulletWorld():
         milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9]))
@@ -112,17 +114,17 @@ async def test_a_located_object_is_remembered_with_its_reference_as_it_was(tmp_p
                 await RememberActionPerformable(shelf).perform()
             await memory.flush()
             async with memory.session() as session:
-                told = (await session.scalars(select(LocatedObjectRow).order_by(LocatedObjectRow.id))).all()
+                located = (await session.scalars(select(LocatedObjectRow).order_by(LocatedObjectRow.id))).all()
                 (part,) = (await session.scalars(select(ObjectPartRow))).all()
                 milks = (await session.scalars(select(ObjectRow).where(ObjectRow.name == "milk"))).all()
-    assert [(each.dtype, each.obj_type) for each in told] == [
+    assert [(each.dtype, each.obj_type) for each in located] == [
         ("LocatedObject", ObjectType.JEROEN_CUP),
         ("LocatedObject", ObjectType.GENERIC_OBJECT),
     ]
-    assert place(told[0])[1:] == pytest.approx((0.8, 0, 0.6))
-    assert told[0].pose is not None
-    assert told[0].pose.time == noon
-    assert place(told[0].reference) == ("milk", 1.0, 0.0, 0.5)
-    assert place(told[1].reference) == place(part.part_of) == ("kitchen", 0.0, 0.0, 0.0)
+    assert place(located[0])[1:] == pytest.approx((0.8, 0, 0.6))
+    assert located[0].pose is not None
+    assert located[0].pose.time == noon
+    assert place(located[0].reference) == ("milk", 1.0, 0.0, 0.5)
+    assert place(located[1].reference) == place(part.part_of) == ("kitchen", 0.0, 0.0, 0.0)
     assert part.name == "fridge_shelf_surface"
     assert [place(each)[1:3] for each in milks] == [(1.0, 0.0), (5.0, 5.0)]

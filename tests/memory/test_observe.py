@@ -1,4 +1,4 @@
-"""A program in the same process receives every event as it is recorded, and never makes the plan wait."""
+"""A program in the same process receives every event as it is recorded, and never delays the plan."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def url(tmp_path: Path) -> str:
     return f"sqlite:///{tmp_path}/memory.db"
 
 
-async def test_every_event_arrives_once_in_order_also_the_end_of_a_failed_node(url: str) -> None:
+async def test_every_event_arrives_once_in_order_including_the_end_of_a_failed_node(url: str) -> None:
     seen: list[RecordedEvent] = []
     async with Memory.open(url) as memory:
         with memory.observe(seen.append):
@@ -68,7 +68,7 @@ async def test_every_event_arrives_once_in_order_also_the_end_of_a_failed_node(u
     ]
 
 
-async def test_a_callback_that_blocks_costs_the_plan_nothing_and_what_it_missed_is_counted(url: str) -> None:
+async def test_a_callback_that_blocks_does_not_delay_the_plan_and_missed_events_are_counted(url: str) -> None:
     seen: list[RecordedEvent] = []
     may_go = threading.Event()
 
@@ -80,8 +80,8 @@ async def test_a_callback_that_blocks_costs_the_plan_nothing_and_what_it_missed_
         observation = memory.observe(block, buffer=5)
         for _ in range(20):
             await SayActionPerformable("hello").perform()
-        recorded = 20 * 6  # each an episode of its own: start, root, node, and their ends
-        assert observation.left_out >= recorded - 6  # five in the buffer, one in the hands of the callback
+        recorded = 20 * 6  # each in an episode of its own: start, root, node, and their ends
+        assert observation.left_out >= recorded - 6  # five in the buffer, one in the callback
         may_go.set()
         observation.close()
         observation.join()
@@ -123,7 +123,7 @@ async def test_a_stream_ends_with_the_memory_after_its_last_event(url: str) -> N
     assert [each.sequence for each in seen] == [1, 2, 3, 4, 5, 6]
 
 
-async def test_events_of_threads_arrive_each_once_and_each_observer_gets_all(url: str) -> None:
+async def test_each_observer_gets_each_event_of_all_threads_once(url: str) -> None:
     one: list[RecordedEvent] = []
     other: list[RecordedEvent] = []
     async with Memory.open(url) as memory:
@@ -141,7 +141,7 @@ async def many() -> None:
         await SayActionPerformable("hello").perform()
 
 
-async def test_a_stream_whose_loop_is_closed_costs_the_plan_nothing(url: str) -> None:
+async def test_a_stream_whose_loop_is_closed_does_not_delay_the_plan(url: str) -> None:
     async with Memory.open(url) as memory:
 
         def abandon() -> None:

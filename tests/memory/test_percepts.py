@@ -1,4 +1,4 @@
-"""What a robot's own perception reports is in the tables as it reported it, objects of the world or not."""
+"""Detections of a robot's own perception are in the tables as reported, with or without an object of the world."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CUP_AT = Pose([1.2, 0.4, 0.9], [0, 0, 1, 0])
 
 
 class Perceiving(SimulatedModules):
-    """A robot whose perception reports what the test wants."""
+    """A robot whose perception reports percepts that the test chooses."""
 
     def __init__(self, seen: Sequence[Seen]) -> None:
         super().__init__(Limits.SOFT)
@@ -43,12 +43,12 @@ class Perceiving(SimulatedModules):
 
 
 def guessed(name: str, at: Pose = CUP_AT, **percept: Any) -> Seen:
-    """A percept that matches no object of the world."""
+    """Return a percept that matches no object of the world."""
     return Seen(BelieveObject(name, ObjectType.JEROEN_CUP, at), **percept)
 
 
 async def perceive(*seen: Seen) -> ObjectDesignator:
-    """What the plan is given of these percepts."""
+    """Return the plan's results for these percepts."""
     with ChosenRobot("own", Perceiving(seen)):
         return await DetectingMotion(ObjectType.JEROEN_CUP).perform()
 
@@ -57,7 +57,7 @@ async def rows(memory: Memory, *, simulated: bool = False) -> list[tuple[Any, ..
     await memory.flush()
     assert memory.status.faults.total == 0, memory.status.faults.last
     async with memory.session(simulated=simulated) as session:
-        found = (await session.scalars(select(Detection).order_by(Detection.id, Detection.position))).all()
+        detections = (await session.scalars(select(Detection).order_by(Detection.id, Detection.position))).all()
         return [
             (
                 each.position,
@@ -69,7 +69,7 @@ async def rows(memory: Memory, *, simulated: bool = False) -> list[tuple[Any, ..
                 each.confidence,
                 each.source,
             )
-            for each in found
+            for each in detections
         ]
 
 
@@ -111,7 +111,7 @@ async def test_a_percept_keeps_its_pose_confidence_and_source_and_needs_no_objec
     assert differences(live, tables_of(copied)) == []
 
 
-async def test_a_confidence_of_numpy_and_names_no_database_takes_are_recorded(tmp_path: Path) -> None:
+async def test_a_confidence_of_numpy_and_names_that_no_database_accepts_are_recorded(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         async with memory.episode(description="perceived"):
             await perceive(guessed("a\0b", confidence=np.float32(0.25), source="s\0\ud800"))
@@ -120,27 +120,27 @@ async def test_a_confidence_of_numpy_and_names_no_database_takes_are_recorded(tm
         assert source == "s\\x00\\ud800"
 
 
-async def test_numbers_that_are_not_finite_cost_no_other_percept(tmp_path: Path) -> None:
+async def test_numbers_that_are_not_finite_affect_no_other_percept(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         async with memory.episode(description="perceived"):
             await perceive(
                 guessed("a", confidence=math.nan), guessed("b", visible=math.inf), guessed("c", confidence=0.5)
             )
-        found = await rows(memory)
-        assert [(each[1], each[5], each[6]) for each in found] == [
+        detections = await rows(memory)
+        assert [(each[1], each[5], each[6]) for each in detections] == [
             ("a", None, None), ("b", None, None), ("c", None, 0.5),
         ]  # fmt: skip
         assert memory.status.missing.total == 1
 
 
-async def test_too_many_percepts_for_an_event_lose_the_last(tmp_path: Path) -> None:
+async def test_too_many_percepts_for_an_event_lose_the_last_ones(tmp_path: Path) -> None:
     settings = Settings(record_bytes_max=4096)
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=settings) as memory:
         async with memory.episode(description="perceived"):
             await perceive(*(guessed(f"cup {n}", confidence=1 / (n + 1), source="stereo") for n in range(64)))
-        found = await rows(memory)
-        assert [each[1] for each in found] == [f"cup {n}" for n in range(16)]
-        assert [each[6] for each in found] == [1 / (n + 1) for n in range(16)]
+        detections = await rows(memory)
+        assert [each[1] for each in detections] == [f"cup {n}" for n in range(16)]
+        assert [each[6] for each in detections] == [1 / (n + 1) for n in range(16)]
 
 
 async def test_a_percept_of_a_simulation_refers_to_the_object_of_the_simulation(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ async def test_a_percept_of_a_simulation_refers_to_the_object_of_the_simulation(
         ]  # fmt: skip
 
 
-async def test_a_percept_of_another_kind_is_refused_in_the_plan_and_counted(tmp_path: Path) -> None:
+async def test_a_percept_of_another_class_is_refused_in_the_plan_and_counted(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         async with memory.episode(description="perceived"):
             with pytest.raises(Exception, match="expected an object or its designator, got 'cup'"):

@@ -1,4 +1,4 @@
-"""What a memory refuses, and how it says so; nothing recorded is lost by it."""
+"""Refusals by a memory and their messages; no recorded event is lost by one."""
 
 import asyncio
 import sqlite3
@@ -31,7 +31,7 @@ from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 pytestmark = pytest.mark.slow
 
 
-async def test_a_memory_that_is_not_open_says_how_to_open_it(tmp_path: Path) -> None:
+async def test_a_memory_that_is_not_open_names_the_call_that_opens_it(tmp_path: Path) -> None:
     memory = Memory.open(url_of(tmp_path))
     with pytest.raises(CallerError, match=r"async with Memory\.open"):
         await memory.flush()
@@ -61,7 +61,7 @@ async def test_bad_addresses_are_refused_with_their_class(tmp_path: Path) -> Non
     assert recorder.get() is None
 
 
-async def test_a_spool_belongs_to_one_database_while_anything_is_in_it(tmp_path: Path) -> None:
+async def test_a_spool_belongs_to_one_database_while_it_holds_a_recorder(tmp_path: Path) -> None:
     spool = tmp_path / "spool"
     async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=spool):
         await NoteActionPerformable("a").perform()
@@ -71,14 +71,14 @@ async def test_a_spool_belongs_to_one_database_while_anything_is_in_it(tmp_path:
         with pytest.raises(SpoolForeign, match="pycrorm spool rebind"):
             async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=spool):
                 pass
-        with pytest.raises(DatabaseUnavailable, match="the spool belongs to log"):  # nothing is made in its place
+        with pytest.raises(DatabaseUnavailable, match="the spool belongs to log"):  # no other file is made
             async with Memory.open(f"sqlite:///{tmp_path}/3.db", spool=spool):
                 pass
         assert not (tmp_path / "3.db").exists()
         assert await texts(memory) == ["b"]
 
 
-async def test_a_flush_that_cannot_reach_the_database_gives_up_and_loses_nothing(tmp_path: Path) -> None:
+async def test_a_flush_that_cannot_reach_the_database_raises_and_loses_nothing(tmp_path: Path) -> None:
     settings = Settings(flush_timeout_s=0.3)
     async with Memory.open(url_of(tmp_path), settings=settings) as memory:
         await NoteActionPerformable("before").perform()
@@ -95,7 +95,7 @@ async def test_a_flush_that_cannot_reach_the_database_gives_up_and_loses_nothing
 
 
 async def flushed(memory: Memory) -> None:
-    """However often its short time is over on a busy machine."""
+    """Flush, and repeat it when its short timeout expires on a busy machine."""
     async with asyncio.timeout(60):
         while True:
             with suppress(FlushTimeout):
@@ -112,7 +112,7 @@ async def test_a_type_that_contradicts_the_tables_parks_its_episode_with_both_ty
             text: int
 
             async def perform(self) -> None:
-                """Noted."""
+                """Succeed without doing anything."""
 
         return NoteActionPerformable
 
@@ -120,7 +120,7 @@ async def test_a_type_that_contradicts_the_tables_parks_its_episode_with_both_ty
         async with Memory.open(url_of(tmp_path)) as memory:
             await other()(7).perform()  # type: ignore[call-arg]
             await memory.flush()
-    async with Memory.open(url_of(tmp_path)) as memory:  # an episode that stopped earlier stops nobody
+    async with Memory.open(url_of(tmp_path)) as memory:  # an episode that stopped earlier stops no other process
         await NoteActionPerformable("later").perform()
         await memory.flush()
         assert await texts(memory) == ["text", "later"]
@@ -137,7 +137,7 @@ async def test_a_type_that_contradicts_the_tables_parks_its_episode_with_both_ty
         ({"plan": "x" * 3_000_000}, "plan"),
     ],
 )
-async def test_what_an_episode_cannot_be_opened_with_is_refused_by_name(
+async def test_an_impossible_argument_of_an_episode_is_refused_by_name(
     tmp_path: Path, arguments: dict[str, Any], named: str
 ) -> None:
     async with Memory.open(url_of(tmp_path), settings=Settings(on_unrecordable="refuse")) as memory:
@@ -153,12 +153,12 @@ async def test_what_an_episode_cannot_be_opened_with_is_refused_by_name(
 @pytest.mark.parametrize(
     "arguments", [{"on_full": "waait"}, {"on_unrecordable": ""}, {"batch_events_max": 0}, {"flush_timeout_s": -1.0}]
 )
-def test_a_setting_that_cannot_work_is_refused_by_name(arguments: dict[str, Any]) -> None:
+def test_an_impossible_setting_is_refused_by_name(arguments: dict[str, Any]) -> None:
     with pytest.raises(CallerError, match=rf"Settings\.{next(iter(arguments))} is "):
         Settings(**arguments)
 
 
-async def test_nothing_of_a_memory_that_is_not_open_is_an_attribute_error(tmp_path: Path) -> None:
+async def test_an_attribute_of_a_memory_that_is_not_open_raises_attribute_error(tmp_path: Path) -> None:
     memory = Memory.open(url_of(tmp_path))
     for use in (
         lambda: memory.status,
@@ -171,14 +171,14 @@ async def test_nothing_of_a_memory_that_is_not_open_is_an_attribute_error(tmp_pa
             use()
 
 
-async def test_a_parked_episode_is_told_once(tmp_path: Path) -> None:
+async def test_a_parked_episode_is_reported_once(tmp_path: Path) -> None:
     def other() -> Any:
         @dataclass
         class NoteActionPerformable(ActionAbstract):
             text: int
 
             async def perform(self) -> None:
-                """Noted."""
+                """Succeed without doing anything."""
 
         return NoteActionPerformable
 
@@ -192,7 +192,7 @@ async def test_a_parked_episode_is_told_once(tmp_path: Path) -> None:
         assert memory.status.faults.total == 0
 
 
-async def test_a_table_of_the_users_own_in_the_way_is_named_and_parks_that_type_until_it_is_renamed(
+async def test_a_foreign_table_with_a_used_name_is_named_and_parks_that_type_until_it_is_renamed(
     tmp_path: Path,
 ) -> None:
     in_the_way = r"note_action already exists: rename your table or view, then open the memory again"
@@ -243,14 +243,14 @@ async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tm
         assert await texts(memory) == ["fine"]
 
 
-async def test_a_spool_that_nobody_will_empty_fails_a_start_instead_of_making_it_wait_for_ever(tmp_path: Path) -> None:
+async def test_a_full_spool_without_a_drainer_fails_a_start_instead_of_blocking_for_ever(tmp_path: Path) -> None:
     settings = Settings(
         segment_bytes=2**18, record_bytes_max=2**12, spool_bytes_max=2**20 + 2**18, spool_reserve_bytes=2**18
     )
     reached = 0
     async with Memory.open(url_of(tmp_path), settings=settings) as memory:
         other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
-        other.execute("BEGIN IMMEDIATE")  # nothing can be stored, so nothing is freed
+        other.execute("BEGIN IMMEDIATE")  # nothing can be stored, so that no space is freed
         with pytest.raises(SpoolStuck, match="the writer has stopped"):
             async with memory.episode(description="e"):
                 memory._open_parts.queue.fail("the writer has stopped")

@@ -1,4 +1,4 @@
-"""A database that goes back is given again what it had confirmed: events, declarations, numbers and row ids."""
+"""A restored database receives again what it had confirmed: events, declarations, numbers and row ids."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ ROWS = "SELECT id, dtype FROM task_tree_node ORDER BY id"
 
 @dataclass
 class LateActionPerformable(ActionAbstract):
-    """Declared after the backup."""
+    """A designator that is declared after the backup."""
 
     number: int
 
     async def perform(self) -> None:
-        """Done."""
+        """Succeed without doing anything."""
 
 
 @pytest.fixture
@@ -81,11 +81,11 @@ def everything(url: str) -> list[list[Any]]:
 async def is_clean(url: str) -> bool:
     log = await EventLog.open(DatabaseAddress.parse(url), create=False)
     try:
-        found = await verify(log)
+        result = await verify(log)
         stopped = await log.stopped()
     finally:
         await log.close()
-    return (found.damage, found.drift, found.behind, stopped) == (0, 0, 0, [])
+    return (result.damage, result.drift, result.behind, stopped) == (0, 0, 0, [])
 
 
 async def incarnations(url: str) -> list[str]:
@@ -96,7 +96,7 @@ async def incarnations(url: str) -> list[str]:
         await log.close()
 
 
-async def test_a_plan_that_goes_on_brings_back_all_that_was_flushed(
+async def test_a_plan_that_continues_stores_again_all_that_was_flushed(
     database_url: str, spool: Path, take_backup: TakeBackup
 ) -> None:
     async with memory_at(database_url, spool) as memory:
@@ -111,11 +111,11 @@ async def test_a_plan_that_goes_on_brings_back_all_that_was_flushed(
             stored = everything(database_url)
             backup.restore()
             assert everything(database_url) != stored
-            await memory.flush()  # nothing new: it is asked whether all is still there
+            await memory.flush()  # without a new event the writer checks that confirmed events are still stored
             assert everything(database_url) == stored
 
             backup.restore()
-            await LateActionPerformable(2).perform()  # a gap in the episode, and a type that is not declared any more
+            await LateActionPerformable(2).perform()  # a gap in the episode, and a type that is no longer declared
             await memory.flush()
         after = everything(database_url)
         assert after[1][: len(stored[1])] == stored[1]
@@ -147,7 +147,7 @@ async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
     assert [row for row in after[2] if row in stored[2]] == stored[2]
     numbers = [number for _, number, *_ in after[0]]
     assert numbers[:3] == [1, 2, 3]
-    reserve = 4_096 if database_url.startswith("postgresql") else 0  # for what other spools had stored there
+    reserve = 4_096 if database_url.startswith("postgresql") else 0  # for episodes that other spools had stored there
     assert numbers[3] > 3 + reserve
     assert await is_clean(database_url)
     [reason] = await incarnations(database_url)
@@ -181,7 +181,7 @@ async def test_a_lost_episode_of_a_dead_recorder_ends_lost_again(
     assert await is_clean(database_url)
 
 
-async def test_a_daemon_that_nobody_gives_anything_heals_what_dead_recorders_had_stored(
+async def test_an_idle_daemon_stores_again_what_dead_recorders_had_stored(
     database_url: str, spool: Path, take_backup: TakeBackup
 ) -> None:
     daemon = Daemon(database_url, spool)
@@ -189,7 +189,7 @@ async def test_a_daemon_that_nobody_gives_anything_heals_what_dead_recorders_had
     async with memory_at(database_url, spool, settings) as memory:
         await note(memory, "one")
         await memory.flush()
-    await daemon.leaves()
+    await daemon.stop()
     backup = take_backup()
     daemon = Daemon(database_url, spool)
     async with memory_at(database_url, spool, settings) as memory:
@@ -203,7 +203,7 @@ async def test_a_daemon_that_nobody_gives_anything_heals_what_dead_recorders_had
         assert await texts(memory) == ["one", "two", "three"]
     after = everything(database_url)
     assert [row for row in after[0] if row in stored[0]] == stored[0]
-    await daemon.leaves()
+    await daemon.stop()
     stored = everything(database_url)
     backup.restore()
     daemon = Daemon(database_url, spool)
@@ -211,11 +211,11 @@ async def test_a_daemon_that_nobody_gives_anything_heals_what_dead_recorders_had
         while everything(database_url) != stored:  # noqa: ASYNC110
             await asyncio.sleep(0.02)
         await memory.flush()
-    await daemon.leaves()
+    await daemon.stop()
     assert await is_clean(database_url)
 
 
-async def test_what_is_not_kept_any_more_is_refused_with_its_gap_and_not_looked_for_again(
+async def test_records_that_are_no_longer_kept_are_refused_with_their_gap_and_not_searched_again(
     database_url: str,
     spool: Path,
     take_backup: TakeBackup,

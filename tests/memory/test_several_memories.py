@@ -1,4 +1,4 @@
-"""A memory beside others: other memories, tasks, processes, and plans that nobody holds any more."""
+"""A memory beside others: other memories, tasks and processes, and abandoned plans."""
 
 import asyncio
 import contextvars
@@ -23,7 +23,7 @@ from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 pytestmark = pytest.mark.slow
 
 
-async def test_a_memory_goes_on_where_an_earlier_one_ended(tmp_path: Path) -> None:
+async def test_a_memory_continues_after_an_earlier_one_ended(tmp_path: Path) -> None:
     for text in ("one", "two", "three"):
         async with Memory.open(url_of(tmp_path)):
             await NoteActionPerformable(text).perform()
@@ -42,7 +42,7 @@ async def test_recording_ends_with_the_memory(tmp_path: Path) -> None:
         assert await texts(reading) == ["inside"]
 
 
-async def test_what_is_performed_goes_to_the_memory_whose_episode_is_open(tmp_path: Path) -> None:
+async def test_a_perform_is_recorded_by_the_memory_whose_episode_is_open(tmp_path: Path) -> None:
     first, second = f"sqlite:///{tmp_path}/1.db", f"sqlite:///{tmp_path}/2.db"
     async with Memory.open(first) as one, Memory.open(second) as two:
         await NoteActionPerformable("to the last opened").perform()
@@ -67,7 +67,7 @@ async def test_a_memory_closed_inside_an_episode_ends_it_as_interrupted(tmp_path
         assert [each.status for each in await reading.episodes()] == ["INTERRUPTED"]
 
 
-async def test_the_next_memory_adopts_what_a_killed_process_left(tmp_path: Path) -> None:
+async def test_the_next_memory_adopts_the_folder_of_a_killed_process(tmp_path: Path) -> None:
     script = (
         "import asyncio, os, signal, sys\n"
         "from tests.memory.note_actions import Memory, NoteActionPerformable\n"
@@ -86,11 +86,11 @@ async def test_the_next_memory_adopts_what_a_killed_process_left(tmp_path: Path)
         await NoteActionPerformable("after").perform()
         for _ in range(200):
             await memory.flush()
-            found = await texts(memory)
-            if len(found) == 51:
+            result = await texts(memory)
+            if len(result) == 51:
                 break
             await asyncio.sleep(0.05)
-        assert sorted(found) == sorted([*map(str, range(50)), "after"])
+        assert sorted(result) == sorted([*map(str, range(50)), "after"])
         lost = [each for each in await memory.reading.episodes() if each.description == "killed"]
         assert [each.status for each in lost] == ["LOST"]
     assert [path for path in (tmp_path / "memory.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
@@ -106,9 +106,9 @@ async def test_concurrent_episodes_in_tasks_of_their_own_are_all_whole(tmp_path:
     async with Memory.open(url_of(tmp_path)) as memory:
         await asyncio.gather(*(run(name) for name in "abcde"))
         await memory.flush()
-        found = await memory.reading.episodes()
-        assert sorted(each.description for each in found) == list("abcde")
-        for each in found:
+        result = await memory.reading.episodes()
+        assert sorted(each.description for each in result) == list("abcde")
+        for each in result:
             nodes = await memory.reading.tree(each.number)
             assert [node.parameters.get("text") for node in nodes] == [None] + [
                 f"{each.description}{index}" for index in range(20)
@@ -132,7 +132,7 @@ async def test_a_memory_opened_inside_an_episode_of_another_leaves_that_episode_
         assert await texts(one) == ["1", "3"]
 
 
-async def test_a_forked_child_leaves_the_memory_of_its_parent_alone(tmp_path: Path) -> None:
+async def test_a_forked_child_does_not_affect_the_memory_of_its_parent(tmp_path: Path) -> None:
     script = (
         "import asyncio, os, sys\n"
         "from tests.memory.note_actions import Memory, NoteActionPerformable\n"
@@ -142,7 +142,7 @@ async def test_a_forked_child_leaves_the_memory_of_its_parent_alone(tmp_path: Pa
         "        child = os.fork()\n"
         "        if child == 0:\n"
         "            await NoteActionPerformable('in the child').perform()\n"
-        "            os._exit(7)\n"  # the way every worker of multiprocessing leaves
+        "            os._exit(7)\n"  # the exit of every worker of multiprocessing
         "        _, status = os.waitpid(child, 0)\n"
         "        assert os.waitstatus_to_exitcode(status) == 7\n"
         "        await NoteActionPerformable('after').perform()\n"
@@ -163,7 +163,7 @@ async def test_a_forked_child_leaves_the_memory_of_its_parent_alone(tmp_path: Pa
         assert [each.status for each in await reading.episodes()] == ["SUCCEEDED"]
 
 
-async def test_what_outlives_the_memory_runs_on_and_is_not_recorded(tmp_path: Path) -> None:
+async def test_a_plan_that_outlives_the_memory_continues_and_is_not_recorded(tmp_path: Path) -> None:
     leave = asyncio.Event()
 
     async def late() -> str:
@@ -182,7 +182,7 @@ async def test_what_outlives_the_memory_runs_on_and_is_not_recorded(tmp_path: Pa
         assert await texts(reading) == ["early"]
 
 
-async def test_memories_closed_in_another_order_than_opened_record_what_is_theirs(tmp_path: Path) -> None:
+async def test_memories_closed_in_another_order_than_opened_record_their_own_plans(tmp_path: Path) -> None:
     one, two = Memory.open(f"sqlite:///{tmp_path}/1.db"), Memory.open(f"sqlite:///{tmp_path}/2.db")
     await one.__aenter__()
     await two.__aenter__()
@@ -217,7 +217,9 @@ async def test_an_opening_that_fails_or_is_cancelled_leaves_no_thread(tmp_path: 
     assert ours() <= before
 
 
-async def test_a_dropped_plan_that_is_closed_elsewhere_leaves_the_episode_there_alone(tmp_path: Path) -> None:
+async def test_an_abandoned_plan_that_is_closed_in_another_context_leaves_the_episode_there_alone(
+    tmp_path: Path,
+) -> None:
     @dataclass
     class HangActionPerformable(ActionAbstract):
         async def perform(self) -> None:
@@ -233,5 +235,5 @@ async def test_a_dropped_plan_that_is_closed_elsewhere_leaves_the_episode_there_
             dropped.close()
             await NoteActionPerformable("here").perform()
         await memory.flush()
-        found = {each.description: each.nodes for each in await memory.reading.episodes()}
-        assert found == {"HangAction": 2, "mine": 2}
+        result = {each.description: each.nodes for each in await memory.reading.episodes()}
+        assert result == {"HangAction": 2, "mine": 2}

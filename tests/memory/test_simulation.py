@@ -1,4 +1,4 @@
-"""A memory keeps what was thought through apart from what happened."""
+"""A memory keeps simulations apart from what really happened."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ NEAR = Pose([0.6, 0.9, 0], yaw_quaternion(-0.27))
 
 @dataclass
 class FetchFromAnywhereActionPerformable(ActionAbstract):
-    """Thinks through from where the thing can be picked up, and does it from the first place that works."""
+    """Simulate picking the object up from several places, and do it from the first place that works."""
 
     thing: ObjectDesignator
 
@@ -66,7 +66,7 @@ class FetchFromAnywhereActionPerformable(ActionAbstract):
 
 
 async def fetched(url: str) -> None:
-    """One real episode, in which one thought failed and one went well."""
+    """Record one real episode, in which one simulation failed and one succeeded."""
     async with Memory.open(url) as memory, memory.episode(description="fetch the cereal"):
         with BulletWorld(), simulated_robot:
             WorldObject("pr2", ObjectType.ROBOT)
@@ -76,7 +76,7 @@ async def fetched(url: str) -> None:
             await FetchFromAnywhereActionPerformable(designator_of(cereal)).perform()
 
 
-async def test_the_plan_found_in_thought_is_what_happened_and_the_thoughts_are_left_out(tmp_path: Path) -> None:
+async def test_the_plan_found_by_simulation_is_recorded_and_the_simulations_are_left_out(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     async with Reading.open(url_of(tmp_path)) as reading:
         async with reading.session() as session:
@@ -95,7 +95,7 @@ async def test_the_plan_found_in_thought_is_what_happened_and_the_thoughts_are_l
         assert list(frame.status) == ["SUCCEEDED"]
 
 
-async def test_who_asks_for_thoughts_sees_what_came_of_them(tmp_path: Path) -> None:
+async def test_a_reader_that_asks_for_simulations_sees_their_results(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     async with Reading.open(url_of(tmp_path)) as reading:
         frame = await reading.dataframe(select(PickUpWithContextView), simulated=True)
@@ -113,7 +113,7 @@ async def test_who_asks_for_thoughts_sees_what_came_of_them(tmp_path: Path) -> N
                 (episodes[0].uuid, thinker.id >> 5 & 2**26 - 1)
             }
             picked = (await session.scalars(select(PickUpAction).order_by(PickUpAction.id))).all()
-            # each episode has a cereal of its own, there as it was when it was picked up
+            # each episode has a cereal of its own, where it was when it was picked up
             assert len({each.object.id for each in picked}) == 3
             poses = [each.object.pose for each in picked]
             assert {(each.x, each.y, each.z) for each in poses if each is not None} == {(1.3, 0.7, 0.95)}
@@ -121,7 +121,7 @@ async def test_who_asks_for_thoughts_sees_what_came_of_them(tmp_path: Path) -> N
             assert [each.process_metadata_id for each in held] == [1, 3]
 
 
-async def test_thoughts_without_an_episode_are_remembered_all_the_same(tmp_path: Path) -> None:
+async def test_simulations_without_an_episode_are_recorded_too(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         with SimulatedTaskTree(description="what if"):
             await NoteActionPerformable("thought").perform()
@@ -140,7 +140,7 @@ async def test_thoughts_without_an_episode_are_remembered_all_the_same(tmp_path:
         assert len(await memory.dataframe(select(TaskTreeNode))) == 2
 
 
-async def test_a_memory_opened_in_a_thought_remembers_thoughts(tmp_path: Path) -> None:
+async def test_a_memory_opened_in_a_simulation_records_simulations(tmp_path: Path) -> None:
     with SimulatedTaskTree():
         async with Memory.open(url_of(tmp_path)) as memory:
             await NoteActionPerformable("a").perform()
@@ -151,7 +151,7 @@ async def test_a_memory_opened_in_a_thought_remembers_thoughts(tmp_path: Path) -
         assert {each.simulated for each in await reading.episodes(simulated=True)} == {True}
 
 
-async def test_a_memory_closed_in_a_thought_ends_it(tmp_path: Path) -> None:
+async def test_a_memory_closed_in_a_simulation_ends_it(tmp_path: Path) -> None:
     with SimulatedTaskTree():
         async with Memory.open(url_of(tmp_path)):
             with SimulatedTaskTree():
@@ -164,7 +164,7 @@ async def test_a_memory_closed_in_a_thought_ends_it(tmp_path: Path) -> None:
         assert [each.status for each in await reading.episodes(simulated=True)] == ["INTERRUPTED"]
 
 
-async def test_a_thought_whose_process_is_killed_is_lost_with_the_episode_around_it(tmp_path: Path) -> None:
+async def test_a_simulation_whose_process_is_killed_is_lost_with_the_episode_around_it(tmp_path: Path) -> None:
     script = (
         "import asyncio, os, signal, sys\n"
         "from pycrorm_async.plan import SimulatedTaskTree\n"
@@ -183,15 +183,15 @@ async def test_a_thought_whose_process_is_killed_is_lost_with_the_episode_around
     assert done.returncode == -signal.SIGKILL
     assert (await recover(url_of(tmp_path))).failed == {}
     async with Reading.open(url_of(tmp_path)) as reading:
-        found = await reading.episodes(simulated=True)
-        assert [(each.description, each.status, each.simulated) for each in found] == [
+        episodes = await reading.episodes(simulated=True)
+        assert [(each.description, each.status, each.simulated) for each in episodes] == [
             ("killed", "LOST", False),
             ("simulation", "LOST", True),
         ]
         assert await texts(reading) == ["real"]
 
 
-async def test_who_asks_with_nothing_but_sqlite3_is_told_what_happened(tmp_path: Path) -> None:
+async def test_plain_sqlite3_shows_only_what_really_happened(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     connection = sqlite3.connect(tmp_path / "memory.db")
     count = "SELECT (SELECT count(*) FROM pick_up_action), (SELECT count(*) FROM process_metadata)"
@@ -199,7 +199,7 @@ async def test_who_asks_with_nothing_but_sqlite3_is_told_what_happened(tmp_path:
     connection.close()
 
 
-async def test_the_command_leaves_thoughts_out_and_tells_of_them_when_asked(tmp_path: Path) -> None:
+async def test_the_command_leaves_simulations_out_and_shows_them_on_request(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     url = ("--url", url_of(tmp_path))
     assert [each["number"] for each in answer("episodes", *url, cwd=tmp_path)] == [1]

@@ -1,4 +1,4 @@
-"""A robot's way through a motion, as a memory has it: when it was where, to the last bit."""
+"""A robot's trajectory during a motion, as a memory has it: times and positions, to the last bit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SAMPLED = Settings(sample_interval_ms=2)
 
 
 class Driving:
-    """Moves the base along x to its goal in 20 steps of 5 ms, and keeps its own log of when it was set where."""
+    """Move the base along x to its goal in 20 steps of 5 ms, and log the time and position of each step."""
 
     def __init__(self) -> None:
         self.log: list[tuple[int, float]] = []
@@ -55,7 +55,7 @@ class Driving:
     async def move_joints(self, motion: object) -> None: ...
 
 
-async def test_a_trajectory_is_remembered_with_its_values_and_times(tmp_path: Path) -> None:
+async def test_a_trajectory_is_recorded_with_its_values_and_times(tmp_path: Path) -> None:
     robot = Driving()
     async with Memory.open(url_of(tmp_path), settings=SAMPLED) as memory:
         with BulletWorld(), ChosenRobot("mine", robot):
@@ -85,17 +85,19 @@ async def test_a_trajectory_is_remembered_with_its_values_and_times(tmp_path: Pa
     assert first == base | joints
     way = [(row.ns, row.value) for row in rows if row.channel == "base.x"]
     assert all(row.channel == "base.x" for row in rows if row.id != rows[0].id)
-    assert [x for _, x in way] == sorted({x for _, x in way})  # it never went back, and nothing is written twice
+    assert [x for _, x in way] == sorted(
+        {x for _, x in way}
+    )  # the base never moved back, and no sample is written twice
     assert way[-1][1] == 1.0
     stations = [0.0, *(x for _, x in robot.log)]
     for ns, value in way:
-        # What was in force when the sample was written; or the one before or after, where a step came in between.
+        # The value in force when the sample was written, or the one before or after if a step fell in between.
         so_far = sum(set_ns <= ns for set_ns, _ in robot.log)
         assert value in stations[max(0, so_far - 1) : so_far + 2]
 
 
-async def test_the_state_at_any_moment_is_what_was_written_last_of_each_channel(tmp_path: Path) -> None:
-    """Over several motions and robots' parts: after each motion the samples up to its end say how the robot stood."""
+async def test_the_state_at_any_moment_is_the_last_written_value_of_each_channel(tmp_path: Path) -> None:
+    """Over several motions of several parts: the samples up to the end of a motion give the robot's state after it."""
     stood: list[dict[str, float]] = []
     async with Memory.open(url_of(tmp_path), settings=Settings(sample_interval_ms=1)) as memory:
         async with memory.episode(description="moving"):
@@ -121,7 +123,7 @@ async def test_the_state_at_any_moment_is_what_was_written_last_of_each_channel(
         assert {channel: state[channel] for channel in expected} == expected
 
 
-async def test_nothing_is_sampled_unless_it_is_asked_for(tmp_path: Path) -> None:
+async def test_no_samples_are_taken_unless_requested(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         with BulletWorld(), simulated_robot:
             Object("pr2", ObjectType.ROBOT)
@@ -132,7 +134,7 @@ async def test_nothing_is_sampled_unless_it_is_asked_for(tmp_path: Path) -> None
             assert (await session.scalars(select(StateSample))).all() == []
 
 
-async def test_a_memory_that_is_closed_in_the_midst_of_a_motion_takes_its_thread_along(tmp_path: Path) -> None:
+async def test_a_memory_that_is_closed_during_a_motion_ends_its_thread(tmp_path: Path) -> None:
     with BulletWorld(), ChosenRobot("mine", Driving()):
         Object("pr2", ObjectType.ROBOT)
         memory = Memory.open(url_of(tmp_path), settings=SAMPLED)
@@ -147,7 +149,7 @@ async def test_a_memory_that_is_closed_in_the_midst_of_a_motion_takes_its_thread
         assert require_robot().body.pose == Pose([1, 0, 0])
 
 
-def test_a_forked_child_goes_on_without_sampling_and_the_parent_with_it(tmp_path: Path) -> None:
+def test_a_forked_child_continues_without_sampling_and_its_parent_keeps_sampling(tmp_path: Path) -> None:
     script = (
         "import asyncio, os, sys, threading, warnings\n"
         "warnings.simplefilter('ignore')\n"

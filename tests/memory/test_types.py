@@ -1,4 +1,4 @@
-"""Types of one's own in a memory: subclasses, mapped classes, views, frames, processes that lack the class."""
+"""User types in a memory: subclasses, mapped classes, views, data frames, and processes that lack the class."""
 
 import asyncio
 import subprocess
@@ -26,10 +26,10 @@ class GentlePickUpActionPerformable(PickUpActionPerformable):
     force: float = 1.0
 
     async def perform(self) -> None:
-        """Lifts nothing: this is about what is remembered."""
+        """Lift nothing: the test is about the recorded row."""
 
 
-async def test_a_view_of_ones_own_lives_beside_the_tables(tmp_path: Path) -> None:
+async def test_a_user_view_is_made_beside_the_tables(tmp_path: Path) -> None:
     view = UserView("attempts", select(TaskTreeNode.dtype, func.count().label("times")).group_by(TaskTreeNode.dtype))
     async with Memory.open(url_of(tmp_path), views=[view]) as memory:
         async with memory.episode(description="e"):
@@ -43,7 +43,7 @@ async def test_a_view_of_ones_own_lives_beside_the_tables(tmp_path: Path) -> Non
         assert sorted(frame.times) == [1, 2]
 
 
-async def test_a_subclass_of_an_action_is_found_as_that_action(tmp_path: Path) -> None:
+async def test_a_subclass_of_an_action_is_listed_among_that_action(tmp_path: Path) -> None:
     cup = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.0, 2.0, 3.0]))
     async with Memory.open(url_of(tmp_path)) as memory:
         await GentlePickUpActionPerformable(cup, Arms.RIGHT, Grasp.TOP, 0.5).perform()
@@ -57,7 +57,7 @@ async def test_a_subclass_of_an_action_is_found_as_that_action(tmp_path: Path) -
             assert (picked.object.name, picked.object.pose.position.z) == ("cup", 3.0)
 
 
-async def test_a_process_that_lacks_the_class_sees_its_rows_all_the_same(tmp_path: Path) -> None:
+async def test_a_process_that_lacks_the_class_still_reads_its_rows(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)):
         await NoteActionPerformable("seen").perform()
     script = (
@@ -104,7 +104,7 @@ async def test_a_plain_engine_sees_an_unknown_type_as_an_action_with_its_paramet
 
 
 class ORMShout(Action):
-    """A mapped class of one's own whose table has the natural name of the type."""
+    """A user's mapped class whose table has the natural name of the type."""
 
     __tablename__ = "shout_action"
 
@@ -117,10 +117,10 @@ class ShoutActionPerformable(ActionAbstract):
     orm_class = ORMShout
 
     async def perform(self) -> None:
-        """Shouted."""
+        """Succeed without doing anything."""
 
 
-async def test_a_mapped_class_of_ones_own_may_have_the_natural_table(tmp_path: Path) -> None:
+async def test_a_users_mapped_class_may_have_the_natural_table(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         await ShoutActionPerformable("hey").perform()
         await memory.flush()
@@ -136,7 +136,7 @@ class CountActionPerformable(ActionAbstract):
     sure: bool | None
 
     async def perform(self) -> None:
-        """Counted."""
+        """Succeed without doing anything."""
 
 
 async def test_a_frame_keeps_integers_and_truth_values_where_others_are_missing(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A perform that was called and never awaited is noticed, named, and told apart from one that was cancelled."""
+"""A perform that was called and never awaited is noticed and named, and differs from a cancelled one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FAULT = "NoteAction.perform() was called and never awaited"
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Python warns of the same; here it is ours that is looked at."""
+    """Ignore Python's own warning: the test is about the package's."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         yield
@@ -63,7 +63,9 @@ async def test_outside_any_episode_it_is_a_fault_of_the_memory(tmp_path: Path) -
         assert memory.status.unawaited == (SENTENCE,)
 
 
-async def test_what_was_cancelled_or_closed_before_it_started_or_starts_later_is_no_fault(tmp_path: Path) -> None:
+async def test_a_perform_that_was_cancelled_or_closed_before_its_start_or_starts_later_is_no_fault(
+    tmp_path: Path,
+) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode() as episode:
             cancelled = asyncio.create_task(NoteActionPerformable("cancelled").perform())

@@ -1,7 +1,7 @@
-"""A trap in a fold worker: at the next batch that it has written, and not committed, something happens to it.
+"""Inject a fault into a fold worker: at the next batch that it has written and not committed, the fault happens.
 
-A daemon gives its workers the projection `Trapped`, so that they import this module. Its own process stays as it is.
-The word in the file that PYCRORM_TRAP names is taken out before the trap goes off, so that it does so once.
+A daemon gives its workers the projection `Trapped`, so that they import this module. The daemon's own process is not
+affected. The word in the file that PYCRORM_TRAP names is removed before the fault, so that it happens once.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ class Trapped(Projection):
     tables: ClassVar = {"trapped": {"what": "text"}}
 
     def fold(self, event: Event, rows: Changes) -> None:
-        """Folds nothing: it is here to be imported."""
+        """Fold nothing: the projection exists so that workers import this module."""
 
 
 def arm(trap: Path, word: str) -> None:
-    """A signal's name, `exit`, `raise` or `hang`."""
+    """Set the fault: a signal's name, `exit`, `raise` or `hang`."""
     trap.with_suffix(".making").write_text(word)
     trap.with_suffix(".making").rename(trap)
 

@@ -1,6 +1,6 @@
-"""Whatever happens to a fold worker in its transaction: the daemon says so, replaces the worker, and all is shown.
+"""Faults of a fold worker during its transaction: the daemon reports them, replaces the worker, and folds everything.
 
-The daemon is in this loop; its one worker is a process of its own.
+The daemon runs in this loop; its one worker is a process of its own.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1, fold_worker_report_s=0.1)
 IMPATIENT = replace(PATIENT, fold_worker_stopped_s=0.6)
 HURRIED = replace(PATIENT, fold_worker_answer_s=10.0)
-"""Starting takes a few seconds on a busy machine, and has no longer."""
+"""The limit on the start of a worker, which takes a few seconds on a busy machine."""
 NOTES = 10
 
 
@@ -46,14 +46,14 @@ class JotActionPerformable(ActionAbstract):
 
 
 class Lab:
-    """A memory whose daemon has one fold worker, which has a trap."""
+    """A memory whose daemon has one fold worker with an injected fault."""
 
     def __init__(self, url: str, folder: Path, memory: Memory) -> None:
         self.url = url
         self.spool = Spool(folder / "spool")
         self.trap = folder / "trap"
         self.memory = memory
-        self.said: list[str] = []
+        self.lines: list[str] = []
         self.written = 0
 
     def worker(self) -> FoldWorkerState:
@@ -66,9 +66,9 @@ class Lab:
                 await asyncio.sleep(0.01)
         return now
 
-    async def says(self, pattern: str) -> str:
+    async def wait_for_line(self, pattern: str) -> str:
         async with asyncio.timeout(60):
-            while not (lines := [line for line in self.said if re.search(pattern, line)]):  # noqa: ASYNC110
+            while not (lines := [line for line in self.lines if re.search(pattern, line)]):  # noqa: ASYNC110
                 await asyncio.sleep(0.01)
         return lines[0]
 
@@ -78,7 +78,7 @@ class Lab:
                 await JotActionPerformable(str(self.written)).perform()
                 self.written += 1
 
-    async def prove_that_all_is_shown(self) -> None:
+    async def verify_all_is_folded(self) -> None:
         await self.memory.flush()
         notes = ask(self.url, "SELECT text FROM jot_action ORDER BY id")
         assert notes == [(str(number),) for number in range(self.written)]
@@ -96,7 +96,7 @@ async def lab_at(url: str, folder: Path, settings: Settings, monkeypatch: pytest
             url,
             spool=spool,
             stop=leave,
-            report=lab.said.append,
+            report=lab.lines.append,
             settings=settings,
             projections=[Trapped()],
             fold_workers=1,
@@ -106,7 +106,7 @@ async def lab_at(url: str, folder: Path, settings: Settings, monkeypatch: pytest
             await lab.write()
             await lab.worker_is("running")
             yield lab
-            await lab.prove_that_all_is_shown()
+            await lab.verify_all_is_folded()
         finally:
             leave.set()
             await daemon
@@ -116,7 +116,7 @@ DEATHS = {"SIGKILL": "exited with signal 9", "SIGSEGV": "exited with signal 11",
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_a_worker_that_dies_in_its_transaction_is_started_again_after_longer_and_longer_pauses(
+async def test_a_worker_that_dies_in_its_transaction_is_restarted_after_longer_and_longer_pauses(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with lab_at(database_url, tmp_path, PATIENT, monkeypatch) as lab:
@@ -130,24 +130,24 @@ async def test_a_worker_that_dies_in_its_transaction_is_started_again_after_long
             assert again.pid != pid
             expected.append(f"fold worker 1 (pid {pid}) {how}; restarting it in {pause_s:g} s")
             pause_s *= 2
-        assert [line for line in lab.said if "restarting" in line] == expected
+        assert [line for line in lab.lines if "restarting" in line] == expected
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_what_a_worker_raises_is_said_and_it_goes_on_folding(
+async def test_an_exception_of_a_worker_is_reported_and_it_continues_to_fold(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with lab_at(database_url, tmp_path, PATIENT, monkeypatch) as lab:
         before = lab.worker()
         arm(lab.trap, "raise")
         await lab.write()
-        await lab.says("the tables cannot be brought up to date: no memory left")
+        await lab.wait_for_line("the tables cannot be brought up to date: no memory left")
         await lab.memory.flush()
         assert (lab.worker().pid, lab.worker().restarts) == (before.pid, 0)
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_status_counts_the_batches_of_a_worker_that_folds_no_more(
+async def test_status_keeps_the_batch_count_of_a_worker_that_has_ended(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with lab_at(database_url, tmp_path, PATIENT, monkeypatch) as lab:
@@ -160,18 +160,18 @@ async def test_status_counts_the_batches_of_a_worker_that_folds_no_more(
                 await asyncio.sleep(0.01)
 
 
-async def test_a_worker_that_is_stopped_in_its_transaction_is_named_and_then_replaced(
+async def test_a_worker_that_is_suspended_in_its_transaction_is_named_and_then_replaced(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async with lab_at(database_url, tmp_path, IMPATIENT, monkeypatch) as lab:
         pid = lab.worker().pid
         arm(lab.trap, "SIGSTOP")
         await lab.write()
-        named = await lab.says("is stopped")
+        named = await lab.wait_for_line("is stopped")
         assert named.startswith(
             f"fold worker 1 (pid {pid}) is stopped while it writes a batch and holds locks of the database; replacing"
         )
-        killed = await lab.says("restarting")
+        killed = await lab.wait_for_line("restarting")
         assert re.fullmatch(
             rf"fold worker 1 \(pid {pid}\) was stopped for \d\.\d s while it writes a batch and holds locks of the"
             r" database, and was killed; restarting it in 0\.1 s",
@@ -191,7 +191,7 @@ async def test_a_worker_that_continues_in_time_is_not_replaced(
         assert (await lab.worker_is("stopped")).pid == pid
         assert pid is not None
         os.kill(pid, signal.SIGCONT)
-        assert await lab.says(r"\) continues$") == f"fold worker 1 (pid {pid}) continues"
+        assert await lab.wait_for_line(r"\) continues$") == f"fold worker 1 (pid {pid}) continues"
         await lab.memory.flush()
         assert (lab.worker().state, lab.worker().pid, lab.worker().restarts) == ("running", pid, 0)
 
@@ -200,10 +200,10 @@ async def test_a_worker_that_never_answers_is_replaced(tmp_path: Path, monkeypat
     async with lab_at(f"sqlite:///{tmp_path}/memory.db", tmp_path, HURRIED, monkeypatch) as lab:
         arm(lab.trap, "hang")
         await lab.write()
-        assert "gave no answer for" in await lab.says("restarting")
+        assert "gave no answer for" in await lab.wait_for_line("restarting")
 
 
-async def test_a_worker_folds_no_other_database_than_its_daemon(tmp_path: Path) -> None:
+async def test_a_worker_refuses_to_fold_another_database_than_its_daemons(tmp_path: Path) -> None:
     fold = _RequestHandler(Assignment(f"sqlite:///{tmp_path}/memory.db", "another log", []))
     missing = await fold.answer(Write())
     assert isinstance(missing, Failure)

@@ -1,4 +1,4 @@
-"""The fold workers of `pycrorm writer`: shown by `status`, started again, and gone with their daemon."""
+"""The fold workers of `pycrorm writer`: shown by `status`, restarted after their death, and ended with their daemon."""
 
 import os
 import signal
@@ -42,7 +42,7 @@ def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 def is_gone(process: int) -> bool:
-    """Within some seconds."""
+    """Return whether the process ends within some seconds."""
     for _ in range(500):
         status = Path(f"/proc/{process}/stat")
         if not status.exists() or status.read_text().rpartition(")")[2].split()[0] == "Z":
@@ -52,7 +52,7 @@ def is_gone(process: int) -> bool:
 
 
 def noted(folder: Path) -> int:
-    """How many notes a plan beside the daemon left in the tables when it was over."""
+    """Return the number of notes that a plan beside the daemon left in the tables at its end."""
     answer("run", "notes.py", "--writer", "daemon", cwd=folder)
     return int(ask(f"sqlite:///{folder}/pycrorm.db", "SELECT count(*) FROM note_action")[0][0])
 
@@ -63,7 +63,7 @@ def workers(folder: Path) -> list[dict[str, Any]]:
 
 
 def wait_for_workers(folder: Path, count: int) -> list[int]:
-    """Until so many run; their processes."""
+    """Wait until this many workers run, and return their processes."""
     for _ in range(200):
         pids = [each["pid"] for each in workers(folder) if each["state"] == "running"]
         if len(pids) == count:
@@ -72,7 +72,7 @@ def wait_for_workers(folder: Path, count: int) -> list[int]:
     raise AssertionError(workers(folder))
 
 
-def test_another_process_folds_and_its_death_is_said_and_shown_and_it_is_started_again(
+def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(
     folder: Path, daemon: subprocess.Popen[str]
 ) -> None:
     first, other = wait_for_workers(folder, 2)
@@ -101,7 +101,7 @@ def test_another_process_folds_and_its_death_is_said_and_shown_and_it_is_started
     assert workers(folder) == []
 
 
-def test_a_stopped_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon: subprocess.Popen[str]) -> None:
+def test_a_suspended_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon: subprocess.Popen[str]) -> None:
     assert noted(folder) == 3
     stopped, idle = wait_for_workers(folder, 2)
     os.kill(stopped, signal.SIGSTOP)
@@ -112,7 +112,7 @@ def test_a_stopped_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon
 
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT])
-def test_what_a_terminal_sends_to_both_ends_it_with_the_daemon_and_no_sooner(
+def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
     folder: Path, daemon: subprocess.Popen[str], end: signal.Signals
 ) -> None:
     pids = wait_for_workers(folder, 2)
@@ -130,7 +130,7 @@ def test_what_a_terminal_sends_to_both_ends_it_with_the_daemon_and_no_sooner(
     assert all(map(is_gone, pids))
 
 
-def test_what_keeps_it_from_folding_is_told(folder: Path, daemon: subprocess.Popen[str]) -> None:
+def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: subprocess.Popen[str]) -> None:
     assert noted(folder) == 3
     ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE task_tree_node__1")
     plan = subprocess.Popen([*COMMAND, "run", "notes.py", "--writer", "daemon"], cwd=folder, env=environment())
@@ -140,7 +140,7 @@ def test_what_keeps_it_from_folding_is_told(folder: Path, daemon: subprocess.Pop
         said = daemon.stderr.readline()
         assert said, "the daemon has ended"
     ended = "SELECT count(*) FROM event WHERE type = 'NodeEnded'"
-    while ask(f"sqlite:///{folder}/pycrorm.db", ended) != [(8,)]:  # appending goes on
+    while ask(f"sqlite:///{folder}/pycrorm.db", ended) != [(8,)]:  # appending continues
         time.sleep(0.01)
     plan.kill()
     plan.wait()
@@ -152,7 +152,7 @@ LONG_PLAN = NOTES_PLAN.replace('in "abc"', f"in map(str, range({MANY}))") + "   
 
 
 def leave_many_notes(folder: Path) -> str:
-    """A plan takes many notes and is killed before anybody drains it; the database that they will be in."""
+    """Run a plan that takes many notes and is killed before they are drained; return the URL of their database."""
     (folder / "long.py").write_text(f"import os\n{LONG_PLAN}")
     done = subprocess.run(
         [*COMMAND, "run", "long.py", "--writer", "daemon"], cwd=folder, env=environment(), check=False
@@ -162,7 +162,7 @@ def leave_many_notes(folder: Path) -> str:
 
 
 def wait_for(url: str, question: str) -> None:
-    """Until its answer is yes."""
+    """Wait until the condition holds."""
     for _ in range(6_000):
         if ask(url, question)[0][0]:
             return
@@ -173,16 +173,16 @@ def wait_for(url: str, question: str) -> None:
 ALL = "SELECT coalesce(sum(head - folded), 1) = 0 AND count(ended_wall_ns) = 1 FROM episode"
 
 
-def prove_that_each_note_is_there(folder: Path, url: str) -> None:
+def verify_each_note_is_stored(folder: Path, url: str) -> None:
     notes = ask(url, "SELECT text FROM note_action ORDER BY id")
     assert notes == [(str(number),) for number in range(len(notes))]
-    assert len(notes) >= MANY - 1_000  # what it did last may not have been handed over
+    assert len(notes) >= MANY - 1_000  # its last notes may not have been put
     running = ask(url, "SELECT count(*) FROM task_tree_node WHERE status = 'RUNNING'")
     assert running == [(0,)]
     assert answer("verify", cwd=folder)["differences"] == []
 
 
-def test_when_both_workers_are_killed_on_a_long_way_the_daemon_goes_on(folder: Path) -> None:
+def test_a_daemon_whose_workers_are_both_killed_continues_to_fold(folder: Path) -> None:
     url = leave_many_notes(folder)
     with started(folder) as process:
         pids = wait_for_workers(folder, 2)
@@ -199,4 +199,4 @@ def test_when_both_workers_are_killed_on_a_long_way_the_daemon_goes_on(folder: P
         f"fold worker {number} (pid {pid}) exited with signal 9; restarting it in 1 s"
         for number, pid in enumerate(pids, start=1)
     ]
-    prove_that_each_note_is_there(folder, url)
+    verify_each_note_is_stored(folder, url)

@@ -1,4 +1,4 @@
-"""What happened to the objects of a world, told twice: by an observer of our own, and by the tables of a memory."""
+"""Record the changes of a world's objects twice: by an observer of the tests, and by the tables of a memory."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 class Entry(NamedTuple):
-    """One change: what it was, what caused it (a dtype; None: no node), when."""
+    """One change: its kind, its cause (a dtype, or None without a node), and its time."""
 
     what: tuple[Any, ...]
     cause: str | None
@@ -31,26 +31,26 @@ class Entry(NamedTuple):
 
 
 class Chronicle:
-    """An observer of a world that writes down what it is told, after checking it against Bullet itself.
+    """An observer of a world that records each change after checking it against Bullet.
 
-    It comes after the memory's own observer, so each change is in the memory between its last note and this one.
+    It comes after the memory's observer, so that each change is in the memory between two notes of the chronicle.
     """
 
     def __init__(self) -> None:
         self.entries: list[Entry] = []
         self._known: dict[str, tuple[tuple[float, ...], dict[str, float]]] = {}
-        """Pose and joints of every object, as they were told last."""
+        """Pose and joints of every object, as last reported."""
 
     def begin_with(self, things: Iterable[Object]) -> None:
-        """These were there before it came."""
+        """Take over the objects that were in the world before the observer."""
         self._known |= {each.name: (numbers(each.pose), each.joint_positions()) for each in things}
 
     def known_pose(self, name: str) -> tuple[float, ...]:
-        """Where the object was told to be last."""
+        """Return the last reported pose of the object."""
         return self._known[name][0]
 
     def object_added(self, added: Object) -> None:
-        assert_bullet_says(added, added.pose)
+        assert_pose_in_bullet(added, added.pose)
         self._known[added.name] = (numbers(added.pose), added.joint_positions())
         self._note("added", added.name, numbers(added.pose), added.joint_positions())
 
@@ -58,7 +58,7 @@ class Chronicle:
         self._note("removed", removed.name, self._known.pop(removed.name)[0])
 
     def object_moved(self, moved: Object) -> None:
-        assert_bullet_says(moved, moved.pose)
+        assert_pose_in_bullet(moved, moved.pose)
         self._known[moved.name] = (numbers(moved.pose), self._known[moved.name][1])
         self._note("moved", moved.name, numbers(moved.pose))
 
@@ -75,15 +75,15 @@ class Chronicle:
         self._note("detached", parent.name, child.name, link, *self._poses(parent, child))
 
     def _poses(self, *things: Object) -> list[tuple[float, ...]]:
-        """As they were told last."""
+        """Return the last reported poses."""
         return [self.known_pose(each.name) for each in things]
 
-    def assert_nothing_untold(self, world: BulletWorld) -> None:
-        """Every object is, in Bullet, where and as it was told last."""
+    def assert_no_unreported_change(self, world: BulletWorld) -> None:
+        """Assert that every object is in Bullet as last reported."""
         assert {each.name for each in world.objects} == self._known.keys()
         for each in world.objects:
             pose, joints = self._known[each.name]
-            assert_bullet_says(each, Pose(pose[:3], pose[3:]))
+            assert_pose_in_bullet(each, Pose(pose[:3], pose[3:]))
             of_bullet = joints_of_bullet(each)
             assert {joint: of_bullet[joint] for joint in joints} == pytest.approx(joints, abs=1e-9)
 
@@ -94,12 +94,12 @@ class Chronicle:
         self.entries.append(Entry(what, cause, _EPOCH + timedelta(microseconds=microseconds)))
 
     def short(self) -> list[tuple[Any, ...]]:
-        """What happened to whom and because of what, without numbers."""
+        """Return each change with its object and cause, without numbers."""
         return [(*each.what[:2], each.cause) for each in self.entries]
 
 
-async def told_by_memory(memory: Memory | Reading, number: int = 1, *, simulated: bool = False) -> list[Entry]:
-    """The same of the tables: every change of the episode, in the order of the log."""
+async def read_from_memory(memory: Memory | Reading, number: int = 1, *, simulated: bool = False) -> list[Entry]:
+    """Read the same from the tables: every change of the episode, in the order of the log."""
     entries: dict[int, Entry] = {}
 
     async def all_of(statement: Select[Any]) -> list[Any]:
@@ -132,16 +132,16 @@ async def told_by_memory(memory: Memory | Reading, number: int = 1, *, simulated
     return [entries[key] for key in sorted(entries)]
 
 
-def assert_same(remembered: list[Entry], observed: list[Entry]) -> None:
-    """The same changes with the very same numbers and causes, and each at its time."""
-    assert [each[:2] for each in remembered] == [each[:2] for each in observed]
+def assert_same(recorded: list[Entry], observed: list[Entry]) -> None:
+    """Assert that both have the same changes, with identical numbers and causes, at matching times."""
+    assert [each[:2] for each in recorded] == [each[:2] for each in observed]
     before = [each.moment - timedelta(microseconds=2) for each in observed]
-    for earliest, row, note in zip([_EPOCH, *before[:-1]], remembered, observed, strict=True):
+    for earliest, row, note in zip([_EPOCH, *before[:-1]], recorded, observed, strict=True):
         assert earliest <= row.moment <= note.moment, row
 
 
 def pose_of(row: ObjectRow) -> tuple[float, ...]:
-    """Of an object as it was: its position and orientation."""
+    """Return the position and orientation of an object at that time."""
     assert row.pose is not None
     return (*at(row.pose), *turned(row.pose))
 
@@ -150,8 +150,8 @@ def numbers(pose: Pose) -> tuple[float, ...]:
     return (*pose.position, *pose.orientation)
 
 
-def assert_bullet_says(thing: Object, pose: Pose) -> None:
-    """The root link is there in Bullet, which itself speaks of the centre of mass."""
+def assert_pose_in_bullet(thing: Object, pose: Pose) -> None:
+    """Assert the pose of the root link in Bullet, which itself gives the centre of mass."""
     body, client = thing.body.number, thing.world.client
     facts = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
     to_root = pybullet.invertTransform(facts[3], facts[4])
@@ -163,7 +163,7 @@ def assert_bullet_says(thing: Object, pose: Pose) -> None:
 
 
 def joints_of_bullet(thing: Object) -> dict[str, float]:
-    """Every joint's position as Bullet has it."""
+    """Return every joint's position in Bullet."""
     body, client = thing.body.number, thing.world.client
     return {
         pybullet.getJointInfo(body, index, physicsClientId=client)[1].decode(): pybullet.getJointState(

@@ -1,4 +1,4 @@
-"""What the tests of promises begin with: a scene in a real Bullet world, a memory in a file, and its answers."""
+"""Fixtures for the tests of promises: a scene in a real Bullet world, a memory in a file, and queries for it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldObse
 MILK_AT = (1.3, 1.0, 0.9)
 CEREAL_AT = (1.3, 0.7, 0.95)
 WITHIN_REACH = Pose([0.6, 0.9, 0])
-"""Where the left arm reaches the milk from the front."""
+"""The base pose from which the left arm reaches the milk from the front."""
 
 
 class Lab(NamedTuple):
@@ -31,9 +31,9 @@ class Lab(NamedTuple):
 
 @contextmanager
 def lab(observer: WorldObserver | None = None) -> Iterator[Lab]:
-    """Robot at the origin, milk and cereal where the thesis has them, nothing below them; motions are simulated.
+    """Robot at the origin, milk and cereal at the thesis' poses, with nothing below them; motions are simulated.
 
-    The observer sees all of it, after the memory.
+    The observer sees every change, after the memory.
     """
     with BulletWorld() as world, simulated_robot:
         if observer is not None:
@@ -48,7 +48,7 @@ def lab(observer: WorldObserver | None = None) -> Iterator[Lab]:
 
 @dataclass
 class FailingActionPerformable(ActionAbstract):
-    """Fails with what it is given."""
+    """Raise the failure that it is given."""
 
     _failure: BaseException
 
@@ -61,8 +61,8 @@ def url_of(folder: Path) -> str:
 
 
 @asynccontextmanager
-async def remembered(folder: Path) -> AsyncIterator[Memory]:
-    """A memory with an episode open; when left, all is in the tables, nothing failed to be recorded."""
+async def recorded(folder: Path) -> AsyncIterator[Memory]:
+    """Open a memory with an episode; afterwards all is in the tables, and nothing failed to be recorded."""
     async with Memory.open(url_of(folder)) as memory:
         async with memory.episode(description="a test"):
             yield memory
@@ -71,19 +71,19 @@ async def remembered(folder: Path) -> AsyncIterator[Memory]:
 
 
 async def every(memory: Memory | Reading, statement: Select[Any], *, simulated: bool = False) -> list[Any]:
-    """All that the question gives, of one column or class; of what was only thought through too, if asked for."""
+    """Return all results of the query, of one column or class; with simulations on request."""
     async with memory.session(simulated=simulated) as session:
         return list(await session.scalars(statement))
 
 
 async def asked(folder: Path, statement: Select[Any]) -> list[Any]:
-    """The same of a memory that is closed."""
+    """Return the same of a closed memory."""
     async with Reading.open(url_of(folder)) as reading:
         return await every(reading, statement)
 
 
 async def nodes_of(folder: Path) -> list[TaskTreeNode]:
-    """Every node of the memory, roots included, in the order they started."""
+    """Return every node of the memory, roots included, in the order of their starts."""
     return await asked(folder, select(TaskTreeNode).order_by(TaskTreeNode.id))
 
 
@@ -92,18 +92,18 @@ def statuses(nodes: list[TaskTreeNode]) -> list[tuple[str | None, str]]:
 
 
 def at(row: PoseRow | None) -> tuple[float, float, float]:
-    """The position of a recorded pose."""
+    """Return the position of a recorded pose."""
     assert row is not None
     return (row.x, row.y, row.z)
 
 
 def turned(row: PoseRow) -> tuple[float, float, float, float]:
-    """The orientation of a recorded pose."""
+    """Return the orientation of a recorded pose."""
     return (row.qx, row.qy, row.qz, row.qw)
 
 
 def written(pose: Pose) -> Mapping[str, Any]:
-    """A pose as it stands among the arguments of a failure, reckoned by hand."""
+    """Return a pose as it is recorded among the arguments of a failure, written by hand."""
     return {
         "position": list(pose.position),
         "orientation": list(pose.orientation),

@@ -1,6 +1,6 @@
 """Plans made at random, whose parts keep a record of their own of what happened to them.
 
-A `Thing` is a part of a plan: it knows its place (path) and what it will do. `built` makes the performable of it, of
+A `PlanPart` is a part of a plan: it knows its place (path) and what it will do. `built` makes the performable of it, of
 classes that write into a `Journal` when they start and how they end. The journal knows nothing of the task tree: who is
 inside whom follows from the paths alone.
 """
@@ -41,33 +41,33 @@ WILD = (*ORDINARY, "monitor", "monitor", "cleanup", "group", "timeout")
 
 
 @dataclass
-class Thing:
+class PlanPart:
     """A part of a plan.
 
     Attributes:
-        does: of a leaf, what each of its runs does: ok, fail, bug, cancelled, cancels.
-        times: rounds, tries, or the asking at which a monitor's condition holds.
+        does: of a leaf, the outcome of each of its runs: ok, fail, bug, cancelled, cancels.
+        times: rounds, attempts, or the check at which a monitor's condition holds.
     """
 
     kind: str
     path: Path
-    children: list[Thing] = field(default_factory=list)
+    children: list[PlanPart] = field(default_factory=list)
     does: list[str] = field(default_factory=list)
     pauses: int = 0
     times: int = 1
     wants: frozenset[Resource] = frozenset()
     nesting: int = 0
 
-    def all(self) -> list[Thing]:
+    def all(self) -> list[PlanPart]:
         return [self, *(each for child in self.children for each in child.all())]
 
 
 class Generator:
-    """Plans of nested expressions and actions.
+    """Generate plans of nested expressions and actions.
 
     Args:
-        wild: with bugs, cancellations, monitors, and parts of the robot they want.
-        greedy: branches that want parts at the outermost level, often more inside of what they have.
+        wild: with bugs, cancellations, monitors, and parts of the robot that they require.
+        greedy: branches that require resources at the outermost level, and often more inside.
     """
 
     def __init__(self, seed: int, *, wild: bool, greedy: bool) -> None:
@@ -77,21 +77,21 @@ class Generator:
         self._wild = wild
         self._greedy = greedy
 
-    def plan(self) -> Thing:
+    def plan(self) -> PlanPart:
         return self._thing((), 4, "", self._dice.choice(["parallel", "all"]) if self._greedy else None)
 
-    def _thing(self, path: Path, depth: int, above: str, kind: str | None = None) -> Thing:
+    def _thing(self, path: Path, depth: int, above: str, kind: str | None = None) -> PlanPart:
         dice = self._dice
         if depth == 0 or (path and dice.random() < 0.2):
             does = [dice.choice(self._ends) for _ in range(3)]
-            return Thing("leaf", path, does=does, pauses=dice.choice([0, 0, 1, 2, 5]), wants=self._wants(0.5))
-        # An expression in one of its own kind would be one with it: that is what `nesting` is for.
+            return PlanPart("leaf", path, does=does, pauses=dice.choice([0, 0, 1, 2, 5]), wants=self._wants(0.5))
+        # An expression inside one of its own kind would be merged with it: `nesting` produces that case.
         kinds = [each for each in self._kinds if each != above or each not in FLAT]
         kind = kind or dice.choice(ACTIONS if above in AT_ONCE and self._greedy else kinds)
         count = (
             1 if kind in ("repeat", "retry", "monitor", "timeout") else 2 if kind == "cleanup" else dice.randint(2, 4)
         )
-        return Thing(
+        return PlanPart(
             kind,
             path,
             [self._thing((*path, number), depth - 1, kind) for number in range(count)],
@@ -104,15 +104,15 @@ class Generator:
     def _wants(self, chance: float) -> frozenset[Resource]:
         if not (self._wild or self._greedy) or self._dice.random() > (0.9 if self._greedy else chance):
             return frozenset()
-        parts = [Resource.LEFT_ARM, Resource.RIGHT_ARM, Resource.BASE]
-        return frozenset(self._dice.sample(parts, 1 if self._greedy else self._dice.randint(1, 2)))
+        performables = [Resource.LEFT_ARM, Resource.RIGHT_ARM, Resource.BASE]
+        return frozenset(self._dice.sample(performables, 1 if self._greedy else self._dice.randint(1, 2)))
 
 
 @dataclass
-class Entry:
-    """One run of a thing."""
+class JournalEntry:
+    """One run of a part."""
 
-    thing: Thing
+    part: PlanPart
     dtype: str
     parent: int | None
     status: str = "RUNNING"
@@ -121,55 +121,55 @@ class Entry:
 
 
 class Journal:
-    """What the things say of themselves.
+    """The runs that the parts report.
 
     Attributes:
-        entries: in the order they started.
+        entries: in the order of their starts.
         fired: paths of the monitors whose condition held, until they run again.
-        collisions: things that held the same part of the robot at once in branches of one parallel expression.
-        tasks: that were started by actions of the plan.
+        collisions: parts that held the same resource concurrently in branches of one parallel expression.
+        tasks: started by actions of the plan.
     """
 
-    def __init__(self, plan: Thing) -> None:
-        self.entries: list[Entry] = []
+    def __init__(self, plan: PlanPart) -> None:
+        self.entries: list[JournalEntry] = []
         self.fired: set[Path] = set()
         self.collisions: list[tuple[Path, Path]] = []
         self.tasks: list[asyncio.Task[Any]] = []
         self._runs: dict[Path, int] = {}
         self.plan = plan
-        self._kinds = {thing.path: thing.kind for thing in plan.all()}
+        self._kinds = {part.path: part.kind for part in plan.all()}
         self.counts: dict[Path, int] = {}
 
-    def started(self, thing: Thing, dtype: str) -> Entry:
-        parent = self._runs[thing.path[:-1]] if thing.path else None
-        entry = Entry(thing, dtype, parent)
+    def started(self, part: PlanPart, dtype: str) -> JournalEntry:
+        parent = self._runs[part.path[:-1]] if part.path else None
+        entry = JournalEntry(part, dtype, parent)
         for other in self.entries:
-            if other.status == "RUNNING" and other.thing.wants & thing.wants and self._in_turns(other.thing, thing):
-                self.collisions.append((other.thing.path, thing.path))
-        self._runs[thing.path] = len(self.entries)
+            if other.status == "RUNNING" and other.part.wants & part.wants and self._in_turns(other.part, part):
+                self.collisions.append((other.part.path, part.path))
+        self._runs[part.path] = len(self.entries)
         self.entries.append(entry)
         return entry
 
-    def ended(self, entry: Entry, error: BaseException | None, *, interrupted: bool = False) -> None:
+    def ended(self, entry: JournalEntry, error: BaseException | None, *, interrupted: bool = False) -> None:
         if error is None:
             entry.status = "INTERRUPTED" if interrupted else "SUCCEEDED"
             return
         entry.reason = type(error).__name__
         entry.message = str(error)
         if isinstance(error, asyncio.CancelledError):
-            path = entry.thing.path
+            path = entry.part.path
             inside = any(path[:length] in self.fired for length in range(len(path)))
             entry.status = "INTERRUPTED" if inside else "CANCELLED"
         else:
             entry.status = "FAILED" if all(isinstance(each, PlanFailure) for each in _leaves(error)) else "ERROR"
 
-    def next_does(self, thing: Thing) -> str:
-        """What this run of a leaf does."""
-        run = self.counts[thing.path] = self.counts.get(thing.path, -1) + 1
-        return thing.does[run % len(thing.does)]
+    def next_does(self, part: PlanPart) -> str:
+        """Return the outcome of this run of a leaf."""
+        run = self.counts[part.path] = self.counts.get(part.path, -1) + 1
+        return part.does[run % len(part.does)]
 
-    def _in_turns(self, one: Thing, other: Thing) -> bool:
-        """Whether neither is inside the other, and both are inside of one parallel expression."""
+    def _in_turns(self, one: PlanPart, other: PlanPart) -> bool:
+        """Return whether neither is inside the other, and both are inside one parallel expression."""
         if one.path == other.path[: len(one.path)] or other.path == one.path[: len(other.path)]:
             return False
         shared = [a for a, b in zip(one.path, other.path, strict=False) if a == b]
@@ -185,14 +185,14 @@ def _leaves(error: BaseException) -> list[BaseException]:
     return [error]
 
 
-class Told:
-    """What the classes below share: a thing, and a journal to tell."""
+class Journaled:
+    """The common base of the classes below: a part, and a journal for its runs."""
 
-    thing: Any
+    part: Any
     journal: Any
 
-    async def tell(self, run: Callable[[], Awaitable[Any]]) -> Any:
-        entry = self.journal.started(self.thing, type(self).dtype)  # type: ignore[attr-defined]  # of the designator
+    async def journal_run(self, run: Callable[[], Awaitable[Any]]) -> Any:
+        entry = self.journal.started(self.part, type(self).dtype)  # type: ignore[attr-defined]  # of the designator
         try:
             result = await run()
         except BaseException as error:
@@ -202,31 +202,31 @@ class Told:
         return result
 
 
-class ToldAction(Told, ActionAbstract):
-    """A leaf, or an action that performs others as its kind says."""
+class JournaledAction(Journaled, ActionAbstract):
+    """A leaf, or an action that performs others in the way of its kind."""
 
-    dtype: ClassVar[str] = "ToldAction"
+    dtype: ClassVar[str] = "JournaledAction"
 
-    def __init__(self, thing: Thing, journal: Journal, parts: list[Designator]) -> None:
-        self.thing = thing
+    def __init__(self, part: PlanPart, journal: Journal, performables: list[Designator]) -> None:
+        self.part = part
         self.journal = journal
-        self.parts = parts
+        self.parts = performables
 
     def resources(self) -> frozenset[Resource]:
-        wants: frozenset[Resource] = self.thing.wants
+        wants: frozenset[Resource] = self.part.wants
         return wants
 
     async def perform(self) -> Any:
-        return await self.tell(getattr(self, f"_{self.thing.kind}"))
+        return await self.journal_run(getattr(self, f"_{self.part.kind}"))
 
     async def _leaf(self) -> str:
-        does = self.journal.next_does(self.thing)
-        for _ in range(self.thing.pauses):
+        does = self.journal.next_does(self.part)
+        for _ in range(self.part.pauses):
             await asyncio.sleep(0)
-        name = ".".join(map(str, self.thing.path))
+        name = ".".join(map(str, self.part.path))
         if does == "fail":
             kinds = (PlanFailure(name), ObjectLost(name, 7), IKError(Pose([1, 2, 3]), Arms.LEFT, name))
-            raise kinds[sum(self.thing.path) % 3]
+            raise kinds[sum(self.part.path) % 3]
         if does == "bug":
             raise ValueError(name)
         if does == "cancelled":
@@ -272,107 +272,113 @@ class ToldAction(Told, ActionAbstract):
     async def _timeout(self) -> None:
         (part,) = self.parts
         try:
-            async with asyncio.timeout(self.thing.pauses / 1e4):
+            async with asyncio.timeout(self.part.pauses / 1e4):
                 await part.perform()
         except TimeoutError:
             raise Timeout("too late") from None
 
 
-class ToldSequential(Told, Sequential):
+class JournaledSequential(Journaled, Sequential):
     async def perform(self) -> Any:
-        return await self.tell(super().perform)
+        return await self.journal_run(super().perform)
 
 
-class ToldTryInOrder(Told, TryInOrder):
+class JournaledTryInOrder(Journaled, TryInOrder):
     async def perform(self) -> Any:
-        return await self.tell(super().perform)
+        return await self.journal_run(super().perform)
 
 
-class ToldParallel(Told, Parallel):
+class JournaledParallel(Journaled, Parallel):
     async def perform(self) -> Any:
-        return await self.tell(super().perform)
+        return await self.journal_run(super().perform)
 
 
-class ToldTryAll(Told, TryAll):
+class JournaledTryAll(Journaled, TryAll):
     async def perform(self) -> Any:
-        return await self.tell(super().perform)
+        return await self.journal_run(super().perform)
 
 
-class ToldRepeat(Told, Repeat):
+class JournaledRepeat(Journaled, Repeat):
     async def perform(self) -> Any:
-        return await self.tell(super().perform)
+        return await self.journal_run(super().perform)
 
 
-class ToldRetry(Told, Retry):
+class JournaledRetry(Journaled, Retry):
     async def perform(self) -> Any:
-        return await self.tell(super().perform)
+        return await self.journal_run(super().perform)
 
 
-class ToldMonitor(Told, Monitor):
+class JournaledMonitor(Journaled, Monitor):
     async def perform(self) -> Any:
-        self.journal.fired.discard(self.thing.path)
-        self.journal.counts[self.thing.path] = 0
-        return await self.tell(super().perform)
+        self.journal.fired.discard(self.part.path)
+        self.journal.counts[self.part.path] = 0
+        return await self.journal_run(super().perform)
 
 
-EXPRESSIONS: dict[str, type[ToldSequential | ToldTryInOrder | ToldParallel | ToldTryAll]] = {
-    "sequential": ToldSequential,
-    "in_order": ToldTryInOrder,
-    "parallel": ToldParallel,
-    "all": ToldTryAll,
+EXPRESSIONS: dict[str, type[JournaledSequential | JournaledTryInOrder | JournaledParallel | JournaledTryAll]] = {
+    "sequential": JournaledSequential,
+    "in_order": JournaledTryInOrder,
+    "parallel": JournaledParallel,
+    "all": JournaledTryAll,
 }
 
 
-def built(thing: Thing, journal: Journal) -> Designator:
-    """What performs it."""
-    parts = [built(child, journal) for child in thing.children]
-    made: Any
-    if thing.kind == "leaf" or thing.kind in ACTIONS:
-        return ToldAction(thing, journal, parts)
-    if thing.kind in FLAT:
-        made = nested(EXPRESSIONS[thing.kind], parts, thing.nesting)
-    elif thing.kind == "repeat":
-        made = ToldRepeat(parts[0], thing.times)
-    elif thing.kind == "monitor":
-        made = parts[0] >> ToldMonitor(functools.partial(_holds, thing, journal), interval_s=0.0005)
+def built(part: PlanPart, journal: Journal) -> Designator:
+    """Return the performable of this part."""
+    performables = [built(child, journal) for child in part.children]
+    performable: Any
+    if part.kind == "leaf" or part.kind in ACTIONS:
+        return JournaledAction(part, journal, performables)
+    if part.kind in FLAT:
+        performable = nested(EXPRESSIONS[part.kind], performables, part.nesting)
+    elif part.kind == "repeat":
+        performable = JournaledRepeat(performables[0], part.times)
+    elif part.kind == "monitor":
+        performable = performables[0] >> JournaledMonitor(functools.partial(_holds, part, journal), interval_s=0.0005)
     else:
-        made = ToldRetry(parts[0] if thing.kind == "retry" else Alternatives(parts), thing.times)
-    made.thing, made.journal = thing, journal
-    return made  # type: ignore[no-any-return]  # one of those above
+        performable = JournaledRetry(
+            performables[0] if part.kind == "retry" else Alternatives(performables), part.times
+        )
+    performable.part, performable.journal = part, journal
+    return performable  # type: ignore[no-any-return]  # one of those above
 
 
-def nested(kind: type[Any], parts: list[Designator], nesting: int) -> Any:
-    """The same expression, whole, or with its beginning or its end in an expression of the same kind."""
-    if len(parts) < 3 or nesting == 0:
-        return kind(*parts)
-    return kind(kind(*parts[:2]), *parts[2:]) if nesting == 1 else kind(parts[0], kind(*parts[1:]))
+def nested(kind: type[Any], performables: list[Designator], nesting: int) -> Any:
+    """Return the same expression, whole, or with its beginning or end in an expression of the same kind."""
+    if len(performables) < 3 or nesting == 0:
+        return kind(*performables)
+    return (
+        kind(kind(*performables[:2]), *performables[2:])
+        if nesting == 1
+        else kind(performables[0], kind(*performables[1:]))
+    )
 
 
 class Alternatives(ActionDescription[Designator]):
-    """A description whose alternatives are these."""
+    """A description with these alternatives."""
 
-    def __init__(self, parts: list[Designator]) -> None:
-        super().__init__(lambda part: part, part=parts)
-
-
-def _holds(thing: Thing, journal: Journal) -> Any:
-    """Whether a monitor's condition holds; half of them are async."""
-    if thing.times % 2:
-        return _holds_later(thing, journal)
-    return _counted(thing, journal)
+    def __init__(self, performables: list[Designator]) -> None:
+        super().__init__(lambda part: part, part=performables)
 
 
-async def _holds_later(thing: Thing, journal: Journal) -> bool:
+def _holds(part: PlanPart, journal: Journal) -> Any:
+    """Return whether a monitor's condition holds; half of the conditions are async."""
+    if part.times % 2:
+        return _holds_later(part, journal)
+    return _counted(part, journal)
+
+
+async def _holds_later(part: PlanPart, journal: Journal) -> bool:
     await asyncio.sleep(0)
-    return _counted(thing, journal)
+    return _counted(part, journal)
 
 
-def _counted(thing: Thing, journal: Journal) -> bool:
-    journal.counts[thing.path] += 1
-    holds = journal.counts[thing.path] > thing.times
+def _counted(part: PlanPart, journal: Journal) -> bool:
+    journal.counts[part.path] += 1
+    holds = journal.counts[part.path] > part.times
     if holds:
-        journal.fired.add(thing.path)
+        journal.fired.add(part.path)
     return holds
 
 
-__all__ = ["AT_ONCE", "Entry", "Journal", "Path", "Thing", "built", "Generator"]
+__all__ = ["AT_ONCE", "JournalEntry", "Journal", "Path", "PlanPart", "built", "Generator"]

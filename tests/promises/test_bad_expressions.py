@@ -1,4 +1,6 @@
-"""A plan put together wrongly, or out of what cannot be done, is remembered as such, and what is around it goes on."""
+"""An expression that was built wrongly, or of impossible parts, is recorded as failed, and the plan around it
+continues.
+"""
 
 from __future__ import annotations
 
@@ -27,18 +29,18 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import lab, nodes_of, remembered, statuses
+from tests.promises.lab import lab, nodes_of, recorded, statuses
 
 pytestmark = pytest.mark.slow
 
 well: Any = NoteActionPerformable("well")
 nothing: Any = 7
-"""Any, for what is written with them here a type checker would refuse."""
+"""Any, because a type checker would refuse these expressions."""
 
 
 @dataclass
 class PlanningActionPerformable(ActionAbstract):
-    """Puts a plan together while it runs, and performs it."""
+    """Build an expression during the perform, and perform it."""
 
     _made: Callable[[], Any]
 
@@ -65,9 +67,9 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-async def test_a_plan_put_together_wrongly_is_a_failure_that_says_why(tmp_path: Path, name: str) -> None:
+async def test_an_expression_that_was_built_wrongly_fails_with_the_reason(tmp_path: Path, name: str) -> None:
     made, why = WRONG[name]
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         await (PlanningActionPerformable(made) - NoteActionPerformable("went on")).perform()
     _, expression, planning, note = await nodes_of(tmp_path)
     assert statuses([expression, planning, note]) == [
@@ -83,8 +85,8 @@ async def test_a_plan_put_together_wrongly_is_a_failure_that_says_why(tmp_path: 
     assert planning.failure_arguments[0] == planning.failure_message
 
 
-async def test_an_empty_alternative_among_others_is_passed_over_and_remembered(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_an_empty_alternative_among_others_is_skipped_and_recorded(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with lab():
             await (NavigateAction([]) - ParkArmsAction([Arms.LEFT])).perform()
     _, expression, park, motion = await nodes_of(tmp_path)
@@ -93,13 +95,13 @@ async def test_an_empty_alternative_among_others_is_passed_over_and_remembered(t
         ("ParkArmsAction", "SUCCEEDED"),
         ("MoveArmJointsMotion", "SUCCEEDED"),
     ]
-    # It was never performed, so it has no node; the expression says what it was.
+    # It was never performed, so that it has no node; the expression has its type.
     message = "IllPosedGoalFailure: NavigateAction has no alternative for target_location"
     assert expression.result == {"succeeded": [1], "failures": [message]}
 
 
 async def test_a_retry_without_any_alternative_fails_with_the_description_named(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with pytest.raises(PlanFailure):
             await Retry(ParkArmsAction([]), max_tries=3).perform()
     _, retry = await nodes_of(tmp_path)
@@ -108,8 +110,8 @@ async def test_a_retry_without_any_alternative_fails_with_the_description_named(
     assert retry.failure_arguments == ["ParkArmsAction has no alternative for arm", "arm"]
 
 
-async def test_a_retry_goes_on_where_a_pose_is_out_of_reach(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_a_retry_tries_again_when_a_pose_is_out_of_reach(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with lab() as scene:
             scene.robot.set_pose(Pose([0.6, 0.4, 0]))
             await Retry(PickUpAction(scene.milk, [Arms.RIGHT, Arms.LEFT], [Grasp.FRONT]), max_tries=2).perform()
@@ -126,9 +128,9 @@ async def test_a_retry_goes_on_where_a_pose_is_out_of_reach(tmp_path: Path) -> N
         assert node.failure_arguments[1:3] == ["RIGHT", "r_gripper_tool_frame"]
 
 
-async def test_several_failures_at_once_are_remembered_with_each_of_them(tmp_path: Path) -> None:
+async def test_concurrent_failures_are_recorded_with_each_of_them(tmp_path: Path) -> None:
     bowl = BelieveObject("bowl", ObjectType.BOWL, Pose([1, 0, 1]))
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             scene.milk.remove()
             gone = PickUpAction(scene.milk, [Arms.LEFT], [Grasp.FRONT])

@@ -1,4 +1,4 @@
-"""What a plan cannot do is remembered with class, message and data at every node it passes, and the plan goes on."""
+"""An impossible action is recorded with class, message and data at every node it passes, and the plan continues."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.robots.robot_description import PR2
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import Lab, asked, lab, nodes_of, remembered, statuses, url_of, written
+from tests.promises.lab import Lab, asked, lab, nodes_of, recorded, statuses, url_of, written
 
 pytestmark = pytest.mark.slow
 
@@ -45,7 +45,7 @@ FAR = Pose([9, 9, 1], time_ns=1)
 
 @dataclass
 class AttemptActionPerformable(ActionAbstract):
-    """Does what it is given, and lets its failures pass."""
+    """Perform the given part, and ignore its failures."""
 
     _what: Callable[[], Awaitable[object]]
 
@@ -55,7 +55,7 @@ class AttemptActionPerformable(ActionAbstract):
 
 @dataclass
 class ServingActionPerformable(ActionAbstract):
-    """Tries, and goes on with something else where that fails."""
+    """Try to perform the part, and continue with another one when it fails."""
 
     _attempt: AttemptActionPerformable
 
@@ -67,9 +67,9 @@ class ServingActionPerformable(ActionAbstract):
 
 
 class Case(NamedTuple):
-    """What is tried, and what must be remembered of it.
+    """An attempt, and what must be recorded of it.
 
-    `arguments` come after the message; `below` are the nodes that failed inside the attempt.
+    `arguments` follow the message; `below` are the nodes that failed inside the attempt.
     """
 
     attempt: Callable[[Lab], Awaitable[object]]
@@ -93,7 +93,7 @@ async def removed(scene: Lab) -> None:
     await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
 
 
-async def opened_a_part_of_what_was_removed(scene: Lab) -> None:
+async def opened_a_part_of_a_removed_object(scene: Lab) -> None:
     lid = ObjectPart("lid", scene.milk)
     scene.milk.remove()
     await OpenActionPerformable(lid, Arms.LEFT).perform()
@@ -179,7 +179,7 @@ CASES = {
         ("PickUpAction",),
     ),
     "a part of an object that was removed": Case(
-        opened_a_part_of_what_was_removed,
+        opened_a_part_of_a_removed_object,
         "PerceptionObjectNotInWorld",
         "milk is not an object of the world",
         ["milk"],
@@ -246,8 +246,8 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-async def test_what_cannot_be_done_is_remembered_and_the_plan_goes_on(tmp_path: Path, case: Case) -> None:
-    async with remembered(tmp_path):
+async def test_an_impossible_action_is_recorded_and_the_plan_continues(tmp_path: Path, case: Case) -> None:
+    async with recorded(tmp_path):
         with lab() as scene:
             await ServingActionPerformable(AttemptActionPerformable(lambda: case.attempt(scene))).perform()
     root, serving, *nodes = await nodes_of(tmp_path)
@@ -264,8 +264,8 @@ async def test_what_cannot_be_done_is_remembered_and_the_plan_goes_on(tmp_path: 
     assert nodes[-1].parent.id == serving.id
 
 
-async def test_an_unreachable_pose_is_remembered_with_the_pose_and_the_arm(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_an_unreachable_pose_is_recorded_with_the_pose_and_the_arm(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with lab() as scene:
             scene.milk.set_pose(FAR)
             attempt = AttemptActionPerformable(PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.TOP).perform)
@@ -281,7 +281,7 @@ async def test_an_unreachable_pose_is_remembered_with_the_pose_and_the_arm(tmp_p
         assert node.reason == "IKError"
         assert node.failure_arguments is not None
         pose, arm, tip, why = node.failure_arguments
-        # 0.1 m before the milk along the gripper, which points along x of the map; turned to point down
+        # 0.1 m before the milk along the gripper, which points along x of the map, turned to point down
         assert pose["position"] == pytest.approx([8.9, 9, 1])
         assert pose["orientation"] == pytest.approx([0, 0.5**0.5, 0, 0.5**0.5])
         assert (arm, tip) == ("RIGHT", "r_gripper_tool_frame")
@@ -289,7 +289,7 @@ async def test_an_unreachable_pose_is_remembered_with_the_pose_and_the_arm(tmp_p
         assert node.failure_message == f"{tip} cannot reach (8.900, 9.000, 1.000) with the RIGHT arm: {why}"
 
 
-async def test_a_failure_that_nobody_catches_is_remembered_up_to_the_episode(tmp_path: Path) -> None:
+async def test_an_uncaught_failure_is_recorded_up_to_the_episode(tmp_path: Path) -> None:
     with pytest.raises(PlanFailure):
         async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
             with lab() as scene:
@@ -314,8 +314,8 @@ async def test_a_failure_that_nobody_catches_is_remembered_up_to_the_episode(tmp
     assert episode.failure_type == "pycrorm_async.plan.failures.PerceptionObjectNotInWorld"
 
 
-async def test_a_look_that_finds_nothing_and_a_search_without_a_place_are_remembered_themselves(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_a_failed_search_is_recorded_as_a_node_of_its_own(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with lab() as scene:
             for name in ("perception of what there is not", "a pose no place reaches"):
                 attempt = AttemptActionPerformable(lambda name=name: CASES[name].attempt(scene))  # type: ignore[misc]  # bound now
@@ -352,9 +352,9 @@ MISTAKES: dict[str, tuple[Callable[[Lab], Awaitable[object]], str, str]] = {
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-async def test_an_authors_mistake_is_remembered_as_an_error_and_said_clearly(tmp_path: Path, name: str) -> None:
+async def test_an_authors_mistake_is_recorded_as_an_error_with_a_clear_message(tmp_path: Path, name: str) -> None:
     attempt, reason, message = MISTAKES[name]
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene, pytest.raises(CallerError, match=r"."):
             await ServingActionPerformable(AttemptActionPerformable(lambda: attempt(scene))).perform()
         await NoteActionPerformable("the episode goes on").perform()
@@ -368,8 +368,8 @@ async def test_an_authors_mistake_is_remembered_as_an_error_and_said_clearly(tmp
         assert "\n" not in node.failure_message
 
 
-async def test_a_plan_outside_any_world_or_robot_is_told_what_to_do_and_remembered(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_a_plan_without_world_or_robot_fails_with_the_next_step_and_is_recorded(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with pytest.raises(CallerError, match="with simulated_robot:"):
             await NavigateActionPerformable(Pose()).perform()
         with pytest.raises(CallerError, match=r"call it inside `with BulletWorld\(\) as world:`"):

@@ -1,6 +1,6 @@
-"""A program changes and goes on with what an earlier one wrote: the recipes of the README, on the golden memory.
+"""Newer programs continue the memory of an older one: the recipes of the README, on the golden memory.
 
-The golden memory was written by `tests/golden/make.py`; what it must show is written out here by hand.
+`tests/golden/make.py` wrote the golden memory; the expected content is written here by hand.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
 
 @pytest.fixture
 def as_written(tmp_path: Path) -> str:
-    """The URL of the golden memory, with the spool of the recorder that died beside it."""
+    """The URL of the golden memory, with the spool of a dead recorder beside it."""
     with tarfile.open(GOLDEN) as packed:
         packed.extractall(tmp_path, filter="data")
     return f"sqlite:///{tmp_path}/memory.db"
@@ -51,7 +51,7 @@ def as_written(tmp_path: Path) -> str:
 
 @pytest.fixture
 async def golden(as_written: str) -> str:
-    """The same with the tables of this version of the fold."""
+    """The golden memory with the tables of this version of the fold."""
     await rebuild_memory(as_written)
     return as_written
 
@@ -60,14 +60,14 @@ def id_of(number: int, sequence: int) -> int:
     return number * 2**31 + sequence * 2**5
 
 
-# --- the classes of a later program: all of them once were `GreetAction(whom: str, loudness: float, hand: Arms)` ----
+# --- the classes of a later program: all of them were once `GreetAction(whom: str, loudness: float, hand: Arms)` ------
 
 
 def greeting(**fields: Any) -> type[Any]:
-    """A `GreetAction` with these fields."""
+    """Return a `GreetAction` with these fields."""
 
     async def perform(self: Any) -> None:
-        """Says nothing."""
+        """Succeed without doing anything."""
 
     body = {"__annotations__": fields, "perform": perform, "__module__": __name__}
     return dataclass(type("GreetActionPerformable", (ActionAbstract,), body))
@@ -75,7 +75,7 @@ def greeting(**fields: Any) -> type[Any]:
 
 @dataclass
 class WelcomeActionPerformable(ActionAbstract):
-    """GreetAction under a new name, with one field less and one more."""
+    """GreetAction under a new name, with one field removed and one added."""
 
     aliases: ClassVar[tuple[str, ...]] = ("GreetAction",)
 
@@ -84,23 +84,23 @@ class WelcomeActionPerformable(ActionAbstract):
     language: str
 
     async def perform(self) -> None:
-        """Says nothing."""
+        """Succeed without doing anything."""
 
 
 @dataclass
 class HelloActionPerformable(ActionAbstract):
-    """The same class again, whose author has kept the name in memories."""
+    """The same class again, whose author kept the dtype of the memories."""
 
     dtype = "GreetAction"
 
     whom: str
 
     async def perform(self) -> None:
-        """Says nothing."""
+        """Succeed without doing anything."""
 
 
 async def performed(url: str, *designators: ActionAbstract) -> None:
-    """Each in an episode of its own, all of them in the tables."""
+    """Perform each in an episode of its own, until all of them are in the tables."""
     async with Memory.open(url) as memory:
         for each in designators:
             await each.perform()
@@ -109,8 +109,8 @@ async def performed(url: str, *designators: ActionAbstract) -> None:
         assert memory.status.unadopted == {}
 
 
-async def shown(url: str, name: str | type, *fields: str) -> list[tuple[Any, ...]]:
-    """These fields of all designators of a type, in order, with what each was called when it was recorded."""
+async def designators_of(url: str, name: str | type, *fields: str) -> list[tuple[Any, ...]]:
+    """Return these fields of all designators of a type, in order, each with its recorded dtype."""
     async with Reading.open(url) as reading, reading.session() as session:
         mapped: Any = reading.mapped(name)
         rows = (await session.scalars(select(mapped).order_by(mapped.id))).all()
@@ -120,12 +120,12 @@ async def shown(url: str, name: str | type, *fields: str) -> list[tuple[Any, ...
 ADA, CLEO, DORA = ("GreetAction", "Ada"), ("GreetAction", "Cleo"), ("GreetAction", "Dora")
 
 
-# --- what the golden memory holds -----------------------------------------------------------------------------------
+# --- the content of the golden memory ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 async def every_event(request: pytest.FixtureRequest, golden: str) -> str:
-    """The golden database with its spool adopted, where it is or copied to a server."""
+    """Return the golden database with its spool adopted, in place or copied to a server."""
     done = await recover(golden)
     assert (done.failed, len(done.lost)) == ({}, 1)
     if request.param == "sqlite":
@@ -138,7 +138,7 @@ async def every_event(request: pytest.FixtureRequest, golden: str) -> str:
     return url
 
 
-async def test_a_memory_of_the_first_version_shows_what_it_held_and_its_spool_is_adopted(every_event: str) -> None:
+async def test_a_memory_of_the_first_version_has_all_its_rows_and_its_spool_is_adopted(every_event: str) -> None:
     t0 = 1_700_000_000_000_000
     assert ask(every_event, "SELECT number, head, folded, parked, refused FROM episode ORDER BY 1") == [
         (1, 18, 18, None, None), (2, 4, 4, None, None), (3, 6, 6, None, None),
@@ -199,7 +199,7 @@ async def test_a_log_of_the_first_version_has_the_tables_of_a_new_one(golden: st
     assert len(ask(new, of_the_log)) == 17
 
 
-async def test_who_has_the_log_open_goes_on_when_a_newer_program_brings_it_up_to_date_and_nobody_older_opens_it_again(
+async def test_a_newer_program_migrates_an_open_log_and_older_programs_cannot_open_it_again(
     database_url: str,
 ) -> None:
     address = DatabaseAddress.parse(database_url)
@@ -223,21 +223,21 @@ async def test_who_has_the_log_open_goes_on_when_a_newer_program_brings_it_up_to
             await EventLog.open(address, create=create)
 
 
-# --- a designator whose fields changed ------------------------------------------------------------------------------
+# --- a designator with changed fields ---------------------------------------------------------------------------------
 
 
-async def test_a_field_that_was_added_is_null_in_old_rows_and_one_that_was_removed_in_new_ones(golden: str) -> None:
-    greet = greeting(whom=str | None, language=str, loudness=float)  # `hand` is gone, `whom` is optional
+async def test_an_added_field_is_null_in_old_rows_and_a_removed_one_in_new_ones(golden: str) -> None:
+    greet = greeting(whom=str | None, language=str, loudness=float)  # `hand` is removed, `whom` is optional
     await performed(golden, greet(None, "en", 1.0))
     expected = [(*ADA, "RIGHT", None), (*CLEO, "LEFT", None), (*DORA, "RIGHT", None), ("GreetAction", None, None, "en")]
-    assert await shown(golden, "GreetAction", "whom", "hand", "language") == expected
+    assert await designators_of(golden, "GreetAction", "whom", "hand", "language") == expected
     before = tables_of(golden)
     await rebuild_memory(golden)
     assert differences(before, tables_of(golden)) == []
-    assert await shown(golden, greet, "whom", "hand", "language") == expected
+    assert await designators_of(golden, greet, "whom", "hand", "language") == expected
 
 
-async def test_a_field_that_was_renamed_is_asked_for_by_both_names(golden: str) -> None:
+async def test_a_renamed_field_can_be_queried_by_both_names(golden: str) -> None:
     await performed(golden, greeting(guest=str)("Eve"))
     async with Reading.open(golden) as reading, reading.session() as session:
         greet: Any = reading.mapped("GreetAction")
@@ -245,24 +245,24 @@ async def test_a_field_that_was_renamed_is_asked_for_by_both_names(golden: str) 
         assert list(guests) == ["Ada", "Cleo", "Dora", "Eve"]
 
 
-async def test_a_field_of_another_type_stops_its_own_episode_with_both_named_and_no_other(golden: str) -> None:
+async def test_a_field_of_another_type_stops_its_own_episode_with_both_types_named(golden: str) -> None:
     async with Memory.open(golden) as memory:
         await greeting(whom=int)(7).perform()
         with pytest.raises(Exception, match=r"GreetAction\.whom is declared as text and as integer"):
             await memory.flush()
-    assert await shown(golden, "GreetAction", "whom") == [ADA, CLEO, DORA]
+    assert await designators_of(golden, "GreetAction", "whom") == [ADA, CLEO, DORA]
 
 
-# --- a designator that was renamed ----------------------------------------------------------------------------------
+# --- a renamed designator ---------------------------------------------------------------------------------------------
 
 
 async def test_a_class_that_keeps_its_dtype_keeps_its_rows(golden: str) -> None:
     await performed(golden, HelloActionPerformable("Eve"))
     expected = [ADA, CLEO, DORA, ("GreetAction", "Eve")]
-    assert await shown(golden, HelloActionPerformable, "whom") == expected
+    assert await designators_of(golden, HelloActionPerformable, "whom") == expected
 
 
-async def test_a_class_with_an_alias_shows_what_was_recorded_under_either_name(golden: str) -> None:
+async def test_a_class_with_an_alias_has_the_rows_recorded_under_either_name(golden: str) -> None:
     await performed(golden, WelcomeActionPerformable("Eve", Arms.BOTH, "en"))
     expected = [
         (*ADA, "RIGHT", None, 0.25),
@@ -272,7 +272,7 @@ async def test_a_class_with_an_alias_shows_what_was_recorded_under_either_name(g
     ]
     for _ in range(2):
         for name in ("WelcomeAction", "GreetAction", WelcomeActionPerformable, "welcome_action", "greet_action"):
-            assert await shown(golden, name, "whom", "hand", "language", "loudness") == expected, name
+            assert await designators_of(golden, name, "whom", "hand", "language", "loudness") == expected, name
         await rebuild_memory(golden)
     async with Reading.open(golden) as reading, reading.session() as session:
         actions = (await session.scalars(select(Action).order_by(Action.id))).all()
@@ -282,14 +282,14 @@ async def test_a_class_with_an_alias_shows_what_was_recorded_under_either_name(g
     assert ask(golden, "SELECT count(*) FROM greet_action") == ask(golden, "SELECT count(*) FROM welcome_action")
 
 
-async def test_an_old_program_that_records_on_is_shown_under_the_new_name(golden: str) -> None:
+async def test_rows_of_an_old_program_that_still_records_have_the_new_name(golden: str) -> None:
     await performed(golden, WelcomeActionPerformable("Eve", Arms.BOTH, "en"))
     await performed(golden, greeting(whom=str, loudness=float)("Flo", 1.0))
-    welcomed = [(dtype, whom) for dtype, whom in await shown(golden, "WelcomeAction", "whom")]
+    welcomed = [(dtype, whom) for dtype, whom in await designators_of(golden, "WelcomeAction", "whom")]
     assert welcomed == [ADA, CLEO, DORA, ("WelcomeAction", "Eve"), ("GreetAction", "Flo")]
 
 
-async def test_a_memory_that_is_open_learns_the_new_name_and_keeps_the_class_it_gave_out(golden: str) -> None:
+async def test_an_open_memory_learns_the_new_name_and_keeps_the_class_that_it_returned(golden: str) -> None:
     await recover(golden)
     async with Reading.open(golden) as reading:
         greet: Any = reading.mapped("GreetAction")
@@ -302,11 +302,11 @@ async def test_a_memory_that_is_open_learns_the_new_name_and_keeps_the_class_it_
             ]  # fmt: skip
 
 
-# --- an event whose shape changed -----------------------------------------------------------------------------------
+# --- an event with a changed shape ------------------------------------------------------------------------------------
 
 
 class Weighed(ObjectAdded, frozen=True, kw_only=True):
-    """A second shape of ObjectAdded: names are upper case from now on, and every object has a mass."""
+    """A second shape of ObjectAdded: names are upper case, and every object has a mass."""
 
     version = 2
 
@@ -320,7 +320,7 @@ def weighed(old: dict[str, Any]) -> dict[str, Any]:
 STEPS: dict[tuple[str, int], Upcaster] = {("ObjectAdded", 1): weighed}
 
 
-async def test_events_of_an_older_shape_are_folded_rebuilt_and_looked_at_as_of_then_through_the_upcaster(
+async def test_an_upcaster_serves_fold_rebuild_and_snapshots_of_older_events(
     golden: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = "SELECT name FROM object ORDER BY id"
@@ -333,11 +333,11 @@ async def test_events_of_an_older_shape_are_folded_rebuilt_and_looked_at_as_of_t
         moment = await reading.as_of(1, sequence=4)
     assert sorted(each.name for each in moment.world.objects) == ["MILK", "PR2"]
     log = await EventLog.open(DatabaseAddress.parse(golden), create=False)
-    assert msgspec.json.decode((await log.events(1))[1].payload)["name"] == "milk"  # the log is as it was
+    assert msgspec.json.decode((await log.events(1))[1].payload)["name"] == "milk"  # the log is unchanged
     await log.close()
 
 
-# --- another version of the fold ------------------------------------------------------------------------------------
+# --- another version of the fold --------------------------------------------------------------------------------------
 
 
 REBUILD = (
@@ -345,7 +345,7 @@ REBUILD = (
 )
 
 
-async def test_while_tables_are_those_of_an_older_fold_events_are_recorded_and_shown_once_they_are_rebuilt(
+async def test_events_are_recorded_beside_tables_of_an_older_fold_and_visible_after_a_rebuild(
     golden: str,
 ) -> None:
     before = tables_of(golden)
@@ -358,27 +358,27 @@ async def test_while_tables_are_those_of_an_older_fold_events_are_recorded_and_s
                 with pytest.raises(TablesOutdated, match=REBUILD):
                     await asked()
     with pytest.raises(TablesOutdated, match=REBUILD):
-        await shown(golden, "GreetAction")
+        await designators_of(golden, "GreetAction")
     assert ask(golden, "SELECT head, folded FROM episode ORDER BY number") == [(18, 18), (4, 4), (6, 0), (6, 0)]
     async with Memory.open(golden) as memory:
         await greet("Flo").perform()
         await rebuild_memory(golden)
         await memory.flush()
-        assert await shown(golden, "GreetAction", "whom") == [
+        assert await designators_of(golden, "GreetAction", "whom") == [
             ADA, CLEO, DORA, ("GreetAction", "Eve"), ("GreetAction", "Flo"),
         ]  # fmt: skip
     after = tables_of(golden)
     assert all(after[name].items() >= rows.items() for name, rows in before.items())
 
 
-async def test_the_tables_of_the_first_version_are_asked_to_be_rebuilt(as_written: str) -> None:
+async def test_opening_tables_of_the_first_version_demands_a_rebuild(as_written: str) -> None:
     asked = rf"by version 3 of the fold, this is version {PROJECTION_VERSION}: run `pycrorm rebuild`$"
     with pytest.raises(TablesOutdated, match=asked):
-        await shown(as_written, "GreetAction")
+        await designators_of(as_written, "GreetAction")
 
 
 async def test_tables_of_a_newer_fold_are_refused(golden: str) -> None:
     ask_to_change(golden, f"UPDATE pycrorm_generation SET version = {PROJECTION_VERSION + 1}")
-    for call in (performed(golden, greeting(whom=str)("Eve")), shown(golden, "GreetAction")):
+    for call in (performed(golden, greeting(whom=str)("Eve")), designators_of(golden, "GreetAction")):
         with pytest.raises(DatabaseForeign, match=r"use a newer pycrorm$"):
             await call

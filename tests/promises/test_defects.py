@@ -1,4 +1,4 @@
-"""Every defect that tests/README.md names has its test, and every test of a defect is named there."""
+"""Every defect that tests/README.md names has a test, and every test of a defect is named there."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ ROWS = re.findall(
 )
 
 
-def declared_and_there(path: Path) -> tuple[dict[str, str], set[str]]:
-    """The table `DEFECTS` of a test file, and the names of its tests."""
+def declared_and_tested(path: Path) -> tuple[dict[str, str], set[str]]:
+    """Return the table `DEFECTS` of a test file, and the names of its tests."""
     tree = ast.parse(path.read_text())
     tests = {each.name for each in tree.body if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)}
     (table,) = [
@@ -31,7 +31,7 @@ def test_every_defect_has_a_test_and_a_line_in_the_readme() -> None:
     assert len(files) == 4
     tested: dict[str, str] = {}
     for path in files:
-        declared, there = declared_and_there(path)
+        declared, there = declared_and_tested(path)
         assert set(declared.values()) <= there, path.name
         assert not tested.keys() & declared.keys(), path.name
         tested |= declared

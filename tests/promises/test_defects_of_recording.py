@@ -1,7 +1,7 @@
-"""Measured defects of the system the thesis describes, each beside what this one keeps true: what is recorded.
+"""Measured defects in recording of the system of the thesis, each with the property that this package keeps instead.
 
-Numbers as in tests/README.md. Every test goes the whole way: a plan in a Bullet world, a memory in a
-SQLite file, the mapped classes.
+Numbers as in tests/README.md. Every test covers the whole way: a plan in a Bullet world, a memory in a SQLite file, the
+mapped classes.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ from tests.promises.lab import (
     every,
     lab,
     nodes_of,
-    remembered,
+    recorded,
     statuses,
     turned,
     url_of,
@@ -87,8 +87,8 @@ pytestmark = pytest.mark.slow
 
 DEFECTS = {
     "1": "test_an_object_is_stored_where_it_was_when_the_action_started",
-    "4": "test_an_action_on_a_believed_object_is_stored_with_where_it_was_believed",
-    "6": "test_a_crash_in_an_action_differs_from_a_plan_failure_and_from_what_never_ran",
+    "4": "test_an_action_on_a_believed_object_is_stored_with_its_believed_pose",
+    "6": "test_an_error_in_an_action_differs_from_a_plan_failure_and_from_an_action_that_never_ran",
     "7": "test_a_failure_keeps_its_message_and_its_arguments",
     "8": "test_concurrent_plans_never_nest_into_each_other",
     "11": "test_a_node_is_running_until_it_ends_and_the_root_ends_too",
@@ -96,13 +96,13 @@ DEFECTS = {
     "13": "test_joint_targets_places_detections_and_attachments_are_recorded",
     "14": "test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_tree",
     "15": "test_opening_and_closing_keep_their_object",
-    "16": "test_every_failure_there_is_can_be_raised_and_is_recorded",
+    "16": "test_every_class_of_failure_can_be_raised_and_is_recorded",
 }
 
 
 @dataclass
 class MoveAsideActionPerformable(ActionAbstract):
-    """Moves its object while it runs."""
+    """Move its object while it runs."""
 
     what: ObjectDesignator
     where: Pose
@@ -113,7 +113,7 @@ class MoveAsideActionPerformable(ActionAbstract):
 
 
 async def test_an_object_is_stored_where_it_was_when_the_action_started(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+    async with recorded(tmp_path) as memory:
         with lab() as scene:
             scene.milk.set_pose(Pose([1.3, 0.95, 0.9]))
             await NavigateActionPerformable(WITHIN_REACH).perform()
@@ -135,9 +135,9 @@ async def test_an_object_is_stored_where_it_was_when_the_action_started(tmp_path
         assert {row.identity_id for row in milk} == {milk[0].id}
 
 
-async def test_an_action_on_a_believed_object_is_stored_with_where_it_was_believed(tmp_path: Path) -> None:
+async def test_an_action_on_a_believed_object_is_stored_with_its_believed_pose(tmp_path: Path) -> None:
     cup = Believed("cup", ObjectType.JEROEN_CUP, Pose([2, 3, 0.5]))
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab():
             with pytest.raises(PerceptionObjectNotInWorld):
                 await PickUpActionPerformable(cup, Arms.LEFT, Grasp.TOP).perform()
@@ -154,7 +154,9 @@ async def test_an_action_on_a_believed_object_is_stored_with_where_it_was_believ
     ]
 
 
-async def test_a_crash_in_an_action_differs_from_a_plan_failure_and_from_what_never_ran(tmp_path: Path) -> None:
+async def test_an_error_in_an_action_differs_from_a_plan_failure_and_from_an_action_that_never_ran(
+    tmp_path: Path,
+) -> None:
     with pytest.raises(ZeroDivisionError):
         async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
             with pytest.raises(PlanFailure):
@@ -177,7 +179,7 @@ async def test_a_crash_in_an_action_differs_from_a_plan_failure_and_from_what_ne
 
 
 async def test_a_failure_keeps_its_message_and_its_arguments(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             with pytest.raises(PlanFailure):
                 await FailingActionPerformable(PlanFailure("the milk is gone", "milk", 3)).perform()
@@ -197,14 +199,14 @@ async def test_a_failure_keeps_its_message_and_its_arguments(tmp_path: Path) -> 
         assert node.failure_arguments == [written(goal), "LEFT", "l_gripper_tool_frame", caught.value.reason]
 
 
-async def test_every_failure_there_is_can_be_raised_and_is_recorded(tmp_path: Path) -> None:
+async def test_every_class_of_failure_can_be_raised_and_is_recorded(tmp_path: Path) -> None:
     module = pycrorm_async.plan.failures
     kinds = [getattr(module, name) for name in module.__all__]
-    # The others are built from more than a message, by what raises them.
+    # The other classes are built from more than a message, by the code that raises them.
     kinds = [kind for kind in kinds if isinstance(kind, type) and (kind is PlanFailure or "__init__" not in vars(kind))]
     assert {CollisionError, ReasoningError} < set(kinds)
     assert len(kinds) >= 52
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         for kind in kinds:
             with pytest.raises(kind):
                 await FailingActionPerformable(kind(f"this is {kind.__name__}", kind.__name__, 1.5)).perform()
@@ -241,7 +243,7 @@ async def test_concurrent_plans_never_nest_into_each_other(tmp_path: Path) -> No
         asyncio.run(SlowActionPerformable(owner).perform())
 
     ALL_STARTED.reset()
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         tasks = [asyncio.create_task(SlowActionPerformable(f"task {index}").perform()) for index in range(3)]
         contexts = [copy_context() for _ in range(3)]
         threads = [
@@ -265,13 +267,13 @@ async def test_concurrent_plans_never_nest_into_each_other(tmp_path: Path) -> No
         assert node.parent_id is not None
         parent = nodes[node.parent_id]
         assert (parent.dtype, parent.parameters["owner"]) == ("SlowAction", node.parameters["owner"])
-    # They did run at the same time: all six began before the first of them ended.
+    # They ran concurrently: all six began before the first of them ended.
     assert max(node.started_at for node in slow) <= min(node.started_at for node in inner)
 
 
 @dataclass
 class LookingBackActionPerformable(ActionAbstract):
-    """Asks the memory, while it runs, what the memory knows."""
+    """Query the memory about the running action itself."""
 
     _memory: Memory
     _seen: list[TaskTreeNode] = field(default_factory=list)
@@ -283,7 +285,7 @@ class LookingBackActionPerformable(ActionAbstract):
 
 
 async def test_a_node_is_running_until_it_ends_and_the_root_ends_too(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+    async with recorded(tmp_path) as memory:
         action = LookingBackActionPerformable(memory)
         await action.perform()
     assert [(node.dtype, node.status, node.end_time is None) for node in action._seen] == [
@@ -303,7 +305,7 @@ async def test_a_node_is_running_until_it_ends_and_the_root_ends_too(tmp_path: P
 
 @pytest.fixture
 def far_from_greenwich(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The process' local time is five hours and three quarters ahead of UTC."""
+    """The local time of the process is five hours and three quarters ahead of UTC."""
     with monkeypatch.context() as changed:
         changed.setenv("TZ", "XYZ-05:45")
         time.tzset()
@@ -316,7 +318,7 @@ async def test_all_times_are_moments_in_utc_whatever_the_local_time_is(
     tmp_path: Path, far_from_greenwich: None
 ) -> None:
     begun = datetime.fromtimestamp(time.time_ns() // 1000 / 1e6, UTC)
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             await NavigateActionPerformable(Pose(WITHIN_REACH.position)).perform()
             await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
@@ -340,7 +342,7 @@ TOO_HIGH = Pose([1.3, 1, 2.5])
 
 
 async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             await ParkArmsActionPerformable(Arms.LEFT).perform()
             await MoveTorsoActionPerformable(0.3).perform()
@@ -407,7 +409,7 @@ LEFT_ARM = [
 
 
 async def test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_tree(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             await NoteActionPerformable("no class of the ORM knows of this").perform()
             await MoveAndPickUpPerformable(WITHIN_REACH, scene.milk, Arms.LEFT, Grasp.FRONT).perform()
@@ -433,7 +435,7 @@ async def test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_t
 
 
 async def test_opening_and_closing_keep_their_object(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab():
             handle = Part("sink_area_drawer_handle", WorldObject("kitchen", ObjectType.ENVIRONMENT))
             await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
@@ -446,7 +448,7 @@ async def test_opening_and_closing_keep_their_object(tmp_path: Path) -> None:
         assert motion.object.part_of is not None
         assert (motion.object.name, motion.object.part_of.name) == ("sink_area_drawer_handle", "kitchen")
         assert motion.object.pose is not None
-        assert motion.object.pose.x == pytest.approx(x)  # the kitchen's drawing; 0.3 m further out when open
+        assert motion.object.pose.x == pytest.approx(x)  # the drawing of the kitchen; 0.3 m further out when open
         assert motion.arm is Arms.LEFT
     turns = await asked(tmp_path, select(JointChange).where(JointChange.joint == "sink_area_drawer_joint"))
     assert [each.position for each in turns] == [pytest.approx(0.3), 0.0]

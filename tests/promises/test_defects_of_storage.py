@@ -1,7 +1,7 @@
-"""Measured defects of the system the thesis describes, each beside what this one keeps true: how it is stored.
+"""Measured defects in storage of the system of the thesis, each with the property that this package keeps instead.
 
-Numbers as in tests/README.md. Every test goes the whole way: a plan, a memory in a SQLite file, and what
-the mapped classes, the file itself or another process then say.
+Numbers as in tests/README.md. Every test covers the whole way: a plan, a memory in a SQLite file, and queries by the
+mapped classes, the file itself or another process.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from tests.promises.lab import (
     every,
     lab,
     nodes_of,
-    remembered,
+    recorded,
     statuses,
     turned,
     url_of,
@@ -62,21 +62,21 @@ from tests.promises.lab import (
 pytestmark = pytest.mark.slow
 
 DEFECTS = {
-    "2": "test_what_is_handed_over_twice_is_stored_once",
+    "2": "test_events_that_are_drained_twice_are_stored_once",
     "3": "test_an_episode_without_a_description_is_stored",
     "5": "test_any_number_of_sessions_and_memories_read_one_episode",
-    "9": "test_what_was_done_before_a_kill_is_remembered",
+    "9": "test_everything_done_before_a_kill_is_stored",
     "10": "test_a_long_plan_costs_less_than_a_hundred_bytes_of_memory_a_node",
     "17": "test_long_texts_and_small_differences_are_kept_exactly",
     "18": "test_an_action_keeps_all_its_poses_and_all_its_objects",
     "19": "test_importing_runs_no_process_and_reads_no_repository",
-    "20": "test_all_that_belongs_to_an_episode_is_found_by_an_index",
+    "20": "test_all_rows_of_an_episode_are_found_by_an_index",
 }
 
 
-async def test_what_is_handed_over_twice_is_stored_once(tmp_path: Path) -> None:
+async def test_events_that_are_drained_twice_are_stored_once(tmp_path: Path) -> None:
     spool, copied = tmp_path / "memory.db.spool", tmp_path / "copied"
-    async with remembered(tmp_path) as memory:
+    async with recorded(tmp_path) as memory:
         with lab():
             await ParkArmsActionPerformable(Arms.BOTH).perform()
         await memory.flush()
@@ -93,7 +93,7 @@ async def test_what_is_handed_over_twice_is_stored_once(tmp_path: Path) -> None:
         None,
         "NoteAction",
     ]
-    # The spool as it was before it was emptied: what a crash between storing and acknowledging leaves behind.
+    # The spool before it was drained: the state after a crash between storing and acknowledging.
     shutil.rmtree(spool)
     shutil.copytree(copied, spool)
     report = await recover(url_of(tmp_path))
@@ -103,7 +103,7 @@ async def test_what_is_handed_over_twice_is_stored_once(tmp_path: Path) -> None:
 
 
 def contents(folder: Path) -> dict[str, list[Any]]:
-    """Every row of every table of the file."""
+    """Return every row of every table of the file."""
     with sqlite3.connect(folder / "memory.db") as file:
         tables = [name for (name,) in file.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
         rows = {name: sorted(file.execute(f'SELECT * FROM "{name}"'), key=repr) for name in tables}
@@ -128,7 +128,7 @@ async def test_an_episode_without_a_description_is_stored(tmp_path: Path) -> Non
 
 
 async def test_any_number_of_sessions_and_memories_read_one_episode(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+    async with recorded(tmp_path) as memory:
         await NoteActionPerformable("one").perform()
         await memory.flush()
         async with Reading.open(url_of(tmp_path)) as reading, memory.session() as first, memory.session() as second:
@@ -163,7 +163,7 @@ asyncio.run(main())
 """
 
 
-async def test_what_was_done_before_a_kill_is_remembered(tmp_path: Path) -> None:
+async def test_everything_done_before_a_kill_is_stored(tmp_path: Path) -> None:
     done = await in_a_process(KILLED, url_of(tmp_path))
     assert done.returncode == -signal.SIGKILL, done.stderr
     report = await recover(url_of(tmp_path))
@@ -177,8 +177,8 @@ async def test_what_was_done_before_a_kill_is_remembered(tmp_path: Path) -> None
     assert (last.name, at(last.pose)) == ("pr2", (1.99, 0, 0))
 
 
-async def test_one_value_that_cannot_be_stored_loses_nothing_else(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_one_value_that_cannot_be_stored_loses_no_other(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with lab():
             await NavigateActionPerformable(Pose([0.1, 0, 0])).perform()
             await NoteActionPerformable("half a pair: \ud800").perform()
@@ -310,11 +310,11 @@ class StackActionPerformable(ActionAbstract):
     by_the_way: list[Pose] | None = None
 
     async def perform(self) -> None:
-        """Stacked."""
+        """Succeed without doing anything."""
 
 
 async def test_an_action_keeps_all_its_poses_and_all_its_objects(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+    async with recorded(tmp_path) as memory:
         with lab() as scene:
             bowl = WorldObject("bowl", ObjectType.BOWL, pose=Pose([0, 1, 0.5]))
             upper, lower, spare = (
@@ -332,11 +332,11 @@ async def test_an_action_keeps_all_its_poses_and_all_its_objects(tmp_path: Path)
         ]
         assert [at(each) for each in (stack.before, stack.after)] == [(3, 0, 0), (4, 0, 0)]
         assert [at(each) for each in stack.entries("by_the_way")] == [(1, 0, 0), (2, 0, 0)]
-        assert (stack.object.name, at(stack.pose)) == ("milk", (3, 0, 0))  # the names the thesis' queries use
+        assert (stack.object.name, at(stack.pose)) == ("milk", (3, 0, 0))  # the names in the queries of the thesis
 
 
-async def test_all_that_belongs_to_an_episode_is_found_by_an_index(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_all_rows_of_an_episode_are_found_by_an_index(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with lab():
             await NavigateActionPerformable(WITHIN_REACH).perform()
     with sqlite3.connect(tmp_path / "memory.db") as file:
@@ -349,8 +349,10 @@ async def test_all_that_belongs_to_an_episode_is_found_by_an_index(tmp_path: Pat
             assert scans(file, select(row).where(mapped.process_metadata_id == 1)) == [], mapped
             asked_of += 1
         assert asked_of > 30
-        assert scans(file, select(TaskTreeNode.id).where(TaskTreeNode.reason == "IKError"))  # where there is none
-        # and what hangs on one row: children of a node, an object's life, where a status is
+        assert scans(
+            file, select(TaskTreeNode.id).where(TaskTreeNode.reason == "IKError")
+        )  # an index of the foreign key
+        # and all that refers to one row: children of a node, an object's life, the node of a status
         parent, identity = TaskTreeNode.parent_id == 34, Object.identity_id == 32
         assert scans(file, select(TaskTreeNode.id).where(parent)) == []
         assert scans(file, select(Object.id).where(identity)) == []
@@ -359,7 +361,7 @@ async def test_all_that_belongs_to_an_episode_is_found_by_an_index(tmp_path: Pat
 
 
 def scans(file: sqlite3.Connection, statement: Any) -> list[str]:
-    """The steps of the query plan that read a whole table."""
+    """Return the steps of the query plan that read a whole table."""
     sql = str(statement.compile(dialect=sqlite.dialect(), compile_kwargs={"literal_binds": True}))
     steps = [step for *_, step in file.execute(f"EXPLAIN QUERY PLAN {sql}")]
     assert steps

@@ -1,4 +1,4 @@
-"""Gaps of the systems that came after the thesis' one, read in their code, each beside what this one keeps true.
+"""Gaps of the systems after the thesis', read in their code, each with the property that this package keeps instead.
 
 Numbers are those of the table in tests/README.md; they follow the order in which the gaps were noted.
 """
@@ -45,7 +45,7 @@ from tests.promises.lab import (
     at,
     lab,
     nodes_of,
-    remembered,
+    recorded,
     statuses,
     url_of,
 )
@@ -55,17 +55,17 @@ pytestmark = pytest.mark.slow
 DEFECTS = {
     "s1": "test_every_node_of_a_sequence_has_its_own_status_and_times",
     "s2": "test_the_state_after_an_action_is_not_the_state_before_it",
-    "s3": "test_whoever_listens_to_a_plan_is_told_of_every_start_and_end",
-    "s4": "test_what_is_stored_can_be_played_again",
-    "s5": "test_every_stored_node_can_be_read_back_as_what_it_was",
+    "s3": "test_an_observer_of_a_plan_is_notified_of_every_start_and_end",
+    "s4": "test_a_stored_episode_can_be_replayed_in_a_new_world",
+    "s5": "test_every_stored_node_can_be_turned_back_into_its_designator",
     "s6": "test_alternatives_that_all_fail_are_a_failure",
     "s7": "test_expressions_have_times",
-    "s8": "test_what_is_imported_is_declared_and_nothing_is_generated",
+    "s8": "test_all_imports_are_declared_and_no_code_is_generated",
 }
 
 
 async def test_every_node_of_a_sequence_has_its_own_status_and_times(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab():
             plan = Navigate([Pose([1, 0, 0])]) + MoveTorso([0.2]) + FailingActionPerformable(PlanFailure("no"))
             with pytest.raises(PlanFailure):
@@ -89,7 +89,7 @@ async def test_every_node_of_a_sequence_has_its_own_status_and_times(tmp_path: P
 
 
 async def test_the_state_after_an_action_is_not_the_state_before_it(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             await NavigateActionPerformable(Pose([0.6, 0.4, 0])).perform()
             await MoveTorsoActionPerformable(0.3).perform()
@@ -108,9 +108,9 @@ async def test_the_state_after_an_action_is_not_the_state_before_it(tmp_path: Pa
     assert at(before.pose) != at(after.pose)
 
 
-async def test_whoever_listens_to_a_plan_is_told_of_every_start_and_end(tmp_path: Path) -> None:
+async def test_an_observer_of_a_plan_is_notified_of_every_start_and_end(tmp_path: Path) -> None:
     seen: list[RecordedEvent] = []
-    async with remembered(tmp_path) as memory:
+    async with recorded(tmp_path) as memory:
         with memory.observe(seen.append), lab():
             await (Navigate([Pose([1, 0, 0])]) - NoteActionPerformable("not needed")).perform()
             with pytest.raises(PlanFailure):
@@ -134,9 +134,9 @@ async def test_whoever_listens_to_a_plan_is_told_of_every_start_and_end(tmp_path
     ]
 
 
-async def test_what_is_stored_can_be_played_again(tmp_path: Path) -> None:
+async def test_a_stored_episode_can_be_replayed_in_a_new_world(tmp_path: Path) -> None:
     states = []
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             for step in (
                 ParkArmsActionPerformable(Arms.BOTH),
@@ -149,7 +149,7 @@ async def test_what_is_stored_can_be_played_again(tmp_path: Path) -> None:
                 states.append((datetime.now(UTC), *state_of(scene.world)))
     held = {("pr2", "milk", "l_gripper_tool_frame")}
     assert [attachments for *_, attachments in states] == [set(), set(), held, held, held]
-    # Each moment in a new world, from nothing but the memory.
+    # Each moment in a new world, made from the memory alone.
     async with Reading.open(url_of(tmp_path)) as reading:
         for time, objects, hand, attachments in states:
             with world_of(await reading.as_of("last", time=time)) as world:
@@ -162,19 +162,19 @@ async def test_what_is_stored_can_be_played_again(tmp_path: Path) -> None:
 
 
 def state_of(world: BulletWorld) -> tuple[list[tuple[Any, ...]], Pose, set[tuple[str, str, str | None]]]:
-    """Objects in their order with poses and joints as Bullet has them, the pose of a hand, and attachments."""
+    """Return objects in their order with poses and joints in Bullet, the pose of a hand, and attachments."""
     objects = [(each.name, each.object_type, numbers(each.pose), joints_of_bullet(each)) for each in world.objects]
     attachments = {(each.parent.name, each.child.name, each.link) for each in world.attachments}
     return objects, world.object("pr2").link_pose("l_gripper_tool_frame"), attachments
 
 
-async def test_every_stored_node_can_be_read_back_as_what_it_was(tmp_path: Path) -> None:
+async def test_every_stored_node_can_be_turned_back_into_its_designator(tmp_path: Path) -> None:
     performed: list[Any] = [
         ParkArmsActionPerformable(Arms.BOTH),
         MoveTorsoActionPerformable(0.2),
         NavigateActionPerformable(WITHIN_REACH),
     ]
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             performed.append(PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT))
             performed.append(PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([1.3, 0.95, 0.9])))
@@ -184,7 +184,7 @@ async def test_every_stored_node_can_be_read_back_as_what_it_was(tmp_path: Path)
     rows = await asked(tmp_path, select(Designator).where(Designator.kind == "action").order_by(Designator.id))
     assert [type(row).__name__ for row in rows] == [type(each).dtype for each in performed]
     assert len(await nodes_of(tmp_path)) == 1 + 5 + 1 + 1 + 1 + 5 + 3
-    # From the rows alone the same plan again, in a new world, with the same end.
+    # From the rows alone the same plan runs again, in a new world, with the same outcome.
     with lab() as again:
         for row in rows:
             await performable_of(row).perform()
@@ -194,7 +194,7 @@ async def test_every_stored_node_can_be_read_back_as_what_it_was(tmp_path: Path)
 
 async def test_alternatives_that_all_fail_are_a_failure(tmp_path: Path) -> None:
     first, second = (FailingActionPerformable(PlanFailure(f"not {number}", number)) for number in (1, 2))
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with pytest.raises(PlanFailure):
             await (first - second).perform()
         await (first - NoteActionPerformable("this one")).perform()
@@ -224,7 +224,7 @@ class WaitingActionPerformable(ActionAbstract):
 
 
 async def test_expressions_have_times(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         one = WaitingActionPerformable(asyncio.Event())
         other = WaitingActionPerformable(one._after, one._before)
         for plan in (one | other, one ^ other, one + NoteActionPerformable("then"), other * 2):
@@ -242,7 +242,7 @@ async def test_expressions_have_times(tmp_path: Path) -> None:
         assert expression.start_time <= inside[0].start_time
 
 
-def test_what_is_imported_is_declared_and_nothing_is_generated() -> None:
+def test_all_imports_are_declared_and_no_code_is_generated() -> None:
     root = Path(pycrorm_async.__file__).parent
     project = tomllib.loads((root.parent / "pyproject.toml").read_text())["project"]
     declared = [
@@ -260,7 +260,7 @@ def test_what_is_imported_is_declared_and_nothing_is_generated() -> None:
 
 
 def canonical(requirement: str) -> str:
-    """The distribution's name as the package index has it."""
+    """Return the distribution's name in the form of the package index."""
     name = requirement.split(";")[0]
     for sign in "[<>=!~ ":
         name = name.split(sign)[0]
@@ -268,7 +268,7 @@ def canonical(requirement: str) -> str:
 
 
 def imports(tree: ast.AST) -> set[str]:
-    """The top-level names of the modules that are imported."""
+    """Return the top-level names of the imported modules."""
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

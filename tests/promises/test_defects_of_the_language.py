@@ -1,4 +1,4 @@
-"""Measured defects of the plan language of the thesis' time, each beside what ours keeps true, in the memory as well.
+"""Measured defects of the plan language of the thesis' time, each with the property that this package keeps instead.
 
 Numbers are those of the table in tests/README.md.
 """
@@ -16,34 +16,34 @@ from pycrorm_async.plan import Code, Designator, NavigateAction, ParkArmsAction,
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.world import Arms, Pose
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import FailingActionPerformable, asked, lab, nodes_of, remembered, statuses
+from tests.promises.lab import FailingActionPerformable, asked, lab, nodes_of, recorded, statuses
 
 pytestmark = pytest.mark.slow
 
 DEFECTS = {
     "a": "test_a_failure_deep_inside_an_expression_fails_all_of_it",
-    "b": "test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested",
-    "c": "test_a_repetition_says_how_it_went",
+    "b": "test_a_sequence_runs_in_the_order_in_which_it_is_written_however_it_is_nested",
+    "c": "test_a_repetition_returns_its_rounds_and_failures",
     "d": "test_every_branch_performs_its_own_operand",
-    "e": "test_expressions_are_nodes_of_the_tree_that_is_remembered",
+    "e": "test_expressions_are_nodes_of_the_recorded_tree",
 }
 
 
-def well(text: str = "well") -> NoteActionPerformable:
+def succeeding(text: str = "well") -> NoteActionPerformable:
     return NoteActionPerformable(text)
 
 
-def badly() -> FailingActionPerformable:
+def failing() -> FailingActionPerformable:
     return FailingActionPerformable(ObjectLost("the milk slipped", "milk"))
 
 
 async def test_a_failure_deep_inside_an_expression_fails_all_of_it(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
-        for plan in ((well() + badly()) | well(), (badly() | well()) + well("never")):
+    async with recorded(tmp_path):
+        for plan in ((succeeding() + failing()) | succeeding(), (failing() | succeeding()) + succeeding("never")):
             with pytest.raises(ObjectLost, match="the milk slipped"):
                 await plan.perform()
     nodes = await nodes_of(tmp_path)
-    # The branches took turns in whatever order; what they are and how they went is always the same.
+    # The branches ran in any order; their classes and outcomes are always the same.
     assert sorted(statuses(nodes)[1:]) == sorted(
         [
             *[("Parallel", "FAILED"), ("Sequential", "FAILED"), ("FailingAction", "FAILED")] * 2,
@@ -56,10 +56,10 @@ async def test_a_failure_deep_inside_an_expression_fails_all_of_it(tmp_path: Pat
             assert node.failure_arguments == ["the milk slipped", "milk"]
 
 
-async def test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
-        await (well("1") + (well("2") + well("3"))).perform()
-        await ((well("4") + well("5")) + (well("6") + (well("7") + well("8")))).perform()
+async def test_a_sequence_runs_in_the_order_in_which_it_is_written_however_it_is_nested(tmp_path: Path) -> None:
+    async with recorded(tmp_path) as memory:
+        await (succeeding("1") + (succeeding("2") + succeeding("3"))).perform()
+        await ((succeeding("4") + succeeding("5")) + (succeeding("6") + (succeeding("7") + succeeding("8")))).perform()
         await memory.flush()
         notes = memory.mapped(NoteActionPerformable)
         assert list(await asked(tmp_path, select(notes.text).order_by(notes.id))) == list("12345678")
@@ -70,12 +70,12 @@ async def test_a_sequence_runs_in_the_order_it_is_written_however_it_is_nested(t
     ]
 
 
-async def test_a_repetition_says_how_it_went(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
-        outcome = await (well() * 3).perform()
+async def test_a_repetition_returns_its_rounds_and_failures(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
+        outcome = await (succeeding() * 3).perform()
         assert (outcome.rounds, outcome.results, outcome.succeeded) == (3, (None, None, None), (0, 1, 2))
         with pytest.raises(PlanFailure) as caught:
-            await Repeat(badly(), 2).perform()
+            await Repeat(failing(), 2).perform()
         assert [type(each) for each in caught.value.data] == [ObjectLost, ObjectLost]
     nodes = await nodes_of(tmp_path)
     assert statuses(nodes)[1:] == [
@@ -98,17 +98,17 @@ async def test_every_branch_performs_its_own_operand(tmp_path: Path) -> None:
     plan = branches[0] | branches[1]
     for each in branches[2:]:
         plan = plan | each
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         outcome = await plan.perform()
     assert outcome.results == tuple(range(40))
     calls = select(TaskTreeNode).where(TaskTreeNode.dtype == "Code").order_by(TaskTreeNode.id)
     assert sorted(node.result for node in await asked(tmp_path, calls)) == list(range(40))
 
 
-async def test_expressions_are_nodes_of_the_tree_that_is_remembered(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+async def test_expressions_are_nodes_of_the_recorded_tree(tmp_path: Path) -> None:
+    async with recorded(tmp_path):
         with lab():
-            plan = NavigateAction([Pose([1, 0, 0])]) + (badly() - ParkArmsAction([Arms.LEFT]))
+            plan = NavigateAction([Pose([1, 0, 0])]) + (failing() - ParkArmsAction([Arms.LEFT]))
             await plan.perform()
     nodes = await nodes_of(tmp_path)
     found = {node.id: node for node in nodes}

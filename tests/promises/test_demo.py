@@ -1,4 +1,4 @@
-"""The demonstration of the thesis (5.1) on this memory: its tree and its five answers, reckoned from the world."""
+"""The demonstration of the thesis (5.1) with this memory: its tree and its five answers, computed from the world."""
 
 from collections.abc import Awaitable
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ from pycrorm_async.world import Object as WorldObject
 from tests.commands import answer
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 THESIS_TREE = """
 root
@@ -78,11 +78,11 @@ class SayingActionPerformable(ActionAbstract):
     orm_class = ORMSaying
 
     async def perform(self) -> None:
-        """Said."""
+        """Succeed without doing anything."""
 
 
-class Witness:
-    """Stands before the memory and writes down what the world itself says when an action starts."""
+class WorldObserver:
+    """An observer before the memory that notes the state of the world when an action starts."""
 
     def __init__(self, memory: PlanObserver, world: BulletWorld) -> None:
         self.memory = memory
@@ -125,14 +125,14 @@ def same(row: Any, pose: Pose) -> bool:
     return (row.x, row.y, row.z) == pose.position and (row.qx, row.qy, row.qz, row.qw) == pose.orientation
 
 
-async def test_the_demo_is_remembered_as_it_was(tmp_path: Path, database_url: str) -> None:
+async def test_the_memory_of_the_demo_has_its_tree_and_its_answers(tmp_path: Path, database_url: str) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         async with memory.episode(description="Tutorial for getting familiar with the memory") as episode:
             with BulletWorld() as world:
                 kitchen_world()
-                told = recorder.get()
-                assert told is not None
-                witness = Witness(told, world)
+                recorder_of_memory = recorder.get()
+                assert recorder_of_memory is not None
+                witness = WorldObserver(recorder_of_memory, world)
                 token = recorder.set(witness)
                 await breakfast()
                 recorder.reset(token)
@@ -175,7 +175,7 @@ async def test_the_demo_is_remembered_as_it_was(tmp_path: Path, database_url: st
                 assert action.robot_state.torso_height == torso
             assert actions[-1].robot_state is None
 
-            # 4. the poses of objects that were picked up, at that moment
+            # 4. the poses of picked-up objects, at that moment
             picked = (await session.scalars(select(PoseRow).join(PickUpAction.object).join(Object.pose))).all()
             assert len(picked) == 1
             assert same(picked[0], Pose([1.3, 0.7, 0.95]))
@@ -185,12 +185,12 @@ async def test_the_demo_is_remembered_as_it_was(tmp_path: Path, database_url: st
             assert not same(placed.object.pose, Pose([1.3, 0.7, 0.95]))
             assert placed.object.name == "cereal"
 
-            # 5. the action declared on the spot, with the author's own class
-            said = (await session.scalars(select(ORMSaying))).all()
-            assert [each.text for each in said] == ["Patchie, Patchie; Where is my Patchie?"]
+            # 5. the action declared in the demo, with the author's own class
+            sayings = (await session.scalars(select(ORMSaying))).all()
+            assert [each.text for each in sayings] == ["Patchie, Patchie; Where is my Patchie?"]
             assert isinstance(actions[-1], ORMSaying)
 
-            # what the thesis' memory did not keep
+            # beyond the memory of the thesis
             last = (await session.scalars(select(Object).where(Object.name == "cereal").order_by(Object.id))).all()[-1]
             assert same(last.pose, resting)
             place = next(each for each in witness.designators if isinstance(each, PlaceActionPerformable))
@@ -245,7 +245,7 @@ async def test_the_same_plan_runs_without_a_memory_and_records_nothing(tmp_path:
     assert not any(tmp_path.iterdir())
 
 
-async def test_the_plan_runs_on_the_mesh_model_as_well(tmp_path: Path) -> None:
+async def test_the_plan_also_runs_on_the_mesh_model(tmp_path: Path) -> None:
     from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path
 
     async with Memory.open(f"sqlite:///{tmp_path}/demo.db") as memory:

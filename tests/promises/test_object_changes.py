@@ -1,4 +1,4 @@
-"""Every change of every object is in the memory: what, where to, when, and because of which node of the plan."""
+"""Every change of every object is in the memory: its kind, its time, the new state, and the node that caused it."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.chronicle import Chronicle, assert_same, told_by_memory
-from tests.promises.lab import WITHIN_REACH, Lab, at, every, lab, remembered, url_of
+from tests.promises.chronicle import Chronicle, assert_same, read_from_memory
+from tests.promises.lab import WITHIN_REACH, Lab, at, every, lab, recorded, url_of
 
 pytestmark = pytest.mark.slow
 
@@ -41,7 +41,7 @@ ARM = "l_gripper_tool_frame"
 
 @dataclass
 class RearrangingActionPerformable(ActionAbstract):
-    """Changes the world with its own hands, as a simulation of people or of processes does."""
+    """Change the world directly, as a simulation of people or of processes does."""
 
     _change: Any
 
@@ -49,8 +49,8 @@ class RearrangingActionPerformable(ActionAbstract):
         self._change()
 
 
-async def test_every_change_of_a_plan_is_remembered_with_its_cause(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+async def test_every_change_by_a_plan_is_recorded_with_its_cause(tmp_path: Path) -> None:
+    async with recorded(tmp_path) as memory:
         chronicle = Chronicle()
         with lab(chronicle) as scene:
             spoon = Object("spoon", ObjectType.SPOON, pose=Pose([1.3, 1, 1.05]))
@@ -62,7 +62,7 @@ async def test_every_change_of_a_plan_is_remembered_with_its_cause(tmp_path: Pat
             await PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([1.2, 1.0, 0.9])).perform()
             await RearrangingActionPerformable(lambda: scene.milk.set_pose(Pose([3, 3, 0]))).perform()
             await RearrangingActionPerformable(spoon.remove).perform()
-            chronicle.assert_nothing_untold(scene.world)
+            chronicle.assert_no_unreported_change(scene.world)
         await memory.flush()
         assert [each for each in chronicle.short() if each[0] != "added"] == [
             ("moved", "cereal", None),
@@ -90,19 +90,20 @@ async def test_every_change_of_a_plan_is_remembered_with_its_cause(tmp_path: Pat
             ("detached", "milk", "RearrangingAction"),
             ("removed", "spoon", "RearrangingAction"),
         ]
-        told = await told_by_memory(memory)
-        assert_same(told[: len(chronicle.entries)], chronicle.entries)
-        # The world was left inside the episode: then nothing is in it any more, and no node did that.
-        assert [(each.what, each.cause) for each in told[len(chronicle.entries) :]] == [
+        in_memory = await read_from_memory(memory)
+        assert_same(in_memory[: len(chronicle.entries)], chronicle.entries)
+        # The world was left inside the episode: then it is empty, and no node caused that.
+        assert [(each.what, each.cause) for each in in_memory[len(chronicle.entries) :]] == [
             (("removed", name, chronicle.known_pose(name)), None) for name in ("pr2", "milk", "cereal")
         ]
 
 
-async def test_what_a_failed_action_had_changed_before_is_remembered(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+async def test_changes_by_an_action_that_failed_later_are_recorded(tmp_path: Path) -> None:
+    async with recorded(tmp_path) as memory:
         chronicle = Chronicle()
         with lab(chronicle) as scene:
-            # From 0.32 the arm gets before the milk and not to it; at 1.22 m the milk is grasped and cannot be lifted.
+            # From 0.32 m the arm reaches to the milk and not around it; at 1.22 m it grasps the milk and cannot lift
+            # it.
             for stand, height in ((0.32, 0.9), (0.6, 1.22)):
                 scene.world.reset()
                 scene.milk.set_pose(Pose([1.3, 1, height]))
@@ -120,7 +121,7 @@ async def test_what_a_failed_action_had_changed_before_is_remembered(tmp_path: P
             ("joints", "pr2", "MoveGripperMotion"),
             ("attached", "pr2", "PickUpAction"),
         ]
-        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
         failed = select(TaskTreeNode.dtype).where(TaskTreeNode.status == TaskStatus.FAILED).order_by(TaskTreeNode.id)
         assert await every(memory, failed) == ["PickUpAction", "MoveTCPMotion"] * 2
 
@@ -148,18 +149,18 @@ class StepActionPerformable(ActionAbstract):
         await asyncio.sleep(0)
 
 
-async def test_branches_at_the_same_time_each_cause_their_own_changes(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+async def test_concurrent_branches_each_cause_their_own_changes(tmp_path: Path) -> None:
+    async with recorded(tmp_path) as memory:
         chronicle = Chronicle()
         with lab(chronicle) as scene:
             async with asyncio.TaskGroup() as group:
-                for thing in (scene.milk, scene.cereal, scene.robot):
-                    group.create_task(BranchActionPerformable(f"moves {thing.name}", thing).perform())
+                for world_object in (scene.milk, scene.cereal, scene.robot):
+                    group.create_task(BranchActionPerformable(f"moves {world_object.name}", world_object).perform())
         await memory.flush()
         moved = [each.what[1] for each in chronicle.entries if each.what[0] == "moved"]
         assert len(moved) == 15
-        assert len(set(moved[:3])) == 3  # they took turns
-        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        assert len(set(moved[:3])) == 3  # they ran in turns
+        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
         steps = {step.id: step for step in await every(memory, select(memory.mapped("StepAction")))}
         rows = await every(memory, select(ObjectRow).where(ObjectRow.id != ObjectRow.identity_id))
         caused = [steps[row.node_id] for row in rows]
@@ -167,21 +168,22 @@ async def test_branches_at_the_same_time_each_cause_their_own_changes(tmp_path: 
 
 
 async def test_an_expression_names_the_branch_that_caused_a_change(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+    async with recorded(tmp_path) as memory:
         chronicle = Chronicle()
         with lab(chronicle) as scene:
-            # The left hand carries the milk while the right one opens, base and torso first: all change the world.
+            # The left hand carries the milk while the right one opens, base and torso first: all of them change the
+            # world.
             await NavigateActionPerformable(WITHIN_REACH).perform()
             take = PickUpAction(scene.milk, [Arms.LEFT], [Grasp.FRONT])
             wave = ParkArmsAction([Arms.RIGHT]) + SetGripperAction([Arms.RIGHT], [GripperState.OPEN])
             push = BranchActionPerformable("moves cereal", scene.cereal)
             await (take | wave | push).perform()
         await memory.flush()
-        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
         rows = {node.id: node for node in await every(memory, select(TaskTreeNode))}
 
         def branch(node: TaskTreeNode) -> str | None:
-            """The type of the branch it is in."""
+            """Return the type of the branch that contains the node."""
             while node.parent_id is not None and rows[node.parent_id].dtype != "Parallel":
                 node = rows[node.parent_id]
             return node.dtype
@@ -198,8 +200,8 @@ async def test_an_expression_names_the_branch_that_caused_a_change(tmp_path: Pat
         }
 
 
-async def test_what_is_only_thought_through_changes_nothing_that_is_remembered_as_real(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+async def test_a_simulation_changes_nothing_that_is_recorded_as_real(tmp_path: Path) -> None:
+    async with recorded(tmp_path) as memory:
         real, imagined = Chronicle(), Chronicle()
         with lab(real) as scene:
             await NavigateActionPerformable(WITHIN_REACH).perform()
@@ -212,18 +214,18 @@ async def test_what_is_only_thought_through_changes_nothing_that_is_remembered_a
             await MoveTorsoActionPerformable(0.1).perform()
         await memory.flush()
         assert real.short()[3:] == [("moved", "pr2", "MoveMotion"), ("joints", "pr2", "MoveJointsMotion")]
-        assert_same((await told_by_memory(memory))[: len(real.entries)], real.entries)
-        there, _, _, *thought = await told_by_memory(memory, 2, simulated=True)
-        assert (there.what[1], there.what[2][:3]) == ("pr2", (0.6, 0.9, 0))  # it begins with what is there
+        assert_same((await read_from_memory(memory))[: len(real.entries)], real.entries)
+        there, _, _, *thought = await read_from_memory(memory, 2, simulated=True)
+        assert (there.what[1], there.what[2][:3]) == ("pr2", (0.6, 0.9, 0))  # it begins with the objects of the world
         assert_same(thought[: len(imagined.entries)], imagined.entries)
         assert ("attached", "pr2", "PickUpAction") in imagined.short()
-        assert await told_by_memory(memory, 2) == []
+        assert await read_from_memory(memory, 2) == []
         episodes = await every(memory, select(ProcessMetaData).order_by(ProcessMetaData.id), simulated=True)
         assert [(each.simulated, each.status) for each in episodes] == [(False, "RUNNING"), (True, "SUCCEEDED")]
 
 
-async def test_a_reset_between_rollouts_is_remembered_and_no_node_did_it(tmp_path: Path) -> None:
-    async with remembered(tmp_path) as memory:
+async def test_a_reset_between_rollouts_is_recorded_without_a_node(tmp_path: Path) -> None:
+    async with recorded(tmp_path) as memory:
         chronicle = Chronicle()
         with lab(chronicle) as scene:
             for _ in range(2):
@@ -240,7 +242,7 @@ async def test_a_reset_between_rollouts_is_remembered_and_no_node_did_it(tmp_pat
                     ("moved", "pr2", None),
                 ]
         await memory.flush()
-        assert_same((await told_by_memory(memory))[: len(chronicle.entries)], chronicle.entries)
+        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
         milk = await every(memory, select(ObjectRow).where(ObjectRow.name == "milk").order_by(ObjectRow.id))
         assert [at(row.pose) for row in milk] == [
             (1.3, 1.0, 0.9),
@@ -252,7 +254,7 @@ async def test_a_reset_between_rollouts_is_remembered_and_no_node_did_it(tmp_pat
         assert [row.node_id is None for row in milk] == [True, False, True, False, True]
 
 
-async def test_each_episode_in_one_world_begins_with_all_that_is_there(tmp_path: Path) -> None:
+async def test_each_episode_in_one_world_begins_with_all_its_objects(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         with lab() as scene:
             async with memory.episode(description="first"):
@@ -268,19 +270,19 @@ async def test_each_episode_in_one_world_begins_with_all_that_is_there(tmp_path:
             await NoteActionPerformable("in an episode of its own").perform()
         await memory.flush()
         assert memory.status.faults.total == 0
-        told = await told_by_memory(memory, 2)
-        # What was attached when the episode began is told after what is there.
-        assert told[3].what[:4] == ("attached", "pr2", "milk", ARM)
-        assert [each.what[:2] for each in told[:3]] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
-        assert (told[0].what[3]["l_gripper_l_finger_joint"], told[2].what[2][:3]) == (0.0, (9, 9, 9))
-        assert_same(told[4:], chronicle.entries)
-        third = await told_by_memory(memory, 3)
+        in_memory = await read_from_memory(memory, 2)
+        # Attachments at the beginning of the episode follow its objects.
+        assert in_memory[3].what[:4] == ("attached", "pr2", "milk", ARM)
+        assert [each.what[:2] for each in in_memory[:3]] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
+        assert (in_memory[0].what[3]["l_gripper_l_finger_joint"], in_memory[2].what[2][:3]) == (0.0, (9, 9, 9))
+        assert_same(in_memory[4:], chronicle.entries)
+        third = await read_from_memory(memory, 3)
         assert [each.what[:2] for each in third] == [("added", "pr2"), ("added", "milk"), ("added", "cereal")]
         assert third[2].what[2][:3] == (8, 8, 8)
 
 
-class Meddler:
-    """Does whatever can be done to the objects of a world, at random."""
+class RandomChanger:
+    """Apply every operation to the objects of a world, at random."""
 
     def __init__(self, scene: Lab, seed: int) -> None:
         self.rng = random.Random(seed)
@@ -288,16 +290,16 @@ class Meddler:
         self.made = 0
         self.state = scene.world.save_state()
 
-    def meddle(self) -> None:
+    def change(self) -> None:
         choices = [self.move, self.move, self.turn, self.attach, self.detach, self.add, self.remove]
         self.rng.choice([*choices, self.reset, self.save, self.restore])()
 
-    def anything(self) -> Object:
+    def any_change(self) -> Object:
         return self.rng.choice(self.world.objects)
 
     def move(self) -> None:
         place = [self.rng.uniform(-3, 3) for _ in range(3)]
-        self.anything().set_pose(Pose(place, [self.rng.gauss(0, 1) for _ in range(4)]))
+        self.any_change().set_pose(Pose(place, [self.rng.gauss(0, 1) for _ in range(4)]))
 
     def turn(self) -> None:
         robot = self.world.object("pr2")
@@ -305,7 +307,7 @@ class Meddler:
         robot.set_joint_positions({joint: self.rng.uniform(0, 0.3) for joint in joints})
 
     def attach(self) -> None:
-        parent, child = self.anything(), self.anything()
+        parent, child = self.any_change(), self.any_change()
         above: Object | None = parent
         while above is not None and above is not child:
             above = above.attached_to
@@ -323,9 +325,9 @@ class Meddler:
         Object(f"bowl {self.made}", ObjectType.BOWL, pose=Pose([self.made, 0, 0]), world=self.world)
 
     def remove(self) -> None:
-        thing = self.anything()
-        if thing.object_type is ObjectType.BOWL:
-            thing.remove()
+        world_object = self.any_change()
+        if world_object.object_type is ObjectType.BOWL:
+            world_object.remove()
 
     def reset(self) -> None:
         self.world.reset()
@@ -334,26 +336,26 @@ class Meddler:
         self.state = self.world.save_state()
 
     def restore(self) -> None:
-        names = {thing.name for thing in self.world.objects}
+        names = {world_object.name for world_object in self.world.objects}
         if set(self.state.objects) <= names:
             self.world.restore_state(self.state)
 
 
 @pytest.mark.parametrize("seed", range(3))
-async def test_whatever_happens_to_a_world_is_remembered(tmp_path: Path, seed: int) -> None:
-    async with remembered(tmp_path):
+async def test_every_operation_on_a_world_is_recorded(tmp_path: Path, seed: int) -> None:
+    async with recorded(tmp_path):
         chronicle = Chronicle()
         with lab(chronicle) as scene:
-            meddler = Meddler(scene, seed)
+            meddler = RandomChanger(scene, seed)
             for index in range(300):
                 if index % 3:
-                    await RearrangingActionPerformable(meddler.meddle).perform()
+                    await RearrangingActionPerformable(meddler.change).perform()
                 else:
-                    meddler.meddle()
-                chronicle.assert_nothing_untold(scene.world)
+                    meddler.change()
+                chronicle.assert_no_unreported_change(scene.world)
     async with Reading.open(url_of(tmp_path)) as reading:
-        told = await told_by_memory(reading)
-    assert_same(told[: len(chronicle.entries)], chronicle.entries)
+        in_memory = await read_from_memory(reading)
+    assert_same(in_memory[: len(chronicle.entries)], chronicle.entries)
     kinds = {each.what[0] for each in chronicle.entries}
     assert kinds == {"added", "moved", "joints", "attached", "detached", "removed"}
     assert {each.cause for each in chronicle.entries} == {None, "RearrangingAction"}

@@ -1,4 +1,4 @@
-"""A program of a user type-checks strictly against the installed package, and mistakes in it are found."""
+"""A user's program type-checks strictly against the installed package, and its mistakes are reported."""
 
 from __future__ import annotations
 
@@ -156,13 +156,13 @@ class Rate(Projection):
 
 
 def checked(folder: Path, program: str) -> subprocess.CompletedProcess[str]:
-    """What mypy prints for this program, which lies outside the package's folder."""
+    """Return the output of mypy for this program, which is outside the package's folder."""
     (folder / "program.py").write_text(program)
     command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(folder / "cache"), "program.py"]
     return subprocess.run(command, cwd=folder, env=environment(), capture_output=True, text=True, check=False)
 
 
-def test_a_program_of_a_user_is_typed_and_its_mistakes_are_found(tmp_path: Path) -> None:
+def test_a_users_program_is_typed_and_its_mistakes_are_reported(tmp_path: Path) -> None:
     done = checked(tmp_path, PROGRAM)
     assert done.stdout.startswith("Success: no issues found in 1 source file"), done.stdout
     wrong = PROGRAM.replace('GreetActionPerformable("Ada")', "GreetActionPerformable(1)")

@@ -1,4 +1,4 @@
-"""A thousand random plans: what the memory holds of each is what its parts say of themselves."""
+"""A thousand random plans: the memory of each agrees with what its parts report."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract
-from tests.promises.random_plans import AT_ONCE, Entry, Generator, Journal, Thing, built
+from tests.promises.random_plans import AT_ONCE, Generator, Journal, JournalEntry, PlanPart, built
 
 pytestmark = pytest.mark.slow
 
 PLANS = 1_000
 PARTS = 4
-"""A part holds plans of every kind, so one of them runs by default and the others in turns."""
+"""A part has plans of every kind, so that one part runs by default and the others in turns."""
 
 Row = tuple[str, int | None, str, str | None, str | None]
-"""dtype, which row is the parent, status, class and message of the failure."""
+"""Dtype, the index of the parent's row, status, and class and message of the failure."""
 
 SQL = """
 SELECT description, node.id, parent_id, dtype, node.status, reason, node.failure_message
@@ -32,16 +32,16 @@ ORDER BY node.id
 """
 
 
-def plan_of(seed: int) -> Thing:
+def plan_of(seed: int) -> PlanPart:
     return Generator(seed, wild=seed % 5 > 2, greedy=seed % 5 == 2).plan()
 
 
 async def play(seed: int, memory: Memory) -> Journal:
     """Perform the plan of this seed in an episode of its own; every second wild one is cancelled from outside."""
-    thing = plan_of(seed)
-    journal = Journal(thing)
+    part = plan_of(seed)
+    journal = Journal(part)
     async with memory.episode(description=str(seed)):
-        plan = asyncio.create_task(built(thing, journal).perform())
+        plan = asyncio.create_task(built(part, journal).perform())
         if seed % 5 == 4:
             for _ in range(random.Random(-seed).randrange(60)):
                 await asyncio.sleep(0)
@@ -55,8 +55,10 @@ async def play(seed: int, memory: Memory) -> Journal:
     return journal
 
 
-def remembered(file: Path) -> dict[int, list[Row]]:
-    """The trees in the database, by seed, in the order their nodes started, without the roots of the episodes."""
+def recorded(file: Path) -> dict[int, list[Row]]:
+    """Return the trees in the database, by seed, in the order their nodes started, without the roots of the
+    episodes.
+    """
     with closing(sqlite3.connect(file)) as database:
         rows = database.execute(SQL).fetchall()
     places: dict[int, int] = {}
@@ -69,12 +71,12 @@ def remembered(file: Path) -> dict[int, list[Row]]:
     return trees
 
 
-def told(journal: Journal) -> list[Row]:
+def expected_rows(journal: Journal) -> list[Row]:
     return [(each.dtype, each.parent, each.status, each.reason, each.message) for each in journal.entries]
 
 
 @pytest.mark.parametrize("part", [0, *(pytest.param(part, marks=pytest.mark.soak) for part in range(1, PARTS))])
-async def test_what_is_remembered_of_a_random_plan_is_what_its_parts_say(tmp_path: Path, part: int) -> None:
+async def test_the_memory_of_a_random_plan_agrees_with_the_reports_of_its_parts(tmp_path: Path, part: int) -> None:
     journals: dict[int, Journal] = {}
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         for seed in range(part, PLANS, PARTS):
@@ -82,16 +84,16 @@ async def test_what_is_remembered_of_a_random_plan_is_what_its_parts_say(tmp_pat
                 journals[seed] = await play(seed, memory)
         await memory.flush()
         assert memory.status.faults.total == 0
-    trees = remembered(tmp_path / "memory.db")
+    trees = recorded(tmp_path / "memory.db")
     assert set(trees) == {seed for seed, journal in journals.items() if journal.entries}
     for seed, journal in journals.items():
-        assert trees.get(seed, []) == told(journal), f"seed {seed}: {plan_of(seed)}"
+        assert trees.get(seed, []) == expected_rows(journal), f"seed {seed}: {plan_of(seed)}"
         assert journal.collisions == [], f"seed {seed}: two branches held the same part of the robot"
         assert all(each.status != "RUNNING" for each in journal.entries), f"seed {seed}"
 
 
-async def test_random_plans_of_each_status_and_depth_were_among_them() -> None:
-    # Else the test above would prove little. Without a memory: the journals are the same.
+async def test_the_random_plans_include_each_status_and_depth() -> None:
+    # Otherwise the test above would prove little. Without a memory the journals are the same.
     seen: dict[str, int] = defaultdict(int)
     async with Memory.open("sqlite://") as memory:
         for seed in range(300):
@@ -102,39 +104,39 @@ async def test_random_plans_of_each_status_and_depth_were_among_them() -> None:
     for status in ("SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED"):
         assert seen[status] > 20, (status, seen)
     for name in "Sequential TryInOrder Parallel TryAll Repeat Retry Monitor Action".split():
-        assert seen[f"Told{name}"] > 50, (name, seen)
+        assert seen[f"Journaled{name}"] > 50, (name, seen)
     for name in "PlanFailures ExceptionGroup ResourceDeadlock ValueError Timeout".split():
         assert seen[f"reason {name}"] > 0, (name, seen)
 
 
-# --- what the plan language means, said a second time ---------------------------------------------------------------
+# --- a second implementation of the plan language ---------------------------------------------------------------------
 
 Tree = tuple[tuple[int, ...], bool, list["Tree"]]
-"""Path, whether it succeeded, what it performed."""
+"""Path, whether it succeeded, and the results of its children."""
 
 
-class Meaning:
-    """Goes through a plan without bugs, cancellations, monitors and turns as the language says it goes."""
+class Interpreter:
+    """Interpret a plan without bugs, cancellations, monitors and resources by the rules of the language."""
 
     def __init__(self) -> None:
         self.runs: dict[tuple[int, ...], int] = defaultdict(int)
 
-    def of(self, thing: Thing) -> Tree:
-        if thing.kind == "leaf":
-            run = self.runs[thing.path]
-            self.runs[thing.path] += 1
-            return thing.path, thing.does[run % len(thing.does)] == "ok", []
+    def of(self, part: PlanPart) -> Tree:
+        if part.kind == "leaf":
+            run = self.runs[part.path]
+            self.runs[part.path] += 1
+            return part.path, part.does[run % len(part.does)] == "ok", []
         done: list[Tree] = []
-        for each in self.turns(thing):
+        for each in self.turns(part):
             done.append(self.of(each))
-            if self.is_over(thing.kind, succeeded=done[-1][1]):
+            if self.is_over(part.kind, succeeded=done[-1][1]):
                 break
-        return thing.path, self.succeeded(thing.kind, [success for _, success, _ in done]), done
+        return part.path, self.succeeded(part.kind, [success for _, success, _ in done]), done
 
-    def turns(self, thing: Thing) -> list[Thing]:
-        if thing.kind in ("repeat", "retry"):
-            return thing.children * thing.times
-        return thing.children[: thing.times] if thing.kind == "alternatives" else thing.children
+    def turns(self, part: PlanPart) -> list[PlanPart]:
+        if part.kind in ("repeat", "retry"):
+            return part.children * part.times
+        return part.children[: part.times] if part.kind == "alternatives" else part.children
 
     def is_over(self, kind: str, *, succeeded: bool) -> bool:
         if kind in ("in_order", "retry", "alternatives"):
@@ -147,28 +149,28 @@ class Meaning:
         return any(successes) if kind in ("in_order", "retry", "alternatives", "all") else all(successes)
 
 
-def tree_of(entries: list[Entry], root: int = 0) -> Tree:
-    """What the journal says, as a tree; what ran at once in the order it was written."""
+def tree_of(entries: list[JournalEntry], root: int = 0) -> Tree:
+    """Return the journal as a tree, with concurrent runs in the order in which they are written."""
     entry = entries[root]
     inside = [tree_of(entries, number) for number, each in enumerate(entries) if each.parent == root]
-    if entry.thing.kind in AT_ONCE:
+    if entry.part.kind in AT_ONCE:
         inside.sort(key=lambda each: each[0])
-    return entry.thing.path, entry.status == "SUCCEEDED", inside
+    return entry.part.path, entry.status == "SUCCEEDED", inside
 
 
 @pytest.mark.parametrize("plans", [PLANS // PARTS, pytest.param(PLANS, marks=pytest.mark.soak)])
-async def test_an_ordinary_random_plan_does_what_the_language_means(plans: int) -> None:
+async def test_an_ordinary_random_plan_follows_the_rules_of_the_language(plans: int) -> None:
     async with Memory.open("sqlite://") as memory:
         for seed in range(0, plans, 5):
             for each in (seed, seed + 1):
                 journal = await play(each, memory)
-                assert tree_of(journal.entries) == Meaning().of(plan_of(each)), f"seed {each}: {plan_of(each)}"
+                assert tree_of(journal.entries) == Interpreter().of(plan_of(each)), f"seed {each}: {plan_of(each)}"
 
 
-# --- at once ----------------------------------------------------------------------------------------------------------
+# --- concurrency ------------------------------------------------------------------------------------------------------
 
 
-async def test_plans_in_tasks_of_their_own_never_share_a_parent(tmp_path: Path) -> None:
+async def test_concurrent_plans_in_tasks_never_share_a_parent(tmp_path: Path) -> None:
     journals: dict[int, Journal] = {}
 
     async def some(first: int) -> None:
@@ -180,13 +182,13 @@ async def test_plans_in_tasks_of_their_own_never_share_a_parent(tmp_path: Path) 
             for first in range(3):
                 group.create_task(some(first))
         await memory.flush()
-    trees = remembered(tmp_path / "memory.db")
+    trees = recorded(tmp_path / "memory.db")
     for seed, journal in journals.items():
-        assert trees.get(seed, []) == told(journal), f"seed {seed}: {plan_of(seed)}"
+        assert trees.get(seed, []) == expected_rows(journal), f"seed {seed}: {plan_of(seed)}"
 
 
 class Threads(ActionAbstract):
-    """Performs three plans, each in a thread of its own with a copy of the context."""
+    """Perform three plans, each in a thread of its own with a copy of the context."""
 
     def __init__(self, journals: list[Journal]) -> None:
         self.journals = journals
@@ -204,7 +206,7 @@ class Threads(ActionAbstract):
             task.exception()
 
 
-async def test_plans_in_threads_of_their_own_never_share_a_parent(tmp_path: Path) -> None:
+async def test_concurrent_plans_in_threads_never_share_a_parent(tmp_path: Path) -> None:
     seeds = [seed for seed in range(60) if seed % 5 < 2]
     rounds = [[Journal(plan_of(seed)) for seed in seeds[number : number + 3]] for number in range(0, len(seeds), 3)]
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
@@ -212,13 +214,15 @@ async def test_plans_in_threads_of_their_own_never_share_a_parent(tmp_path: Path
             async with memory.episode(description=str(number)):
                 await Threads(journals).perform()
         await memory.flush()
-    trees = remembered(tmp_path / "memory.db")
+    trees = recorded(tmp_path / "memory.db")
     for number, journals in enumerate(rounds):
-        assert sorted(shapes(trees[number])) == sorted(shape for each in journals for shape in shapes(told(each)))
+        assert sorted(shapes(trees[number])) == sorted(
+            shape for each in journals for shape in shapes(expected_rows(each))
+        )
 
 
 def shapes(rows: list[Row]) -> list[str]:
-    """What is below each root (or below `Threads`), as text, in order."""
+    """Return the trees below each root (or below `Threads`), as text, in order."""
     texts = [f"{dtype} {status} {reason} {message}" for dtype, _, status, reason, message in rows]
     children: dict[int | None, list[int]] = defaultdict(list)
     for number, (_, parent, *_) in enumerate(rows):

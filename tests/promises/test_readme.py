@@ -1,4 +1,4 @@
-"""The pages of documentation do what they say: plans run, queries are answered, commands and links exist."""
+"""The documentation is correct: its plans run, its queries have answers, and its commands and links exist."""
 
 import asyncio
 import contextlib
@@ -27,7 +27,7 @@ README = PAGES["README.md"]
 
 
 def python_of(page: str) -> list[str]:
-    """The blocks of Python on a page."""
+    """Return the blocks of Python on a page."""
     return re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL)
 
 
@@ -44,7 +44,7 @@ def test_the_readme_is_short_and_every_link_of_a_page_leads_to_a_file() -> None:
             assert (ROOT / page).parent.joinpath(link).exists(), f"{page} links to {link}"
 
 
-def test_the_commands_after_the_plan_run_one_after_the_other(tmp_path: Path) -> None:
+def test_the_commands_after_the_plan_run_in_order(tmp_path: Path) -> None:
     (tmp_path / "hello.py").write_text(PLAN)
     [commands] = re.findall(r"<!-- run: own plan -->\n```sh\n(.*?)```", README, re.DOTALL)
     lines = [shlex.split(line, comments=True) for line in commands.splitlines()]
@@ -54,7 +54,7 @@ def test_the_commands_after_the_plan_run_one_after_the_other(tmp_path: Path) -> 
         assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
+def test_the_plan_runs_and_is_recorded(tmp_path: Path) -> None:
     (tmp_path / "hello.py").write_text(PLAN)
     done = pycrorm("run", "hello.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -71,7 +71,7 @@ def test_the_plan_runs_and_is_remembered(tmp_path: Path) -> None:
     ]
 
 
-def test_the_plan_that_says_all_a_plan_can_say_runs_and_the_milk_is_where_it_shall_be(tmp_path: Path) -> None:
+def test_the_plan_with_every_expression_runs_and_the_milk_is_at_its_goal(tmp_path: Path) -> None:
     (tmp_path / "tidy.py").write_text(TIDY)
     done = pycrorm("run", "tidy.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -86,7 +86,7 @@ def test_the_plan_that_says_all_a_plan_can_say_runs_and_the_milk_is_where_it_sha
     assert resting == pytest.approx((1.3, 0.45, 0.95), abs=1e-6)
 
 
-def test_what_a_robot_of_ones_own_perceives_is_in_the_table(tmp_path: Path) -> None:
+def test_the_percepts_of_a_users_robot_are_in_the_table(tmp_path: Path) -> None:
     (tmp_path / "stereo.py").write_text(STEREO)
     done = pycrorm("run", "stereo.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -98,7 +98,7 @@ def test_what_a_robot_of_ones_own_perceives_is_in_the_table(tmp_path: Path) -> N
         ]
 
 
-async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_the_queries_have_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     imports, _, rest = QUESTIONS.partition("async with Memory")
@@ -116,7 +116,7 @@ async def test_the_questions_are_answered(tmp_path: Path, monkeypatch: pytest.Mo
     assert await asyncio.to_thread((tmp_path / "memory.db").exists)
 
 
-async def test_what_is_performed_after_a_memory_and_a_world_were_connected_is_remembered(
+async def test_a_perform_after_a_memory_and_a_world_were_connected_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -129,7 +129,7 @@ async def test_what_is_performed_after_a_memory_and_a_world_were_connected_is_re
     assert performed == [(None, "SUCCEEDED"), ("NavigateAction", "SUCCEEDED"), ("MoveMotion", "SUCCEEDED")]
 
 
-def test_the_projection_of_ones_own_counts_what_was_tried(tmp_path: Path) -> None:
+def test_the_users_projection_counts_the_attempts(tmp_path: Path) -> None:
     (tmp_path / "tidy.py").write_text(TIDY)
     (tmp_path / "rates.py").write_text(RATE)
     done = pycrorm("run", "tidy.py", "--projection", "rates:GraspRate", cwd=tmp_path)
@@ -141,7 +141,7 @@ def test_the_projection_of_ones_own_counts_what_was_tried(tmp_path: Path) -> Non
     assert [status for *_, status in tried] == ["SUCCEEDED"]
 
 
-async def test_actions_say_how_long_they_took(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+async def test_actions_have_their_durations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "tidy.py").write_text(TIDY)
     done = await asyncio.to_thread(pycrorm, "run", "tidy.py", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -204,7 +204,7 @@ async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
     assert frame.object.tolist() == [None]
 
 
-async def test_a_moment_is_told_and_made_again_in_another_world(
+async def test_a_snapshot_is_printed_and_restored_in_another_world(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -236,10 +236,10 @@ with BulletWorld() as world:
         *_, there = plain.execute(f"{question} ORDER BY object.id", ((1 << 31) + (116 << 5),)).fetchall()
     assert pose.position == recorded.position == pytest.approx(there)
     assert held == (then.world.object("milk").attached_to is not None)
-    assert holding.name == "pr2"  # it has picked up the milk again
+    assert holding.name == "pr2"  # it holds the milk again
 
 
-async def test_a_policy_is_learned_from_what_is_remembered_and_used(
+async def test_a_policy_is_learned_from_the_recorded_rollouts_and_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -255,7 +255,7 @@ async def test_a_policy_is_learned_from_what_is_remembered_and_used(
     assert statuses == ["SUCCEEDED"]
 
 
-def test_every_verb_the_readme_names_exists(tmp_path: Path) -> None:
+def test_every_verb_in_the_readme_exists(tmp_path: Path) -> None:
     verbs = set(re.findall(r"^pycrorm (\w+)", README, re.MULTILINE))
     assert verbs == {
         "demo",

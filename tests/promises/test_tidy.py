@@ -60,7 +60,7 @@ def names_of(paths: list[Path]) -> list[str]:
 
 
 def replaced_in(paths: list[Path]) -> list[str]:
-    """The places at which prose has a word that the glossary replaces."""
+    """Return the places at which prose has a word that the glossary replaces."""
     found = {
         f"{path.relative_to(ROOT)}:{line}: {match.group()}"
         for path in paths

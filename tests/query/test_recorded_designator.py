@@ -31,7 +31,7 @@ from pycrorm_async.query.recorded_designator import NotPerformable
 from pycrorm_async.world import Arms, Object, ObjectType, Pose
 from pycrorm_async.world.errors import NoWorld, ObjectNotInWorld
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import CEREAL_AT, Lab, asked, lab, remembered, url_of
+from tests.promises.lab import CEREAL_AT, Lab, asked, lab, recorded, url_of
 
 pytestmark = pytest.mark.slow
 
@@ -120,7 +120,7 @@ def cooking(scene: Lab) -> CookActionPerformable:
 
 @pytest.mark.parametrize("options", [(), (undefer(Designator.parameters),)])
 async def test_every_kind_of_parameter_comes_back(tmp_path: Path, options: tuple[Any, ...]) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             cooked = cooking(scene)
             await cooked.perform()
@@ -152,7 +152,7 @@ async def test_every_kind_of_parameter_comes_back(tmp_path: Path, options: tuple
 
 
 async def test_arguments_of_a_class_that_is_no_dataclass_come_back_and_may_be_replaced(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         for mixed in (
             MixActionPerformable("a", 1, 2, speed=0.5, sugar="much"),
             MixActionPerformable("b"),
@@ -169,7 +169,7 @@ async def test_arguments_of_a_class_that_is_no_dataclass_come_back_and_may_be_re
 
 async def test_a_motion_comes_back_with_its_joints(tmp_path: Path) -> None:
     targets = {"l_wrist_roll_joint": 0.5}
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab():
             await MoveArmJointsMotion(targets).perform()
     (row,) = await asked(tmp_path, select(Designator))
@@ -215,7 +215,7 @@ async def test_a_parameter_that_was_not_recorded_is_named_with_the_reason_and_ma
 
 
 async def test_objects_and_places_that_the_present_world_lacks_are_named(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             await cooking(scene).perform()
     (row,) = await asked(tmp_path, select(Action))
@@ -229,7 +229,7 @@ async def test_objects_and_places_that_the_present_world_lacks_are_named(tmp_pat
 
 
 async def test_a_class_that_is_not_imported_and_one_that_is_there_twice_are_named(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         await NoteActionPerformable("once").perform()
         await (NoteActionPerformable("a") + NoteActionPerformable("b")).perform()
     row, sequence, *_ = await asked(tmp_path, select(Designator).order_by(Designator.id))
@@ -258,7 +258,7 @@ async def test_a_class_that_is_not_imported_and_one_that_is_there_twice_are_name
 
 
 async def test_values_that_no_longer_fit_the_class_are_refused(tmp_path: Path) -> None:
-    async with remembered(tmp_path):
+    async with recorded(tmp_path):
         with lab() as scene:
             await cooking(scene).perform()
             await NavigateActionPerformable(Pose([1, 0, 0])).perform()
