@@ -23,7 +23,16 @@ from pycrorm_async.orm.actions import (
     SetGripperAction,
     TransportAction,
 )
-from pycrorm_async.orm.base import Base, Pose, Position, ProcessMetaData, Quaternion, RobotState
+from pycrorm_async.orm.base import (
+    Base,
+    Concept,
+    ConceptAncestor,
+    Pose,
+    Position,
+    ProcessMetaData,
+    Quaternion,
+    RobotState,
+)
 from pycrorm_async.orm.designators import Action, Designator, DesignatorType, Language, Motion, ParameterItem
 from pycrorm_async.orm.language import Code, Monitor, Parallel, Repeat, Retry, Sequential, TryAll, TryInOrder
 from pycrorm_async.orm.motions import (
@@ -45,6 +54,7 @@ from pycrorm_async.orm.objects import (
     JointChange,
     LocatedObject,
     Object,
+    ObjectConcept,
     ObjectPart,
     ObjectRemoval,
 )
@@ -59,6 +69,9 @@ __all__ = [
     "Quaternion",
     "Pose",
     "RobotState",
+    "Concept",
+    "ConceptAncestor",
+    "ObjectConcept",
     "Object",
     "ObjectPart",
     "BelieveObject",

@@ -11,7 +11,18 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import Any, ClassVar, TypeVar
 
-from sqlalchemy import BigInteger, Boolean, ColumnElement, Double, ForeignKey, Text, inspect, literal_column
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    ColumnElement,
+    Double,
+    ForeignKey,
+    Text,
+    inspect,
+    literal_column,
+    or_,
+    select,
+)
 from sqlalchemy.exc import MissingGreenlet, StatementError
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.ext.hybrid import hybrid_property
@@ -30,6 +41,9 @@ __all__ = [
     "named_if_unloaded",
     "on_request",
     "HybridOnRequest",
+    "Concept",
+    "ConceptAncestor",
+    "is_concept",
     "ProcessMetaData",
     "Position",
     "Quaternion",
@@ -132,6 +146,36 @@ class HybridOnRequest(hybrid_property[_Value]):
         if instance is None:  # `undefer` asks an attribute for its columns, which SQLAlchemy 2.1 cannot answer here
             attribute._column_strategy_attrs = lambda: [getattr(owner, f"_{self.__name__}")]  # noqa: SLF001
         return attribute
+
+
+class Concept(Base):
+    """A class of the ontology (SOMA, DUL) and one of its superclasses: several rows if it has several.
+
+    Attributes:
+        parent: its superclass; None for the topmost concepts, such as `Task` and `PhysicalObject`.
+        source: the ontology that defines it, with its version.
+    """
+
+    __tablename__ = "concept"
+
+    name: Mapped[str] = mapped_column(primary_key=True)
+    parent: Mapped[str | None] = mapped_column(primary_key=True)
+    source: Mapped[str]
+
+
+class ConceptAncestor(Base):
+    """A pair of a concept and one of its superclasses, however far up, or itself."""
+
+    __tablename__ = "concept_ancestor"
+
+    concept: Mapped[str] = mapped_column(primary_key=True)
+    ancestor: Mapped[str] = mapped_column(primary_key=True)
+
+
+def is_concept(column: ColumnElement[Any], concept: str) -> ColumnElement[bool]:
+    """Return the condition that a column names this concept or one of its subclasses."""
+    below = select(ConceptAncestor.concept).where(ConceptAncestor.ancestor == concept)
+    return or_(column == concept, column.in_(below))
 
 
 class ProcessMetaData(Base):

@@ -21,12 +21,12 @@ from __future__ import annotations
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Dialect, ForeignKey, String
+from sqlalchemy import ColumnElement, Dialect, ForeignKey, String, select
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
 
-from pycrorm_async.orm.base import Base, HybridOnRequest, Pose, ProcessMetaData, RobotState, RowOfEvent
+from pycrorm_async.orm.base import Base, HybridOnRequest, Pose, ProcessMetaData, RobotState, RowOfEvent, is_concept
 from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import JsonText
@@ -242,6 +242,15 @@ class Designator(RowOfEvent, Base):
     def node(self) -> TaskTreeNode:
         """Its node of the task tree. Raises `CallerError` if it is not loaded."""
         return self._node
+
+    @classmethod
+    def is_a(cls, concept: str) -> ColumnElement[bool]:
+        """Return the condition that its type's SOMA concept is this one or a subclass of it.
+
+        >>> manipulations = select(Action).where(Action.is_a("Manipulating"))
+        """
+        types = select(DesignatorType.dtype).where(is_concept(DesignatorType.__table__.c.concept, concept))
+        return cls.dtype.in_(types)
 
     def entries(self, field: str) -> list[Any]:
         """Return the values of a list field, in order."""

@@ -10,20 +10,38 @@ from __future__ import annotations
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ForeignKey
+from sqlalchemy import ColumnElement, ForeignKey, select
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, on_request
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, is_concept, on_request
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
 
 if TYPE_CHECKING:
     from pycrorm_async.orm.tree import TaskTreeNode
 
-__all__ = ["Object", "ObjectPart", "BelieveObject", "LocatedObject", "ObjectRemoval", "Attachment", "JointChange"]
+__all__ = [
+    "ObjectConcept",
+    "Object",
+    "ObjectPart",
+    "BelieveObject",
+    "LocatedObject",
+    "ObjectRemoval",
+    "Attachment",
+    "JointChange",
+]
 
 _STEPS_MAX = 6
 """Bounds the relationships between a query's class and an `ObjectPart` with a loaded `part_of`; no class needs more."""
+
+
+class ObjectConcept(Base):
+    """The SOMA concept of an object type, such as `MilkPack` of `MILK`."""
+
+    __tablename__ = "object_concept"
+
+    obj_type: Mapped[ObjectType] = mapped_column(primary_key=True)
+    concept: Mapped[str]
 
 
 class Object(RowOfEvent, Base):
@@ -55,6 +73,15 @@ class Object(RowOfEvent, Base):
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
+
+    @classmethod
+    def is_a(cls, concept: str) -> ColumnElement[bool]:
+        """Return the condition that the SOMA concept of its type is this one or a subclass of it.
+
+        >>> tableware = select(Object).where(Object.is_a("Tableware"))
+        """
+        types = select(ObjectConcept.obj_type).where(is_concept(ObjectConcept.__table__.c.concept, concept))
+        return cls.obj_type.in_(types)
 
     node: Mapped[TaskTreeNode | None] = synonym("_node", descriptor=on_request("node"))
 

@@ -40,6 +40,7 @@ from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.pick_up_view import pick_ups_with_context
 from pycrorm_async.projections.schema.root_failure_view import root_failures
 from pycrorm_async.projections.schema.tables import CORE, OWN, column_type, make_table
+from pycrorm_async.projections.schema.views.concept_views import concept_views
 
 __all__ = ["public_views", "projection_views", "View"]
 
@@ -140,7 +141,7 @@ def public_views(
         view = pick_ups_with_context(picked, node, object_, pose, layout.dtypes(_PICKED))
         views["PickUpWithContextView"] = shown(view, node)
     views["designator_type"] = _designator_type(layout)
-    return views
+    return {**views, **concept_views()}
 
 
 def projection_views(

@@ -1,0 +1,1 @@
+"""Views that are computed from the tables and from facts of the field."""

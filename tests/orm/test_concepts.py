@@ -1,0 +1,94 @@
+"""Queries by concept of SOMA find the subclasses of the concept, for tasks and for objects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
+from pycrorm_async.events.fields import table_name
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded
+from pycrorm_async.orm import Action, Concept, ConceptAncestor, Designator, Object, PickUpAction
+from pycrorm_async.plan import ActionAbstract, BaseMotion
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.enums import ObjectType
+from tests.projections.event_script import Script, declarations, declared, field, name_of, pose
+from tests.projections.sql_queries import stored_and_folded
+
+
+def of_concept(dtype: str, concept: str | None) -> DesignatorTypeDeclared:
+    return msgspec.structs.replace(declared(dtype, table_name(dtype), field("what", "text", 2)), concept=concept)
+
+
+TYPES = (
+    of_concept("GraspingAction", "Grasping"),
+    of_concept("LookAtAction", "LookingAt"),
+    of_concept("GreetAction", "Greeting"),
+    of_concept("WaitAction", None),
+)
+
+
+def recorded_types(base: Any) -> Iterator[Any]:
+    for each in base.__subclasses__():
+        yield each
+        yield from recorded_types(each)
+
+
+def test_every_concept_of_the_built_in_types_has_its_superclasses() -> None:
+    types = (*recorded_types(ActionAbstract), *recorded_types(BaseMotion))
+    used = {each.concept for each in types if each.__module__.startswith("pycrorm_async.")}
+    assert used - {None} <= CONCEPTS.keys()
+    assert {each.name for each in ObjectType} == CONCEPT_OF_OBJECT_TYPE.keys()
+    assert {*CONCEPT_OF_OBJECT_TYPE.values()} <= CONCEPTS.keys()
+    for each in used - {None}:
+        assert [*ancestors(str(each))][-1] == "Task"
+    for each in CONCEPT_OF_OBJECT_TYPE.values():
+        assert [*ancestors(each)][-1] == "PhysicalObject"
+    assert [*ancestors("LookingFor")] == [
+        "LookingFor", "Perceiving", "InformationAcquisition", "PhysicalTask", "MentalTask", "Task",
+    ]  # fmt: skip
+    assert [*ancestors("Greeting")] == ["Greeting"]
+
+
+@pytest.mark.slow
+async def test_a_question_for_a_concept_finds_its_subclasses(log: EventLog) -> None:
+    script = Script()
+    for name, kind in (("milk", "MILK"), ("bowl", "BOWL"), ("spoon", "SPOON"), ("pr2", "ROBOT")):
+        script.put(ObjectAdded(name, kind, pose()))
+    for each in TYPES:
+        script.put(NodeStarted("action", None, name_of(each), {"what": "it"}))
+    await stored_and_folded(log, [*declarations(*TYPES), *script.records])
+    reading = Reading(log)
+    async with reading.session() as session:
+
+        async def performed(concept: str) -> list[str]:
+            query = select(Action.dtype).where(Action.is_a(concept)).order_by(Action.id)
+            return list((await session.scalars(query)).all())
+
+        assert await performed("PhysicalTask") == ["GraspingAction", "LookAtAction"]
+        assert await performed("Manipulating") == await performed("Grasping") == ["GraspingAction"]
+        assert await performed("Greeting") == ["GreetAction"]
+        assert await performed("MentalTask") == []
+        assert (await session.scalars(select(PickUpAction).where(PickUpAction.is_a("PhysicalTask")))).all() == []
+        assert len((await session.scalars(select(Designator).where(Designator.is_a("Task")))).all()) == 2
+        names = select(Object.name).where(Object.is_a("Tableware")).order_by(Object.id)
+        assert (await session.scalars(names)).all() == ["bowl", "spoon"]
+        above = select(ConceptAncestor.ancestor).where(ConceptAncestor.concept == "MilkPack")
+        assert set(await session.scalars(above)) == {*ancestors("MilkPack")}
+        looking = (await session.scalars(select(Concept).where(Concept.name.in_(["Perceiving", "Task"])))).all()
+        assert sorted((each.name, each.parent or "", each.source) for each in looking) == [
+            ("Perceiving", "InformationAcquisition", "SOMA 2.1.0"),
+            ("Perceiving", "PhysicalTask", "SOMA 2.1.0"),
+            ("Task", "", "DUL 3.32"),
+        ]
+    by_hand = (
+        "SELECT action.dtype FROM action JOIN designator_type USING (dtype) JOIN concept_ancestor USING (concept)"
+        " WHERE ancestor = 'Manipulating'"
+    )
+    async with log.engine.connect() as connection:
+        assert (await connection.exec_driver_sql(by_hand)).scalars().all() == ["GraspingAction"]
