@@ -10,7 +10,10 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-__all__ = ["Clock", "SYSTEM_CLOCK", "monotonic_ns"]
+__all__ = ["Clock", "ClockQuality", "SYSTEM_CLOCK", "clock_quality", "monotonic_ns"]
+
+_CLOCK_UNSYNCHRONIZED = 5
+"""TIME_ERROR of adjtimex(2): no time service has synchronized the clock."""
 
 
 class Clock(NamedTuple):
@@ -22,3 +25,39 @@ class Clock(NamedTuple):
 
 SYSTEM_CLOCK = Clock(wall_ns=time.time_ns, monotonic_ns=time.monotonic_ns)
 monotonic_ns = time.monotonic_ns
+
+
+class ClockQuality(NamedTuple):
+    """The quality of the system's wall clock, as the kernel knows it from the time service (NTP, PTP).
+
+    Attributes:
+        synchronized: whether a time service keeps the clock synchronized.
+        error_us: the estimated error, microseconds; large without a time service.
+    """
+
+    synchronized: bool
+    error_us: int
+
+
+def clock_quality() -> ClockQuality | None:
+    """Ask the kernel for the quality of the wall clock; None if it does not answer. Changes nothing."""
+    import ctypes
+
+    class Timex(ctypes.Structure):
+        """The first fields of `struct timex`, and room for the others."""
+
+        _fields_ = (
+            ("modes", ctypes.c_uint),
+            ("offset", ctypes.c_long),
+            ("freq", ctypes.c_long),
+            ("maxerror", ctypes.c_long),
+            ("esterror", ctypes.c_long),
+            ("others", ctypes.c_long * 32),
+        )
+
+    timex = Timex()
+    try:
+        state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
+    except (OSError, AttributeError):  # another C library
+        return None
+    return None if state < 0 else ClockQuality(state != _CLOCK_UNSYNCHRONIZED, timex.esterror)

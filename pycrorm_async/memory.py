@@ -35,6 +35,7 @@ from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.event_feed import BUFFER_EVENTS, EventStream, Observation, RecordedEvent
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
+from pycrorm_async.hooks.provenance import PlanSource, Provenance
 from pycrorm_async.memory_parts import Parts
 from pycrorm_async.memory_reading import ReadableMemory
 from pycrorm_async.memory_status import MemoryStatus
@@ -76,6 +77,7 @@ class Memory(ReadableMemory):
         projections: Sequence[Projection],
         settings: Settings,
         clock: Clock,
+        plan_source: PlanSource | None = None,
     ) -> None:
         self._address = address
         self._spool = spool
@@ -83,6 +85,7 @@ class Memory(ReadableMemory):
         self._projections = tuple(projections)
         self._settings = settings
         self._clock = clock
+        self._plan_source = plan_source
         self._unadopted: dict[str, PycrormError] = {}
         self._stack = AsyncExitStack()
         self._parts: Parts | None = None
@@ -100,6 +103,7 @@ class Memory(ReadableMemory):
         writer: Writer | None = None,
         settings: Settings | None = None,
         clock: Clock = SYSTEM_CLOCK,
+        plan_source: PlanSource | None = None,
     ) -> Memory:
         """Return a memory to enter with `async with`, once.
 
@@ -115,6 +119,7 @@ class Memory(ReadableMemory):
                 has no connection for writing, the database may not exist yet, and `session()`, `dataframe()` and
                 `reading` open their own connection at the first query.
             settings, clock: limits and intervals; the time source.
+            plan_source: recorded with each episode; `pycrorm run` passes hash and commit of the plan's file.
 
         Raises:
             UnknownUrl: at once. `CallerError`: at once, for a private database or views of this process with a daemon.
@@ -135,6 +140,7 @@ class Memory(ReadableMemory):
             projections=validate_projections(projections),
             settings=settings,
             clock=clock,
+            plan_source=plan_source,
         )
 
     @classmethod
@@ -210,7 +216,8 @@ class Memory(ReadableMemory):
             with suppress(TablesForeign):  # recording works without tables; queries and `flush` raise this again
                 await reading.refresh()
         emitter = Emitter(queue, self._settings)
-        recorder = Recorder(emitter, clock=self._clock, software=__version__)
+        provenance = Provenance.of(self._plan_source, self._settings, self._clock)
+        recorder = Recorder(emitter, clock=self._clock, software=__version__, provenance=provenance)
         return Parts(queue, writer, reading, emitter, recorder, PickUpExperience(reading))
 
     async def __aexit__(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Final, Literal, get_args
+from typing import Any, Final, Literal, get_args
 
 from pycrorm_async.errors import CallerError
 
@@ -101,6 +101,11 @@ class Settings:
     on_full: OnFull = "wait"
     on_unrecordable: OnUnrecordable = "record_missing"
     file_access: FileAccess = "owner"
+
+    def changed(self) -> dict[str, Any]:
+        """Return the settings that differ from their defaults, by name."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value != getattr(Settings, name)}
 
     def __post_init__(self) -> None:
         for field in fields(self):

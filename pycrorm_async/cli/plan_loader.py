@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import inspect
 import sys
@@ -20,11 +21,13 @@ class PlanNotLoadable(CallerError):
 
 
 class LoadedPlan(NamedTuple):
-    """A plan: an async function that takes the memory or no argument."""
+    """A plan: an async function that takes the memory or no argument, its file, and the hash of that file."""
 
     name: str
     function: Callable[..., Awaitable[Any]]
     takes_memory: bool
+    path: Path
+    sha256: str
 
     @property
     def description(self) -> str:
@@ -40,6 +43,7 @@ def load_plan(reference: str) -> LoadedPlan:
     path = Path(path_text)
     if not path.is_file():
         raise PlanNotLoadable(f"the plan file {path_text!r} does not exist")
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     module = _import_file(path)
     function = getattr(module, function_name, None)
     if function is None:
@@ -56,7 +60,7 @@ def load_plan(reference: str) -> LoadedPlan:
     if len(required) > 1:
         names = ", ".join(each.name for each in required)
         raise PlanNotLoadable(f"{path}:{function_name} takes {names}: a plan takes the memory or no argument")
-    return LoadedPlan(f"{path.name}:{function_name}", function, bool(required))
+    return LoadedPlan(f"{path.name}:{function_name}", function, bool(required), path, sha256)
 
 
 def _import_file(path: Path) -> Any:

@@ -27,6 +27,7 @@ from pycrorm_async.cli.options import (
 )
 from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
 from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
+from pycrorm_async.cli.plan_source import plan_source
 from pycrorm_async.errors import CallerError, EpisodeParked
 from pycrorm_async.hooks.values.texts import message_of
 from pycrorm_async.memory import Memory
@@ -100,7 +101,13 @@ def run(
         on_full=_choice("--on-full", on_full, get_args(OnFull)),
     )
     loaded = load_plan(plan)
-    memory = Memory.open(url, spool=spool, settings=settings, projections=load_projections(projection or ()))
+    memory = Memory.open(
+        url,
+        spool=spool,
+        settings=settings,
+        projections=load_projections(projection or ()),
+        plan_source=plan_source(loaded.path, loaded.sha256),
+    )
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         try:

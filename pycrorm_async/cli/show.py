@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -69,9 +70,28 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
             "continues": f"episode {summary.continues}" if summary.continues else None,
             "continued": f"in episode {summary.continued_in}" if summary.continued_in else None,
             "simulated": simulated_by(summary) if summary.simulated else None,
+            **_provenance(summary, full=full),
         },
     )
     print_tree(tree, events=events, full=full)
+
+
+def _provenance(summary: EpisodeSummary, *, full: bool) -> dict[str, str | None]:
+    """Return what the episode was recorded with, as far as it is known."""
+    commit, clock = summary.git_commit, summary.clock_synchronized
+    kept = "synchronized" if clock else "not synchronized"
+    return {
+        "plan": f"{summary.plan} (sha256 {summary.plan_sha256[:12]})" if summary.plan_sha256 else summary.plan,
+        "commit": f"{commit[:12]}{' and uncommitted changes' if summary.git_dirty else ''}" if commit else None,
+        "world": summary.world,
+        "settings": _pairs(summary.settings),
+        "libraries": _pairs(summary.libraries) if full else None,
+        "clock": f"{kept}, estimated error {summary.clock_error_us:,} µs" if clock is not None else None,
+    }
+
+
+def _pairs(values: Mapping[str, object] | None) -> str | None:
+    return ", ".join(f"{name} {value}" for name, value in values.items()) if values else None
 
 
 def _show_moment(

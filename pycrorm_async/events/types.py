@@ -61,6 +61,11 @@ class EpisodeStarted(Happening, frozen=True):
         simulated: whether the episode is a simulation, performed in a copy of the world.
         thought_by: the node that runs the simulation.
         continues: UUID of the episode that ran out of sequences and that this one continues.
+        plan_sha256: SHA-256 of the plan's file.
+        git_commit, git_dirty: the commit of the plan's repository, and whether the work tree differed from it.
+        libraries: version by package.
+        settings: the memory's settings that differ from their defaults, by name.
+        clock_synchronized, clock_error_us: whether a time service kept the clock, and the estimated error.
     """
 
     description: str
@@ -74,17 +79,26 @@ class EpisodeStarted(Happening, frozen=True):
     simulated: bool = False
     thought_by: NodeReference | None = None
     continues: str | None = None
+    plan_sha256: str | None = None
+    git_commit: str | None = None
+    git_dirty: bool | None = None
+    libraries: dict[str, str] = {}
+    settings: dict[str, Any] = {}
+    clock_synchronized: bool | None = None
+    clock_error_us: int | None = None
 
 
 class EpisodeEnded(Happening, frozen=True):
     """The last event of an episode. Only recovery writes the status LOST.
 
-    `continued_in` is the UUID of the episode that continues this one, if this one ran out of sequences.
+    `continued_in` is the UUID of the episode that continues this one, if this one ran out of sequences. `world` is the
+    description, in one line, of the world that was entered inside the episode, as it was at last.
     """
 
     status: EpisodeStatus
     failure: FailureValue | None = None
     continued_in: str | None = None
+    world: str | None = None
 
 
 class DesignatorTypeDeclared(Happening, frozen=True):

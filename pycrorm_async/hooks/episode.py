@@ -48,6 +48,7 @@ from pycrorm_async.hooks.episode_events import (
     object_detected,
 )
 from pycrorm_async.hooks.values.event_fitting import (
+    episode_text_of,
     fit_detection,
     fit_episode_end,
     fit_episode_start,
@@ -119,6 +120,7 @@ class Episode:
         self.calls: Final = CalledPerforms(self._note_unawaited)
         self._emitter = emitter
         self._opening = opening
+        self._entered_world: str | None = None
         self._open_nodes: dict[int, TaskTreeNode] = {}
         self._interrupted: dict[int, TaskTreeNode] = {}
         self._ending: set[TaskTreeNode] = set()
@@ -167,6 +169,7 @@ class Episode:
     def leave_world(self, world: BulletWorld, *, emptied: bool) -> None:
         """Stop recording this world; with `emptied`, record first that all its objects were removed."""
         if self.world is not None and self.world.world is world:
+            self._described_world()
             if emptied:
                 self.world.empty()
             self.world.stop()
@@ -269,7 +272,7 @@ class Episode:
         value = failure_value(failure, self) if failure is not None else None
         if not self._root_ended:
             self._put_end(NodeEnded(self._root, root_status, value), "Episode")
-        ended = EpisodeEnded(status, value)
+        ended = EpisodeEnded(status, value, world=self._described_world())
         try:
             self._emitter.put(self.id, ended)
         except NotEncodable:
@@ -288,7 +291,7 @@ class Episode:
         if not self._root_ended:  # it ended in an attempt before this one
             self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
             self._root_ended = True
-        self._emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up)))
+        self._emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world()))
         self.id = follow_up
         last = self._root = self._start(former, root)
         self._root_ended = False
@@ -312,6 +315,12 @@ class Episode:
         if self.world is not None:
             self.world.continue_at = self.continue_at
         return renumbered
+
+    def _described_world(self) -> str | None:
+        """Return the description of the world that was entered inside the episode; None if none was."""
+        if self.world is not None and self._opening.world is None:
+            self._entered_world = episode_text_of(self.world.world.description)
+        return self._entered_world
 
     def _note_unawaited(self, designator: type[Designator]) -> None:
         self._emitter.note_unawaited(designator.dtype)

@@ -18,6 +18,7 @@ from pycrorm_async.events.values import (
     RefusalValue,
     SeenValue,
 )
+from pycrorm_async.hooks.provenance import Provenance
 from pycrorm_async.hooks.values.texts import clean
 from pycrorm_async.hooks.values.value_snapshot import References, pose_value
 from pycrorm_async.plan.exceptions import is_plan_failure
@@ -38,6 +39,7 @@ class EpisodeOpening(NamedTuple):
     world: str | None = None
     simulated: bool = False
     thought_by: NodeReference | None = None
+    provenance: Provenance | None = None
 
 
 def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> EpisodeStarted:
@@ -54,6 +56,7 @@ def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> Epi
         simulated=opening.simulated,
         thought_by=opening.thought_by,
         continues=episode_text(continues) if continues is not None else None,
+        **(opening.provenance.fields() if opening.provenance is not None else {}),
     )
 
 

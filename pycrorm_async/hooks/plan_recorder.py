@@ -37,6 +37,7 @@ from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode, NodeRecord, current_task
 from pycrorm_async.hooks.episode_events import EpisodeOpening
+from pycrorm_async.hooks.provenance import Provenance
 from pycrorm_async.hooks.sampler import Sampler
 from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
 from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation
@@ -65,11 +66,13 @@ class Recorder:
         *,
         clock: Clock,
         software: str,
+        provenance: Provenance | None = None,
         randomness: Callable[[int], bytes] = os.urandom,
     ) -> None:
         self._emitter = emitter
         self._clock = clock
         self._software = software
+        self._provenance = provenance
         self._randomness = randomness
         self._strict = emitter.settings.on_unrecordable == "refuse"
         self._declarations = Declarations(strict=self._strict)
@@ -114,6 +117,7 @@ class Recorder:
             world.description if world else None,
             simulated=simulation is not None,
             thought_by=_simulating_node(simulation),
+            provenance=self._provenance,
         )
         episode = Episode(self._emitter, new_id, opening)
         self._open[new_id] = episode

@@ -31,7 +31,7 @@ from sqlalchemy.orm.exc import DetachedInstanceError
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_key
-from pycrorm_async.orm.types import EnumName, Moment
+from pycrorm_async.orm.types import EnumName, JsonText, Moment
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
 
@@ -197,6 +197,7 @@ class ProcessMetaData(Base):
     python: Mapped[str]
     plan: Mapped[str | None]
     world: Mapped[str | None]
+    """The world in one line: at the start, or, if it was entered inside the episode, when it was left."""
     seed: Mapped[int | None]
     status: Mapped[str]
     ended_at: Mapped[datetime | None]
@@ -214,6 +215,17 @@ class ProcessMetaData(Base):
     """UUID of the episode that this one continues, because that one came near its last possible sequence."""
     continued_in: Mapped[str | None]
     """UUID of the episode that continues this one."""
+    plan_sha256: Mapped[str | None]
+    """SHA-256 of the plan's file; `git_commit` and `git_dirty` are those of its repository (`pycrorm run`)."""
+    git_commit: Mapped[str | None]
+    git_dirty: Mapped[bool | None]
+    libraries: Mapped[dict[str, str] | None] = mapped_column(JsonText())
+    """Version by package."""
+    settings: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
+    """The settings that differ from their defaults."""
+    clock_synchronized: Mapped[bool | None]
+    """Whether a time service kept the wall clock; `clock_error_us` is its estimated error, µs."""
+    clock_error_us: Mapped[int | None]
 
     pycram_version: Mapped[str] = synonym("version")
 

@@ -49,6 +49,11 @@ class EpisodeSummary:
         thought_by: the node that performed this simulation, if recorded.
         continues: UUID of the episode that this one continues.
         continued_in: UUID of the episode that continues this one.
+        plan, plan_sha256, git_commit, git_dirty: the plan's name, the hash of its file, the commit of its repository,
+            and whether the work tree differed from it.
+        world: the world in one line.
+        libraries, settings: version by package; the settings that differ from their defaults.
+        clock_synchronized, clock_error_us: whether a time service kept the clock, and its estimated error.
     """
 
     number: int
@@ -66,6 +71,15 @@ class EpisodeSummary:
     continues: str | None = None
     continued_in: str | None = None
     end_sequence: int | None = None
+    plan: str | None = None
+    plan_sha256: str | None = None
+    git_commit: str | None = None
+    git_dirty: bool | None = None
+    world: str | None = None
+    libraries: dict[str, str] | None = None
+    settings: dict[str, Any] | None = None
+    clock_synchronized: bool | None = None
+    clock_error_us: int | None = None
 
 
 @dataclass(frozen=True)
@@ -124,6 +138,15 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             continues=row.continues,
             continued_in=row.continued_in,
             end_sequence=row.end_sequence,
+            plan=row.plan,
+            plan_sha256=row.plan_sha256,
+            git_commit=row.git_commit,
+            git_dirty=row.git_dirty,
+            world=row.world,
+            libraries=row.libraries,
+            settings=row.settings,
+            clock_synchronized=row.clock_synchronized,
+            clock_error_us=row.clock_error_us,
         )
         for row in await connection.execute(query)
     ]

@@ -23,6 +23,7 @@ from pycrorm_async.hooks.values.texts import clean, cut
 
 __all__ = [
     "EPISODE_TEXT_MAX",
+    "episode_text_of",
     "fits",
     "fit_detection",
     "fit_node_end",
@@ -64,6 +65,11 @@ def fit_episode_start(started: EpisodeStarted, bytes_max: int) -> tuple[EpisodeS
     return started, shortened
 
 
+def episode_text_of(text: str) -> str:
+    """Clean and shorten a text for a column of an episode."""
+    return cut(clean(text), EPISODE_TEXT_MAX)
+
+
 def fit_node_end(ended: NodeEnded, bytes_max: int) -> NodeEnded:
     """Replace a result that cannot be encoded by a `MissingValue`, then shorten the failure until the event fits."""
     if ended.result is not None:
@@ -79,7 +85,11 @@ def fit_node_end(ended: NodeEnded, bytes_max: int) -> NodeEnded:
 
 
 def fit_episode_end(ended: EpisodeEnded, bytes_max: int) -> EpisodeEnded:
-    """Shorten the failure of an episode's end until the event fits."""
+    """Shorten the world and then the failure of an episode's end until the event fits."""
+    for characters_max in _CUT_LENGTHS:
+        if ended.world is None or fits(ended, bytes_max):
+            break
+        ended = replace(ended, world=cut(ended.world, characters_max))
     for failure in _shortened_failures(ended.failure):
         if fits(ended, bytes_max):
             break

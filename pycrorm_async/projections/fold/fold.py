@@ -119,6 +119,14 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
         "thought_by_node": by.node if by else None,
         "continues": started.continues,
         "continued_in": None,
+        "plan_sha256": started.plan_sha256,
+        "git_commit": started.git_commit,
+        "git_dirty": started.git_dirty,
+        "libraries": json_text(started.libraries) if started.libraries else None,
+        "settings": json_text(started.settings) if started.settings else None,
+        "clock_synchronized": started.clock_synchronized,
+        "clock_error_us": started.clock_error_us,
+        "entered_world": None,
     }
     if started.simulated:
         rows.inserts["simulated_episode"].append((event.number,))
@@ -135,6 +143,7 @@ def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Design
             failure.type if failure else None,
             failure.message if failure else None,
             ended.continued_in,
+            ended.world,
         )
     )
 

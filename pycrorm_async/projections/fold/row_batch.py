@@ -51,6 +51,7 @@ class EpisodeEnd(NamedTuple):
     failure_type: str | None
     failure_message: str | None
     continued_in: str | None
+    entered_world: str | None
 
 
 assert NodeEnd._fields == ("id", "status", "end_time", "end_ns", "end_sequence", *COLUMNS["task_tree_node"][OUTCOME])

@@ -170,7 +170,8 @@ def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
 
 def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     episodes = core["process_metadata"]
-    first, *others = episodes.c
+    world = func.coalesce(episodes.c.world, episodes.c.entered_world).label("world")
+    first, *others = (world if each.name == "world" else each for each in episodes.c if each.name != "entered_world")
     return select(first, _episode.c.id.label("uuid"), *others).join_from(
         episodes, _episode, _episode.c.number == episodes.c.id
     )

@@ -1,0 +1,76 @@
+"""Describe what an episode was recorded with: the plan's source, the libraries, the settings and the clock's quality.
+
+Reading the plan's source is left to the program that starts the plan (`pycrorm run`); a plan's process never does it on
+its own.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, NamedTuple
+
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
+from pycrorm_async.settings import Settings
+
+__all__ = ["PlanSource", "Provenance"]
+
+_LIBRARIES = ("pycrorm-async", "pybullet", "numpy", "msgspec", "SQLAlchemy", "aiosqlite", "asyncpg")
+"""The packages whose versions are recorded: those that act in the world, encode events and store them."""
+
+
+class PlanSource(NamedTuple):
+    """The source of a plan.
+
+    Attributes:
+        sha256: SHA-256 of the plan's file, hexadecimal.
+        git_commit: the commit that is checked out where the file is; None outside a repository and without git.
+        git_dirty: whether a tracked file differs from that commit, or the plan's file is not tracked.
+    """
+
+    sha256: str
+    git_commit: str | None = None
+    git_dirty: bool | None = None
+
+
+class Provenance(NamedTuple):
+    """What the episodes of one memory are recorded with.
+
+    Attributes:
+        source: the plan's source, if the program that started it has read it.
+        libraries: version by package.
+        settings: the settings that differ from their defaults, by name.
+        clock: the clock that gives the times of events; only the system's has a known quality.
+    """
+
+    source: PlanSource | None
+    libraries: dict[str, str]
+    settings: dict[str, Any]
+    clock: Clock
+
+    @classmethod
+    def of(cls, source: PlanSource | None, settings: Settings, clock: Clock) -> Provenance:
+        """Read the versions of the installed libraries; takes about a millisecond."""
+        return cls(source, _installed_libraries(), settings.changed(), clock)
+
+    def fields(self) -> dict[str, Any]:
+        """Return the fields of `EpisodeStarted`, with the clock's quality at this moment."""
+        quality = clock_quality() if self.clock is SYSTEM_CLOCK else None
+        return {
+            "plan_sha256": self.source.sha256 if self.source else None,
+            "git_commit": self.source.git_commit if self.source else None,
+            "git_dirty": self.source.git_dirty if self.source else None,
+            "libraries": self.libraries,
+            "settings": self.settings,
+            "clock_synchronized": quality.synchronized if quality else None,
+            "clock_error_us": quality.error_us if quality else None,
+        }
+
+
+def _installed_libraries() -> dict[str, str]:
+    versions = {}
+    for name in _LIBRARIES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:  # a source tree that is not installed
+            continue
+    return versions

@@ -1,0 +1,99 @@
+"""Every episode holds what it was recorded with: source, libraries, settings, quality of the clock, and the world."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
+from pycrorm_async.hooks.provenance import PlanSource
+from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.plan import ParkArmsActionPerformable, simulated_robot
+from pycrorm_async.settings import Settings
+from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType
+
+SOURCE = PlanSource("ab" * 32, "cd" * 20, git_dirty=True)
+
+
+async def episodes_of(memory: Memory) -> list[ProcessMetaData]:
+    await memory.flush()
+    async with memory.session() as session:
+        return list(await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id)))
+
+
+async def test_an_episode_holds_source_libraries_settings_and_clock(database_url: str, tmp_path: Path) -> None:
+    settings = Settings(sync_interval_ms=20, on_full="fail")
+    spool = tmp_path / "spool"
+    async with Memory.open(database_url, spool=spool, settings=settings, plan_source=SOURCE) as memory:
+        async with memory.episode(description="with all"):
+            pass
+        (episode,) = await episodes_of(memory)
+        (summary,) = await memory.reading.episodes()
+    quality = clock_quality()
+    for each in (episode, summary):
+        assert (each.plan_sha256, each.git_commit, each.git_dirty) == SOURCE
+        assert each.settings == {"sync_interval_ms": 20, "on_full": "fail"}
+        assert each.libraries is not None
+        assert each.libraries["numpy"] == version("numpy")
+        assert {"pybullet", "msgspec", "SQLAlchemy"} <= set(each.libraries)
+        assert each.clock_synchronized is (quality.synchronized if quality else None)
+    assert "password" not in str(episode.settings)
+
+
+async def test_what_is_not_known_is_null(database_url: str, tmp_path: Path) -> None:
+    own_clock = Clock(SYSTEM_CLOCK.wall_ns, SYSTEM_CLOCK.monotonic_ns)
+    async with Memory.open(database_url, spool=tmp_path / "spool", clock=own_clock) as memory:
+        async with memory.episode(description="without source"):
+            pass
+        (episode,) = await episodes_of(memory)
+    assert (episode.plan_sha256, episode.git_commit, episode.git_dirty, episode.settings) == (None,) * 4
+    assert (episode.clock_synchronized, episode.clock_error_us, episode.world) == (None,) * 3
+
+
+async def test_a_world_that_is_entered_inside_an_episode_is_described(database_url: str, tmp_path: Path) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="left before the end"):
+            with BulletWorld(), simulated_robot:
+                Object("pr2", ObjectType.ROBOT)
+                await ParkArmsActionPerformable(Arms.BOTH).perform()
+        with BulletWorld():
+            Object("milk", ObjectType.MILK)
+            async with memory.episode(description="entered before"):
+                Object("bowl", ObjectType.BOWL)
+        episode = memory.episode(description="open at the end")
+        await episode.__aenter__()
+        with BulletWorld():
+            Object("spoon", ObjectType.SPOON)
+            await episode.__aexit__(None, None, None)
+        await memory.flush()
+        worlds = [each.world for each in await episodes_of(memory)]
+    assert worlds == [
+        "BulletWorld (DIRECT): pr2 (ROBOT)",
+        "BulletWorld (DIRECT): milk (MILK)",
+        "BulletWorld (DIRECT): spoon (SPOON)",
+    ]
+
+
+@pytest.mark.slow
+def test_a_plans_process_starts_no_git_on_its_own(tmp_path: Path) -> None:
+    program = """
+import asyncio, subprocess, sys
+def refuse(event, arguments):
+    if event in ("subprocess.Popen", "os.posix_spawn", "os.system"):
+        print("started", arguments)
+sys.addaudithook(refuse)
+from pycrorm_async import Memory
+async def main():
+    async with Memory.open("sqlite:///memory.db") as memory:
+        async with memory.episode(description="quiet"):
+            pass
+asyncio.run(main())
+"""
+    ran = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "git" not in ran.stdout
