@@ -139,7 +139,7 @@ async def stages(folder: Path, *, turns: int, performs: int) -> dict[str, dict[s
             folder / "queue", settings=Settings(), clock=SYSTEM_CLOCK, recorder=_identity(b"recorder..")
         )
         stack.callback(queue.release)
-        parts = _parts(nothing_action(), queue)
+        parts = _parts(nothing_action(), queue, memory)
         durations_us: dict[str, list[float]] = {name: [] for name in parts}
         for _ in range(turns):
             for name, part in parts.items():
@@ -151,7 +151,7 @@ async def stages(folder: Path, *, turns: int, performs: int) -> dict[str, dict[s
         return {name: spread(values) for name, values in durations_us.items()}
 
 
-def _parts(action: NothingActionPerformable, queue: RecorderQueue) -> dict[str, Callable[[], Any]]:
+def _parts(action: NothingActionPerformable, queue: RecorderQueue, memory: Memory) -> dict[str, Callable[[], Any]]:
     observer, episode = recorder.get(), current_episode.get()
     assert observer is not None
     assert episode is not None
@@ -175,6 +175,7 @@ def _parts(action: NothingActionPerformable, queue: RecorderQueue) -> dict[str, 
 
     return {
         "both hooks of a perform": hooks,
+        "an observation of three numbers": lambda: memory.observe("force", {"x": 1.5, "y": -0.25, "z": 9.81}),
         "the robot's state, read": world.robot,
         "parameters, copied and checked": parameters,
         "start, encoded": lambda: encode(start),

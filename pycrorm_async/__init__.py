@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pycrorm_async.errors import PycrormError
+    from pycrorm_async.events.blobs import Blob
     from pycrorm_async.memory import Memory, MemoryStatus
     from pycrorm_async.operations.recovery import recover
     from pycrorm_async.projections.custom.projection import Projection
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Blob",
     "Memory",
     "MemoryStatus",
     "Projection",
@@ -42,6 +44,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "Blob": "events.blobs",
     "Memory": "memory",
     "MemoryStatus": "memory",
     "Projection": "projections.custom.projection",

@@ -33,9 +33,10 @@ from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, Table
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
-from pycrorm_async.hooks.event_feed import BUFFER_EVENTS, EventStream, Observation, RecordedEvent
+from pycrorm_async.hooks.observations import Observations
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.hooks.provenance import PlanSource, Provenance
+from pycrorm_async.memory_observing import ObservingMemory
 from pycrorm_async.memory_parts import Parts
 from pycrorm_async.memory_reading import ReadableMemory
 from pycrorm_async.memory_status import MemoryStatus
@@ -61,7 +62,7 @@ __all__ = ["Memory", "MemoryStatus"]
 _log = logging.getLogger("pycrorm_async")
 
 
-class Memory(ReadableMemory):
+class Memory(ReadableMemory, ObservingMemory):
     """The memory of one process in one database. Use `Memory.open` as an async context manager.
 
     While it is open, it records every plan performed in its context: in the open episode, or in one of the plan's own.
@@ -218,7 +219,8 @@ class Memory(ReadableMemory):
         emitter = Emitter(queue, self._settings)
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
         recorder = Recorder(emitter, clock=self._clock, software=__version__, provenance=provenance)
-        return Parts(queue, writer, reading, emitter, recorder, PickUpExperience(reading))
+        observations = Observations(emitter, recorder)
+        return Parts(queue, writer, reading, emitter, recorder, observations, PickUpExperience(reading))
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -334,23 +336,7 @@ class Memory(ReadableMemory):
         if parts.reading.is_open:
             await parts.reading.refresh()
 
-    # --- observing --------------------------------------------------------------------------------------------
-
-    def observe(self, callback: Callable[[RecordedEvent], object], *, buffer: int = BUFFER_EVENTS) -> Observation:
-        """Call `callback` with each event from now on, in a thread of its own, until closed or the memory is closed.
-
-        Use the result as a context manager, or call its `close()`. The plan never waits: an event that finds more than
-        `buffer` others waiting is left out, and `left_out` counts it. Exceptions of the callback are counted in
-        `failed`, and the first is logged.
-        """
-        return self._open_parts.emitter.feed.observe(callback, buffer=buffer)
-
-    def events(self, *, buffer: int = BUFFER_EVENTS) -> EventStream:
-        """Return each event from now on as an asynchronous iterator in this loop, which ends when the memory is closed.
-
-        A plan that never suspends lets no other task of its loop run: observe it from a thread, or after the plan.
-        """
-        return self._open_parts.emitter.feed.stream(buffer=buffer)
+    # --- state ------------------------------------------------------------------------------------------------
 
     @property
     def status(self) -> MemoryStatus:

@@ -7,7 +7,9 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
 from pycrorm_async.connected_var import ConnectedVar, set_inside
+from pycrorm_async.errors import CallerError
 from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.observations import Observations
 from pycrorm_async.hooks.plan_recorder import Recorder
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import called_performs
@@ -19,7 +21,7 @@ from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.world.observers import watcher
 from pycrorm_async.writer.writer_thread import WriterThread
 
-__all__ = ["Parts"]
+__all__ = ["Parts", "PartsHolder"]
 
 
 class Parts(NamedTuple):
@@ -30,6 +32,7 @@ class Parts(NamedTuple):
     reading: Reading
     emitter: Emitter
     recorder: Recorder
+    observations: Observations
     experience: PickUpExperience
 
     @contextmanager
@@ -58,3 +61,15 @@ class Parts(NamedTuple):
             (called_performs, self.recorder.calls),
             (experience, self.experience),
         )
+
+
+class PartsHolder:
+    """A memory as its methods see it: with parts while it is open."""
+
+    _parts: Parts | None
+
+    @property
+    def _open_parts(self) -> Parts:
+        if self._parts is None:
+            raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
+        return self._parts

@@ -12,7 +12,7 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.hooks.episode import Episode
-from pycrorm_async.memory_parts import Parts
+from pycrorm_async.memory_parts import PartsHolder
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
@@ -23,10 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["ReadableMemory"]
 
 
-class ReadableMemory:
+class ReadableMemory(PartsHolder):
     """The queries of a memory. Each raises `CallerError` while the memory is not open."""
-
-    _parts: Parts | None
 
     @property
     def reading(self) -> Reading:
@@ -67,9 +65,3 @@ class ReadableMemory:
     async def number_of(self, episode: Episode) -> int:
         """Return the number that this database gave to the episode, after `flush`."""
         return await self._open_parts.reading.number_of(str(episode))
-
-    @property
-    def _open_parts(self) -> Parts:
-        if self._parts is None:
-            raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
-        return self._parts

@@ -31,6 +31,7 @@ _KEYS = {
     "location_candidate": ("resolution_id", "position"),
     "location_refusal": ("resolution_id", "position"),
     "detection": ("id", "position"),
+    "observation_value": ("id", "position"),
     "state_sample": ("id", "channel"),
 }
 _OF_EPISODES = ("process_metadata", "simulated_episode")

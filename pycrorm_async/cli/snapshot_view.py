@@ -6,9 +6,10 @@ import math
 
 from pycrorm_async.cli.output import moment as wall_clock
 from pycrorm_async.cli.output import print_facts, print_table
-from pycrorm_async.cli.tree import print_tree
+from pycrorm_async.cli.tree import parameters_text, print_tree
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.snapshot import Moment, ObjectThen, RobotThen
+from pycrorm_async.events.blobs import BLOB_KEY
+from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen
 
 __all__ = ["print_snapshot", "parse_moment"]
 
@@ -52,6 +53,16 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
     if snapshot.world.objects:
         columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
         print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])
+    if snapshot.observations:
+        observed = [_observed_row(name, each, full=full) for name, each in snapshot.observations.items()]
+        print_table("Observations", ("name", "at", "event", "values"), observed)
+
+
+def _observed_row(name: str, observation: ObservationThen, *, full: bool) -> tuple[object, ...]:
+    values = observation.values
+    if not isinstance(values, dict) or BLOB_KEY in values:
+        values = {"value": values}
+    return name, f"{observation.time_s:.3f} s", f"e{observation.sequence}", parameters_text(values, full=full)
 
 
 def _running_text(snapshot: Moment) -> str:

@@ -11,6 +11,7 @@ from rich.text import Text
 from rich.tree import Tree
 
 from pycrorm_async.cli.output import duration, stdout
+from pycrorm_async.events.blobs import BLOB_KEY
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 
 __all__ = ["print_tree", "parameters_text", "simulated_by"]
@@ -53,6 +54,8 @@ def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
     if events:
         end = f"e{node.end_sequence}" if node.end_sequence is not None else ""
         line.append(f"  e{node.sequence}-{end}", style="dim")
+    if node.observations:
+        line.append(f"  {node.observations} observation{'s' * (node.observations > 1)}", style="dim")
     if node.reason:
         message = _text(node.failure_message or "", None if full else _MESSAGE_MAX)
         line.append(f"  {node.reason}{': ' if message else ''}{message}", style="red")
@@ -84,6 +87,8 @@ def parameters_text(parameters: Mapping[str, Any], *, full: bool = False) -> str
 def _value_text(value: Any, *, full: bool) -> str:
     if isinstance(value, dict) and "position" in value:
         return "(" + ", ".join(f"{each:.2f}" for each in value["position"]) + ")"
+    if isinstance(value, dict) and BLOB_KEY in value:
+        return f"{value.get('media_type')} of {value.get('size')} bytes"
     if isinstance(value, dict) and value.get("name"):
         return str(value["name"])
     if isinstance(value, dict) and "missing" in value:

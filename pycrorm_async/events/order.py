@@ -7,7 +7,7 @@
 | NodeEnded | open; the node is open | the node has ended |
 | ObjectAdded | open | the object exists |
 | ObjectMoved, ObjectRemoved, ObjectAttached, ObjectDetached, JointsMoved | open; the objects they name were added | |
-| LocationResolved, ObjectDetected | open; the node it names, if any, started | |
+| LocationResolved, ObjectDetected, Observed | open; the node it names, if any, started | |
 | StateSampled | open; the object it names was added; the node it names, if any, started | |
 | EpisodeEnded | open | the episode is closed: no event follows |
 
@@ -34,6 +34,7 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     ObjectMoved,
     ObjectRemoved,
+    Observed,
     StateSampled,
 )
 
@@ -108,7 +109,7 @@ class OrderCheck:
                 return self._unknown_objects(event.parent.object, event.child.object)
             case StateSampled():
                 return [*self._unknown_objects(event.object.object), *self._unknown_node(event.node)]
-            case LocationResolved() | ObjectDetected():
+            case LocationResolved() | ObjectDetected() | Observed():
                 return self._unknown_node(event.node)
         return []
 

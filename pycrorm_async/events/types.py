@@ -41,6 +41,7 @@ __all__ = [
     "LocationResolved",
     "ObjectDetected",
     "StateSampled",
+    "Observed",
     "EVENT_TYPES",
 ]
 
@@ -264,6 +265,23 @@ class StateSampled(Happening, frozen=True):
     node: int | None = None
 
 
+class Observed(Happening, frozen=True):
+    """A program made an observation of its own.
+
+    Attributes:
+        name: given by the program.
+        values: JSON: scalars, dicts and lists of these; a `BlobReference` for a content that is stored as a blob.
+        node: the node that observed it.
+        missing: by the path of keys and indices, joined by dots, the reason why a value could not be recorded; the
+            value there is null. The path of `values` itself is empty.
+    """
+
+    name: str
+    values: Any = None
+    node: int | None = None
+    missing: dict[str, str] = {}
+
+
 EVENT_TYPES: dict[str, type[Happening]] = {
     kind.__name__: kind
     for kind in (
@@ -281,6 +299,7 @@ EVENT_TYPES: dict[str, type[Happening]] = {
         LocationResolved,
         ObjectDetected,
         StateSampled,
+        Observed,
     )
 }
 """The event types by name; a log of this version holds no others."""

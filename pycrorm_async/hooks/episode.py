@@ -181,7 +181,7 @@ class Episode:
 
     def node_reference(self, node: TaskTreeNode | None) -> NodeReference:
         """Return a reference to this node, or to its nearest recorded ancestor; None gives the root."""
-        return NodeReference(str(self), self._parent_of(node))
+        return NodeReference(str(self), self.node_or_root(node))
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
@@ -330,7 +330,8 @@ class Episode:
 
     # --- inside -----------------------------------------------------------------------------------------------
 
-    def _parent_of(self, node: TaskTreeNode | None) -> int:
+    def node_or_root(self, node: TaskTreeNode | None) -> int:
+        """Return the sequence of this node or of its nearest recorded ancestor; None gives the root."""
         return self._sequence_of(node) or self._root
 
     def _sequence_of(self, node: TaskTreeNode | None) -> int | None:

@@ -1,6 +1,6 @@
 """Pass recorded events to observers in the same process: callbacks and asynchronous streams.
 
-    with memory.observe(print):
+    with memory.subscribe(print):
         await plan()
 
     async for event in memory.events(): ...
@@ -27,7 +27,7 @@ from typing import Final, NamedTuple, Self
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.types import Happening, NodeStarted
 
-__all__ = ["BUFFER_EVENTS", "EventFeed", "EventStream", "Observation", "RecordedEvent"]
+__all__ = ["BUFFER_EVENTS", "EventFeed", "EventStream", "Subscription", "RecordedEvent"]
 
 _log = logging.getLogger("pycrorm_async")
 BUFFER_EVENTS: Final = 10_000
@@ -72,12 +72,12 @@ class EventFeed:
         for each in self.observers:
             each.add(event)
 
-    def observe(self, callback: Callable[[RecordedEvent], object], *, buffer: int) -> Observation:
+    def subscribe(self, callback: Callable[[RecordedEvent], object], *, buffer: int) -> Subscription:
         """Call this with each event, in a thread of its own."""
-        observation = Observation(callback, buffer, self._remove)
-        self._add(observation)
-        observation.start()
-        return observation
+        subscription = Subscription(callback, buffer, self._remove)
+        self._add(subscription)
+        subscription.start()
+        return subscription
 
     def stream(self, *, buffer: int) -> EventStream:
         """Return the events as an asynchronous iterator for the running loop."""
@@ -89,7 +89,7 @@ class EventFeed:
         """End all observers; wait a limited time until the callbacks have processed their buffers."""
         for each in self.observers:
             each.close()
-            if isinstance(each, Observation):
+            if isinstance(each, Subscription):
                 await asyncio.to_thread(each.join)
 
     def _add(self, observer: _Buffer) -> None:
@@ -129,11 +129,11 @@ class _Buffer:
             self._events.put(None)
 
 
-class Observation(_Buffer):
-    """A callback that is called with each event. A context manager that ends the observation.
+class Subscription(_Buffer):
+    """A callback that is called with each event. A context manager that ends the subscription.
 
     Attributes:
-        failed: number of calls that raised. The first is logged; the observation continues.
+        failed: number of calls that raised. The first is logged; the subscription continues.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class Observation(_Buffer):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """End the observation when the callback has processed the buffer, for a limited time. Blocks."""
+        """End the subscription when the callback has processed the buffer, for a limited time. Blocks."""
         self.close()
         self.join()
 

@@ -13,9 +13,9 @@ value that cannot be recorded is recorded as missing.
 
 `node_ended` may also run in a thread and context of the garbage collector, when it closes a plan that was dropped
 unfinished. So it resets `current_episode` only if the context still holds the node's episode, and it never starts a
-follow-up (see `episode`). `_continue` moves an episode to its follow-up. `_continuing` holds the former id meanwhile,
-so that another event cannot start a second move, and `_open` holds the episode under both ids, because `_open_episode`
-looks it up by its current id, which changes during the move.
+follow-up (see `episode`). `continue_episode` moves an episode to its follow-up. `_continuing` holds the former id
+meanwhile, so that another event cannot start a second move, and `_open` holds the episode under both ids, because
+`episode_here` looks it up by its current id, which changes during the move.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Recorder:
 
         Raises `EpisodeRefused` if this task has an open episode, `CallerError` for an argument that does not fit.
         """
-        open_episode = self._open_episode()
+        open_episode = self.episode_here()
         if open_episode is not None and open_episode.task is current_task():
             raise EpisodeRefused(
                 f"episode {open_episode} is open in this task already: end it first, or open the other in its own task"
@@ -127,9 +127,9 @@ class Recorder:
         return episode
 
     def _enter(self, episode: Episode, world: BulletWorld) -> None:
-        episode.enter_world(world, lambda: self._continue(episode))
+        episode.enter_world(world, lambda: self.continue_episode(episode))
 
-    def _continue(self, episode: Episode) -> None:
+    def continue_episode(self, episode: Episode) -> None:
         """Continue an episode that reached `continue_at` in a follow-up episode. Exceptions are counted, not raised."""
         if episode.id in self._continuing or self._emitter.is_closed:
             return
@@ -193,12 +193,21 @@ class Recorder:
         """The ids of the last 100 episodes opened, including ended ones, without simulations."""
         return tuple(map(episode_text, self._recent))
 
-    def _open_episode(self) -> Episode | None:
+    def episode_here(self) -> Episode | None:
         """Return the open episode of this memory in this context; None if only one of the two is a simulation."""
         episode = current_episode.get()
         if episode is None or episode.closed or episode.id not in self._open:
             return None
         return episode if episode.simulated is (current_simulation.get() is not None) else None
+
+    def episode_of(self, node: TaskTreeNode) -> Episode | None:
+        """Return the open episode of this memory in which the node is recorded; None without one."""
+        record: NodeRecord | None = node.record
+        return record.episode if record is not None and record.episode in self._open.values() else None
+
+    def last_opened(self) -> Episode | None:
+        """Return the open episode that was opened last in any context, without simulations; None without one."""
+        return next((each for each in reversed(self.open_episodes) if not each.simulated), None)
 
     # --- the port of the plan layer ----------------------------------------------------------------------------------
 
@@ -217,7 +226,7 @@ class Recorder:
         implicit: Episode | None = None
         try:
             declared = self._declarations.of(type(node.designator), self._declare)
-            episode = self._open_episode()
+            episode = self.episode_here()
             if episode is None:
                 dtype = declared.dtype
                 episode = implicit = self.open_episode(description=dtype, plan=dtype)
@@ -239,7 +248,7 @@ class Recorder:
             if self._sampler is not None and node.kind == "motion" and episode.acts_in_recorded_world:
                 self._sample(self._sampler.begin, node.record)
             if sequence >= episode.continue_at:
-                self._continue(episode)
+                self.continue_episode(episode)
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
@@ -260,7 +269,7 @@ class Recorder:
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
         refused: tuple[Refusal, ...], offered_beyond: int, node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
-        episode = self._open_episode()
+        episode = self.episode_here()
         if episode is None or self._emitter.is_closed:
             return
         try:
@@ -272,13 +281,13 @@ class Recorder:
             self._emitter.note_fault("LocationResolved", error)
         else:
             if sequence >= episode.continue_at:
-                self._continue(episode)
+                self.continue_episode(episode)
 
     def object_detected(
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
         node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
-        episode = self._open_episode()
+        episode = self.episode_here()
         if episode is None or self._emitter.is_closed:
             return
         try:
@@ -287,7 +296,7 @@ class Recorder:
             self._emitter.note_fault("ObjectDetected", error)
         else:
             if sequence >= episode.continue_at:
-                self._continue(episode)
+                self.continue_episode(episode)
 
     def simulation_started(self, simulation: Simulation) -> None:
         if self._emitter.is_closed:
@@ -326,7 +335,7 @@ class Recorder:
     # --- the port of the world ---------------------------------------------------------------------------------------
 
     def world_entered(self, world: BulletWorld) -> None:
-        episode = self._open_episode()
+        episode = self.episode_here()
         if episode is None or self._emitter.is_closed:
             return
         try:
@@ -335,7 +344,7 @@ class Recorder:
             self._emitter.note_fault("entering a world", error)
 
     def world_left(self, world: BulletWorld) -> None:
-        episode = self._open_episode()
+        episode = self.episode_here()
         if episode is not None:
             episode.leave_world(world, emptied=True)
 

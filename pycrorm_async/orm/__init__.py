@@ -58,7 +58,7 @@ from pycrorm_async.orm.objects import (
     ObjectPart,
     ObjectRemoval,
 )
-from pycrorm_async.orm.perception import Detection, StateSample
+from pycrorm_async.orm.perception import Detection, Observation, ObservationValue, StateSample
 from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
 from pycrorm_async.orm.views import PickUpWithContextView, RootFailure
 
@@ -85,6 +85,8 @@ __all__ = [
     "LocationRefusal",
     "Detection",
     "StateSample",
+    "Observation",
+    "ObservationValue",
     "DesignatorType",
     "Designator",
     "ParameterItem",

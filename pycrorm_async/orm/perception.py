@@ -1,4 +1,4 @@
-"""Map perceived objects, and samples of the robot's state during motions."""
+"""Map perceived objects, observations of programs, and samples of the robot's state during motions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.world.enums import ObjectType
 
-__all__ = ["Detection", "StateSample"]
+__all__ = ["Detection", "StateSample", "Observation", "ObservationValue"]
 
 
 class Detection(RowOfEvent, Base):
@@ -78,3 +78,65 @@ class StateSample(RowOfEvent, Base):
     value: Mapped[float]
     time: Mapped[datetime]
     ns: Mapped[int]
+
+
+class Observation(RowOfEvent, Base):
+    """An observation that a program made with `memory.observe`.
+
+    Attributes:
+        name: given by the program.
+        node: the node that observed it.
+        ns: monotonic time, comparable with `TaskTreeNode.start_ns`.
+        items: its values, each with its key.
+    """
+
+    __tablename__ = "observation"
+
+    id: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
+    name: Mapped[str]
+    time: Mapped[datetime]
+    ns: Mapped[int]
+
+    node: Mapped[TaskTreeNode | None] = relationship(viewonly=True, lazy="selectin")
+    items: Mapped[list[ObservationValue]] = relationship(
+        viewonly=True, lazy="selectin", order_by="ObservationValue.position"
+    )
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+    @property
+    def values(self) -> dict[str, float | str | bool | None]:
+        """The values by key: numbers, texts and bools, of a blob its hash; None for a missing value."""
+        return {each.key: each.value for each in self.items}
+
+
+class ObservationValue(RowOfEvent, Base):
+    """A scalar or a blob of an observation. All values of one observation share their `id`.
+
+    Attributes:
+        key: the keys and indices that lead to it, joined by dots; `value` if the observation is this value.
+        number, text, truth: the scalar.
+        blob: the SHA-256 of a blob, for `memory.blob`; with its `media_type` and its `size` in bytes.
+        missing: the reason why the value could not be recorded.
+    """
+
+    __tablename__ = "observation_value"
+
+    id: Mapped[int] = mapped_column(ForeignKey("observation.id"), primary_key=True)
+    position: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    key: Mapped[str]
+    number: Mapped[float | None]
+    text: Mapped[str | None]
+    truth: Mapped[bool | None]
+    blob: Mapped[str | None]
+    media_type: Mapped[str | None]
+    size: Mapped[int | None]
+    missing: Mapped[str | None]
+
+    @property
+    def value(self) -> float | str | bool | None:
+        """The number, text or bool, or the hash of the blob; None for a missing value."""
+        scalars = (self.number, self.text, self.truth, self.blob)
+        return next((each for each in scalars if each is not None), None)

@@ -12,7 +12,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
-from pycrorm_async.orm import Designator, Object, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import Designator, Object, Observation, ProcessMetaData, TaskTreeNode
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
 
@@ -95,6 +95,7 @@ class NodeSummary:
         parameters: as recorded, empty at the root; a reference to an object of the world also has the object's name.
         reason, failure_message: the class and the text of the failure it ended with.
         thoughts: numbers of the simulations that it performed.
+        observations: number of observations that a program made at it.
     """
 
     id: int
@@ -112,6 +113,7 @@ class NodeSummary:
     sequence: int
     end_sequence: int | None
     thoughts: tuple[int, ...] = ()
+    observations: int = 0
 
 
 async def episodes(connection: AsyncConnection, number: int | None = None) -> list[EpisodeSummary]:
@@ -201,6 +203,8 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
     named = select(objects.c.id, objects.c.name).where(objects.c.process_metadata_id == number)
     names = {row.id: row.name for row in await connection.execute(named)}
     simulations = await _simulations_by_node(connection, number)
+    counted = select(Observation.node_id, func.count()).where(Observation.process_metadata_id == number)
+    observations = dict(iter(await connection.execute(counted.group_by(Observation.node_id))))
     children: dict[int | None, list[NodeSummary]] = {}
     for row in await connection.execute(query):
         children.setdefault(row.parent_id, []).append(
@@ -220,6 +224,7 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 thoughts=tuple(simulations.get(row.id, ())),
                 sequence=row_key(row.id).sequence,
                 end_sequence=row.end_sequence,
+                observations=observations.get(row.id, 0),
             )
         )
     return list(_depth_first(children))

@@ -11,16 +11,16 @@ Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.state import ObjectState, WorldState
 
-__all__ = ["Moment", "NodeThen", "WorldThen", "ObjectThen", "RobotThen", "AttachmentThen"]
+__all__ = ["Moment", "ObservationThen", "NodeThen", "WorldThen", "ObjectThen", "RobotThen", "AttachmentThen"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +102,25 @@ class WorldThen:
 
 
 @dataclass(frozen=True)
+class ObservationThen:
+    """The latest observation of one name.
+
+    Attributes:
+        values: as recorded; a blob is a dict with its hash in `$blob`.
+        sequence: of its event.
+        time_s: since the episode's start.
+        node: id of the node that observed it.
+        missing: by path, why a value could not be recorded.
+    """
+
+    values: Any
+    sequence: int
+    time_s: float
+    node: int | None
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Moment:
     """The state of an episode after one of its events, until the next one.
 
@@ -113,6 +132,7 @@ class Moment:
         at: of that event, by the wall clock.
         status: of the episode at that moment.
         tree: the nodes that had started, each before its children, children in the order they started.
+        observations: by name, the latest observation of a program.
     """
 
     number: int
@@ -127,6 +147,7 @@ class Moment:
     status: str
     tree: tuple[NodeThen, ...]
     world: WorldThen
+    observations: Mapping[str, ObservationThen] = field(default_factory=dict)
 
     @property
     def running(self) -> tuple[NodeThen, ...]:

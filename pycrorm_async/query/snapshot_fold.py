@@ -25,10 +25,11 @@ from pycrorm_async.events.types import (
     ObjectDetached,
     ObjectMoved,
     ObjectRemoved,
+    Observed,
 )
 from pycrorm_async.events.values import FailureValue, PoseValue
 from pycrorm_async.projections.fold.fold import CannotFold, happening_of
-from pycrorm_async.query.snapshot import Moment, NodeThen, ObjectThen, RobotThen, WorldThen
+from pycrorm_async.query.snapshot import Moment, NodeThen, ObjectThen, ObservationThen, RobotThen, WorldThen
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.robots.robot_description import robot_description
@@ -86,6 +87,7 @@ class MomentFold:
         self._objects: dict[int, _WorldObject] = {}
         self._names: dict[int, str] = {}
         """The names of all objects, removed ones included, by identity."""
+        self._observed: dict[str, tuple[StoredEvent, Observed]] = {}
 
     def read(self, event: StoredEvent) -> None:
         """Apply the next event. Raises `CannotFold`."""
@@ -122,6 +124,8 @@ class MomentFold:
                 self._started = happening
             case EpisodeEnded():
                 self._ended(happening.status)
+            case Observed():
+                self._observed[happening.name] = event, happening
             case _:
                 self._changed(event.sequence, happening)
 
@@ -180,6 +184,17 @@ class MomentFold:
             status=self._status,
             tree=tuple(self._tree(dtypes, first.monotonic_ns)),
             world=self._world(),
+            observations={name: self._observation(*each) for name, each in self._observed.items()},
+        )
+
+    def _observation(self, event: StoredEvent, observed: Observed) -> ObservationThen:
+        assert self.first is not None
+        return ObservationThen(
+            values=observed.values,
+            sequence=event.sequence,
+            time_s=(event.monotonic_ns - self.first.monotonic_ns) / 1e9,
+            node=row_id(self.number, observed.node, SLOT_NODE) if observed.node is not None else None,
+            missing=observed.missing,
         )
 
     def _tree(self, dtypes: Mapping[str, str], start_ns: int) -> Iterator[NodeThen]:

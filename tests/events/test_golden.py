@@ -25,7 +25,9 @@ from pycrorm_async.events.values import (
     SeenValue,
 )
 
-LINES = (Path(__file__).parent.parent / "golden" / "events_v1.jsonl").read_text().splitlines()
+FOLDER = Path(__file__).parent.parent / "golden"
+LINES = (FOLDER / "events_v1.jsonl").read_text().splitlines()
+LINES += (FOLDER / "events_added.jsonl").read_text().splitlines()  # the event types added since 0.1.0
 GOLDEN = [(kind, payload.encode()) for kind, _, payload in (line.partition(" ") for line in LINES)]
 
 

@@ -1,160 +1,383 @@
-"""A program in the same process receives every event as it is recorded, and never delays the plan."""
+"""Observations of one's own, from the plan to the tables, on both kinds of database."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
+import io
 import json
-import logging
+import math
+import os
+import sys
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
+from subprocess import run
+from typing import Any
 
+import numpy as np
 import pytest
+from sqlalchemy import select
 
-from pycrorm_async import Memory
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.hooks.event_feed import RecordedEvent
-from pycrorm_async.plan import ActionAbstract, PlanFailure
-from pycrorm_async.world import BulletWorld, Object, ObjectType
-from tests.databases import ask
+from pycrorm_async import Blob, Memory, Reading, Settings, recover
+from pycrorm_async.errors import Unrecordable
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.orm import Observation, ObservationValue
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.plan.task_tree import TaskTreeNode, current_node
+from pycrorm_async.projections.verify.findings import VerifyResult
+from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.commands import answer, environment, pycrorm
+from tests.databases import Server, ask_to_change
+from tests.table_comparison import differences, tables_of
 
 pytestmark = pytest.mark.slow
 
+IMAGE = os.urandom(5_000_000)
+NAME = sha256(IMAGE).hexdigest()
+
 
 @dataclass
-class SayActionPerformable(ActionAbstract):
-    text: str
+class LookActionPerformable(ActionAbstract):
+    """Observes inside an action."""
+
+    def __post_init__(self) -> None:
+        self.memory: Memory | None = None
+        self.seen: list[tuple[str, Any]] = []
+        self.node: TaskTreeNode | None = None
 
     async def perform(self) -> None:
-        if self.text == "nothing":
-            raise PlanFailure("nothing to say")
+        assert self.memory is not None
+        self.node = current_node.get()
+        for name, values in self.seen:
+            self.memory.observe(name, values)
 
 
-@pytest.fixture
-def url(tmp_path: Path) -> str:
-    return f"sqlite:///{tmp_path}/memory.db"
+async def look(memory: Memory, *seen: tuple[str, Any]) -> LookActionPerformable:
+    action = LookActionPerformable()
+    action.memory, action.seen = memory, list(seen)
+    await action.perform()
+    return action
 
 
-async def test_every_event_arrives_once_in_order_including_the_end_of_a_failed_node(url: str) -> None:
-    seen: list[RecordedEvent] = []
-    async with Memory.open(url) as memory:
-        with memory.observe(seen.append):
-            async with memory.episode(description="said") as episode:
-                with BulletWorld():
-                    Object("milk", ObjectType.MILK)
-                    await SayActionPerformable("hello").perform()
-                    with contextlib.suppress(PlanFailure):
-                        await SayActionPerformable("nothing").perform()
-        await SayActionPerformable("unobserved").perform()
-    logged = ask(
-        url, f"SELECT sequence, type, payload FROM event JOIN episode ON number = episode WHERE id = '{episode}'"
-    )
-    assert [(each.episode, each.sequence, type(each.happening).__name__) for each in seen] == [
-        (str(episode), sequence, kind) for sequence, kind, _ in sorted(logged)
-    ]
-    kinds = [type(each.happening) for each in seen]
-    assert kinds[:3] == [EpisodeStarted, NodeStarted, ObjectAdded]
-    assert kinds[-1] is EpisodeEnded
-    nodes = [(each.dtype, each.happening.kind) for each in seen if isinstance(each.happening, NodeStarted)]
-    assert nodes == [(None, "root"), ("SayAction", "action"), ("SayAction", "action")]
-    ends = [each.happening for each in seen if isinstance(each.happening, NodeEnded)]
-    assert [each.status for each in ends] == ["SUCCEEDED", "FAILED", "SUCCEEDED"]
-    assert ends[1].failure is not None
-    assert ends[1].failure.message == "nothing to say"
-    assert [json.loads(payload)["status"] for _, kind, payload in sorted(logged) if kind == "NodeEnded"] == [
-        each.status for each in ends
-    ]
+async def observed(memory: Memory | Reading) -> list[tuple[str, str | None, dict[str, Any]]]:
+    async with memory.session() as session:
+        rows = (await session.scalars(select(Observation).order_by(Observation.id))).all()
+        return [(each.name, each.node.dtype if each.node is not None else None, each.values) for each in rows]
 
 
-async def test_a_callback_that_blocks_does_not_delay_the_plan_and_missed_events_are_counted(url: str) -> None:
-    seen: list[RecordedEvent] = []
-    may_go = threading.Event()
-
-    def block(event: RecordedEvent) -> None:
-        may_go.wait(60)
-        seen.append(event)
-
-    async with Memory.open(url) as memory:
-        observation = memory.observe(block, buffer=5)
-        for _ in range(20):
-            await SayActionPerformable("hello").perform()
-        recorded = 20 * 6  # each in an episode of its own: start, root, node, and their ends
-        assert observation.left_out >= recorded - 6  # five in the buffer, one in the callback
-        may_go.set()
-        observation.close()
-        observation.join()
-        assert len(seen) + observation.left_out == recorded
-        assert [each.sequence for each in seen[:5]] == [1, 2, 3, 4, 5]
+async def verified(url: str) -> VerifyResult:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    try:
+        return await verify(log)
+    finally:
+        await log.close()
 
 
-async def test_a_callback_that_raises_is_counted_and_logged_once_and_gets_the_next_event(
-    url: str, caplog: pytest.LogCaptureFixture
+def assert_no_faults(memory: Memory) -> None:
+    assert memory.status.faults.total == 0, memory.status.faults.last
+
+
+async def test_values_of_every_kind_are_rows_under_the_node_and_the_same_after_copy_and_rebuild(
+    database_url: str, tmp_path: Path, server: Server
 ) -> None:
-    seen: list[RecordedEvent] = []
+    cloud = np.arange(300, dtype=np.float32).reshape(100, 3)
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="seen"):
+            await look(
+                memory,
+                ("force", {"x": 1.5, "y": -2, "contact": True, "at": {"frame": "wrist", "axes": [1, 0]}, "none": None}),
+                ("voltage", 24.25),
+                ("joints", np.array([0.5, 1.5])),
+                ("cloud", {"points": cloud}),
+                ("camera", Blob(IMAGE, "image/png")),
+            )
+            memory.observe("outside", "an action")
+        await memory.flush()
+        assert_no_faults(memory)
+        assert memory.status.missing.total == 0, memory.status.missing.last
+        npy = io.BytesIO()
+        np.save(npy, cloud)
+        expected: list[tuple[str, str | None, dict[str, Any]]] = [
+            (
+                "force",
+                "LookAction",
+                {
+                    "x": 1.5,
+                    "y": -2.0,
+                    "contact": True,
+                    "at.frame": "wrist",
+                    "at.axes.0": 1.0,
+                    "at.axes.1": 0.0,
+                    "none": None,
+                },
+            ),
+            ("voltage", "LookAction", {"value": 24.25}),
+            ("joints", "LookAction", {"0": 0.5, "1": 1.5}),
+            ("cloud", "LookAction", {"points": sha256(npy.getvalue()).hexdigest()}),
+            ("camera", "LookAction", {"value": NAME}),
+            ("outside", None, {"value": "an action"}),
+        ]
+        assert await observed(memory) == expected
+        assert await memory.blob(NAME) == Blob(IMAGE, "image/png")
+        stored = await memory.blob(expected[3][2]["points"])
+        assert stored is not None
+        assert np.array_equal(np.load(io.BytesIO(stored.content)), cloud)
+        frame = await memory.dataframe(
+            select(Observation.name, Observation.sequence, ObservationValue.key, ObservationValue.number)
+            .join(ObservationValue, ObservationValue.id == Observation.id)
+            .where(ObservationValue.key == "x")
+        )
+        assert frame[["name", "key", "number"]].to_numpy().tolist() == [["force", "x", 1.5]]
+        then = await memory.as_of("last", time=1e9)
+        assert list(then.observations) == ["force", "voltage", "joints", "cloud", "camera", "outside"]
+        assert then.observations["voltage"].values == 24.25
+        assert then.observations["cloud"].values["points"]["dtype"] == "float32"
+        assert then.observations["cloud"].values["points"]["shape"] == [100, 3]
+        tree = await memory.reading.tree(1)
+        assert [(each.dtype, each.observations) for each in tree] == [(None, 1), ("LookAction", 5)]
+    before = tables_of(database_url)
+    await rebuild_memory(database_url)
+    assert differences(before, tables_of(database_url)) == []
+    result = await verified(database_url)
+    assert (result.damage, result.drift, len(result.blobs)) == (0, 0, 2)
+    other = f"sqlite:///{tmp_path}/copy.db" if database_url.startswith("postgresql") else server.new_database()
+    await copy_episodes(database_url, other)
+    async with Reading.open(other) as reading:
+        assert await observed(reading) == expected
+        assert await reading.blob(NAME) == Blob(IMAGE, "image/png")
+    assert (await verified(other)).damage == 0
+    if other.startswith("postgresql"):
+        server.drop(other)
 
-    def fail(event: RecordedEvent) -> None:
-        seen.append(event)
-        raise ValueError("not for me")
 
-    async with Memory.open(url) as memory:
-        with caplog.at_level(logging.ERROR), memory.observe(fail) as observation:
-            await SayActionPerformable("hello").perform()
-        assert (len(seen), observation.failed) == (6, 6)
-    assert [each.message[:44] for each in caplog.records] == ["an observer of recorded events raised at Rec"]
-
-
-async def test_a_stream_ends_with_the_memory_after_its_last_event(url: str) -> None:
-    seen: list[RecordedEvent] = []
-
-    async def watch(memory: Memory) -> None:
-        async for event in memory.events():
-            seen.append(event)  # noqa: PERF401 - what came before an error counts too
-
-    async with Memory.open(url) as memory:
-        watching = asyncio.create_task(watch(memory))
-        await asyncio.sleep(0)
-        async with memory.episode(description="open until the end"):
-            await SayActionPerformable("hello").perform()
-            await asyncio.sleep(0.05)
-            assert [type(each.happening).__name__ for each in seen][-1] == "NodeEnded"
-    await asyncio.wait_for(watching, 10)
-    assert [each.sequence for each in seen] == [1, 2, 3, 4, 5, 6]
+async def test_a_private_memory_holds_observations_and_blobs() -> None:
+    async with Memory.open("sqlite://") as memory:
+        async with memory.episode(description="seen"):
+            memory.observe("camera", Blob(b"png", "image/png"))
+        await memory.flush()
+        assert await memory.blob(sha256(b"png").hexdigest()) == Blob(b"png", "image/png")
+        assert await memory.blob("0" * 64) is None
+        assert_no_faults(memory)
 
 
-async def test_each_observer_gets_each_event_of_all_threads_once(url: str) -> None:
-    one: list[RecordedEvent] = []
-    other: list[RecordedEvent] = []
-    async with Memory.open(url) as memory:
-        with memory.observe(one.append), memory.observe(other.append):
-            await asyncio.gather(*(asyncio.to_thread(asyncio.run, many()) for _ in range(4)))
-    for seen in (one, other):
-        by_episode: dict[str, list[int]] = {}
-        for each in seen:
-            by_episode.setdefault(each.episode, []).append(each.sequence)
-        assert sorted(by_episode.values()) == [[1, 2, 3, 4, 5, 6]] * 100
+async def test_what_cannot_be_recorded_is_missing_with_its_reason_and_counted(tmp_path: Path) -> None:
+    settings = Settings(blob_bytes_max=1000, record_bytes_max=64 * 1024)
+    itself: list[Any] = []
+    itself.append(itself)
+    bad: dict[str, Any] = {
+        "nan": math.nan,
+        "nul": "a\0b",
+        "long": "x" * 2**20,
+        "object": object(),
+        "key": {1: 2},
+        "dollar": {"$blob": "0" * 64},
+        "blob": Blob(bytes(1001), "a/b"),
+        "not bytes": Blob("text", "a/b"),  # type: ignore[arg-type]
+        "array": np.array([1.0, math.inf]),
+        "objects": np.array([object()] * 100, dtype=object),
+        "itself": itself,
+        "huge": 2**70,
+    }
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=settings) as memory:
+        memory.observe("before", 1)
+        async with memory.episode(description="seen"):
+            memory.observe("bad", {**bad, "good": 1.0})
+            memory.observe("nul\0name", math.nan)
+            memory.observe("long", "y" * 2**20)
+            memory.observe(7, 7)  # type: ignore[arg-type]
+        await memory.flush()
+        assert_no_faults(memory)
+        async with memory.session() as session:
+            rows = (await session.scalars(select(Observation).order_by(Observation.id))).all()
+        (all_bad, name, long, number) = rows
+        assert number.name == "7"
+        reasons = {each.key: each.missing for each in all_bad.items if each.missing is not None}
+        assert all_bad.values["good"] == 1.0
+        assert reasons == {
+            "nan": "nan is not a finite number",
+            "nul": "the text holds U+0000",
+            "long": reasons["long"],
+            "object": "JSON cannot hold a object",
+            "key": "a key of the dict is a int, not a str",
+            "dollar": "a key of the dict begins with $, which marks a blob",
+            "blob": "the blob takes 1,001 bytes, 1,000 are allowed (blob_bytes_max)",
+            "not bytes": "the content of a blob must be bytes, not str",
+            "array.1": "inf is not a finite number",
+            "objects": reasons["objects"],
+            "huge": "the integer does not fit into 64 bits",
+            "itself" + ".0" * 8: "it is nested more than 8 deep",
+        }
+        assert "1,048,5" in reasons["long"]
+        assert "record_bytes_max" in reasons["long"]
+        assert "allow_pickle" in reasons["objects"]
+        assert (name.name, name.items[0].missing) == ("nul\\x00name", "nan is not a finite number")
+        assert long.items[0].missing is not None
+        # "before" was observed without an episode
+        assert memory.status.missing.total == len(reasons) + 3
+    assert (await verified(f"sqlite:///{tmp_path}/memory.db")).damage == 0
 
 
-async def many() -> None:
-    for _ in range(25):
-        await SayActionPerformable("hello").perform()
+async def test_with_refuse_a_value_that_cannot_be_recorded_raises(tmp_path: Path) -> None:
+    settings = Settings(on_unrecordable="refuse")
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url, settings=settings) as memory, memory.episode(description="seen"):
+        with pytest.raises(Unrecordable, match="nan is not a finite number"):
+            memory.observe("force", {"x": math.nan})
 
 
-async def test_a_stream_whose_loop_is_closed_does_not_delay_the_plan(url: str) -> None:
-    async with Memory.open(url) as memory:
+async def test_threads_observe_for_the_episode_opened_last_and_a_node_can_be_named(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        async with memory.episode(description="seen"):
+            action = await look(memory, ("inside", 1))
+            memory.observe("late", 2, node=action.node)
 
-        def abandon() -> None:
-            async def begin() -> object:
-                return memory.events()
+            def observe() -> None:
+                for number in range(100):
+                    memory.observe("thread", {"n": number})
 
-            asyncio.run(begin())
+            threads = [threading.Thread(target=observe) for _ in range(4)]
+            for each in threads:
+                each.start()
+            for each in threads:
+                each.join()
+        memory.observe("afterwards", 3, node=action.node)
+        await memory.flush()
+        rows = await observed(memory)
+        assert rows[:2] == [("inside", "LookAction", {"value": 1.0}), ("late", "LookAction", {"value": 2.0})]
+        assert len(rows) == 402
+        assert {(name, node) for name, node, _ in rows[2:]} == {("thread", None)}
+        assert_no_faults(memory)
+        assert memory.status.missing == (1, "observation.afterwards: no episode is open")
 
-        await asyncio.to_thread(abandon)
-        assert len(list(observers_of(memory))) == 1
-        await SayActionPerformable("hello").perform()
-        assert list(observers_of(memory)) == []
+
+async def test_a_full_spool_leaves_observations_out_and_never_stops_the_plan(tmp_path: Path) -> None:
+    settings = Settings(
+        spool_bytes_max=8 * 2**14,
+        spool_reserve_bytes=2**14,
+        segment_bytes=2**14,
+        record_bytes_max=2**12,
+        writer="daemon",
+    )
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=settings) as memory:
+        async with memory.episode(description="seen"):
+            memory.observe("camera", Blob(bytes(8 * 2**14), "image/png"))
+            assert memory.status.missing.total == 1
+            assert "spool_bytes_max is reached" in str(memory.status.missing.last)
+            for number in range(3_000):
+                memory.observe("number", {"n": number, "text": "x" * 100})
+        assert_no_faults(memory)
+        left_out = memory.status.missing.total - 1
+        assert 2_000 < left_out < 3_000
+    await recover(f"sqlite:///{tmp_path}/memory.db")
+    async with Reading.open(f"sqlite:///{tmp_path}/memory.db") as reading:
+        rows = await observed(reading)
+        assert len(rows) == 1 + 3_000 - left_out
+        assert rows[0] == ("camera", None, {"value": None})
 
 
-def observers_of(memory: Memory) -> Iterator[object]:
-    yield from memory._open_parts.emitter.feed.observers
+async def test_a_long_episode_continues_and_threads_stop_at_its_last_events(tmp_path: Path) -> None:
+    settings = Settings(episode_events_max=200)
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=settings) as memory:
+        async with memory.episode(description="seen"):
+            for number in range(300):
+                memory.observe("number", number)
+
+            def observe() -> None:
+                for number in range(300):
+                    memory.observe("thread", number)
+
+            other = threading.Thread(target=observe)
+            other.start()
+            other.join()
+        await memory.flush()
+        assert_no_faults(memory)
+        assert memory.status.episodes_continued == 1
+        rows = await observed(memory)
+        assert [values["value"] for name, _, values in rows if name == "number"] == list(range(300))
+        assert "no more room" in str(memory.status.missing.last)
+
+
+def returncode(script: Path) -> int:
+    return run([sys.executable, str(script)], env=environment(), check=False).returncode
+
+
+@pytest.mark.parametrize("kill", ["before the record", "after the record"])
+async def test_a_process_killed_between_blob_and_record_loses_no_blob_that_an_event_refers_to(
+    database_url: str, tmp_path: Path, kill: str
+) -> None:
+    script = tmp_path / "observe.py"
+    put = "Emitter.offer = lambda *_: os.kill(os.getpid(), signal.SIGKILL)" if kill == "before the record" else ""
+    script.write_text(f"""
+import asyncio, os, signal
+from pycrorm_async import Blob, Memory
+from pycrorm_async.hooks.emitter import Emitter
+
+async def main():
+    async with Memory.open({database_url!r}, spool={str(tmp_path / "spool")!r}, writer="daemon") as memory:
+        async with memory.episode(description="seen"):
+            memory.observe("first", Blob(b"first" * 1000, "a/b"))
+            {put}
+            memory.observe("second", Blob(b"second" * 1000, "a/b"))
+            os.kill(os.getpid(), signal.SIGKILL)
+
+asyncio.run(main())
+""")
+    assert returncode(script) == -9
+    report = await recover(database_url, spool=tmp_path / "spool")
+    assert len(report.lost) == 1
+    async with Reading.open(database_url) as reading:
+        rows = await observed(reading)
+        assert [name for name, _, _ in rows] == (["first"] if kill == "before the record" else ["first", "second"])
+        for name, _, values in rows:
+            assert await reading.blob(values["value"]) == Blob(name.encode() * 1000, "a/b")
+    assert (await verified(database_url)).damage == 0
+
+
+async def test_verify_names_the_event_whose_blob_is_missing_or_has_other_bytes(
+    database_url: str, tmp_path: Path
+) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory, memory.episode(description="seen"):
+        memory.observe("camera", Blob(b"one", "image/png"))
+        memory.observe("camera", Blob(b"two", "image/png"))
+    one, two = sha256(b"one").hexdigest(), sha256(b"two").hexdigest()
+    if database_url.startswith("postgresql"):
+        ask_to_change(database_url, "ALTER TABLE pycrorm.pycrorm_blob DISABLE TRIGGER USER")
+        spoil = "UPDATE pycrorm.pycrorm_blob SET content = 'owt'::bytea"
+    else:
+        ask_to_change(database_url, "DROP TRIGGER blob_is_not_updated")
+        ask_to_change(database_url, "DROP TRIGGER blob_is_not_deleted")
+        spoil = "UPDATE pycrorm_blob SET content = CAST('owt' AS BLOB)"
+    table = "pycrorm.pycrorm_blob" if database_url.startswith("postgresql") else "pycrorm_blob"
+    ask_to_change(database_url, f"DELETE FROM {table} WHERE hash = '{one}'")
+    ask_to_change(database_url, f"{spoil} WHERE hash = '{two}'")
+    result = await verified(database_url)
+    assert [str(each) for each in result.damages] == [
+        f"episode 1, event 3: refers to blob {one}, which is missing",
+        f"episode 1, event 4: refers to blob {two}, which has another content than its hash says",
+    ]
+    if not database_url.startswith("postgresql"):
+        done = pycrorm("verify", "--url", database_url, cwd=tmp_path)
+        assert done.returncode == 4
+        assert f"refers to blob {one}, which is missing" in done.stdout
+
+
+async def test_show_counts_observations_and_a_moment_shows_the_latest_values(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/pycrorm.db") as memory, memory.episode(description="seen"):
+        await look(memory, ("force", {"x": 1.5}), ("force", {"x": 2.5}), ("camera", Blob(b"png", "image/png")))
+    assert "LookAction  SUCCEEDED" in (shown := pycrorm("show", "last", cwd=tmp_path).stdout)
+    assert "3 observations" in shown
+    moment = pycrorm("show", "last", "--at", "e4", cwd=tmp_path).stdout
+    assert "x=1.5" in moment
+    assert "image/png" not in moment
+    moment = pycrorm("show", "last", "--at", "9", cwd=tmp_path).stdout
+    assert "x=2.5" in moment
+    assert "image/png of 3 bytes" in moment
+    assert answer("show", "last", "--at", "e4", cwd=tmp_path)["observations"]["force"]["values"] == {"x": 1.5}
+    assert [each["type"] for each in map(dict, _lines("events", "last", cwd=tmp_path))].count("Observed") == 3
+
+
+def _lines(*arguments: str, cwd: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in pycrorm(*arguments, "--json", cwd=cwd).stdout.splitlines()]

@@ -267,10 +267,11 @@ async def test_flipped_bytes_anywhere_give_findings_or_an_error_and_never_a_trac
 ) -> None:
     dice = random.Random(7)
     whole = file.read_bytes()
+    pages = [at for at in range(4096, len(whole), 4096) if whole[at : at + 4096].count(0) < 3900]  # of tables with rows
     findings_for_any_parts = 0
     for _ in range(25):
         image = bytearray(whole)
-        page = dice.randrange(1, len(image) // 4096) * 4096
+        page = dice.choice(pages)
         for _ in range(20):
             image[page + dice.randrange(4096)] = dice.randrange(256)
         copy = tmp_path / "copy.db"

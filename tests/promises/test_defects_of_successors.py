@@ -111,7 +111,7 @@ async def test_the_state_after_an_action_is_not_the_state_before_it(tmp_path: Pa
 async def test_an_observer_of_a_plan_is_notified_of_every_start_and_end(tmp_path: Path) -> None:
     seen: list[RecordedEvent] = []
     async with recorded(tmp_path) as memory:
-        with memory.observe(seen.append), lab():
+        with memory.subscribe(seen.append), lab():
             await (Navigate([Pose([1, 0, 0])]) - NoteActionPerformable("not needed")).perform()
             with pytest.raises(PlanFailure):
                 await FailingActionPerformable(PlanFailure("no")).perform()

@@ -33,7 +33,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 TIDY, STEREO = python_of("pycrorm_async/plan/README.md")
-COURSE, AROUND, BEGAN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
+COURSE, AROUND, BEGAN, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 [BETTER] = python_of("pycrorm_async/learning/README.md")
 
 
@@ -202,6 +202,16 @@ async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
         {"path": "root > Parallel > KnockAction", "reason": "PlanFailure", "times": 2}
     ]
     assert frame.object.tolist() == [None]
+
+
+async def test_observations_are_recorded_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, Any] = {}
+    exec("from pycrorm_async import Memory", names)
+    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
+    exec(f"async def asked():\n{opened}{textwrap.indent(SEEN, '        ')}        return frame", names)
+    frame = await names["asked"]()
+    assert frame.number.tolist() == [1.5]
+    assert "Blob(content=b'the bytes of an image', media_type='image/png')" in capsys.readouterr().out
 
 
 async def test_a_snapshot_is_printed_and_restored_in_another_world(

@@ -27,6 +27,7 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     ObjectMoved,
     ObjectRemoved,
+    Observed,
     StateSampled,
 )
 from pycrorm_async.projections.fold.column_values import (
@@ -53,6 +54,7 @@ from pycrorm_async.projections.fold.node_row import (
     START_TIME,
     TORSO_HEIGHT,
 )
+from pycrorm_async.projections.fold.observed_values import value_rows
 from pycrorm_async.projections.fold.parameters import Designators, ParameterRows
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, Row, Rows
 from pycrorm_async.store.stored import StoredEvent
@@ -317,6 +319,14 @@ def _state_sampled(event: StoredEvent, sampled: StateSampled, _designators: Desi
     )
 
 
+def _observed(event: StoredEvent, observed: Observed, _designators: Designators, rows: Rows) -> None:
+    own, number = _own(event)
+    node, time = _node(event, observed.node), microseconds(event.wall_ns)
+    values = [(own, position, number, *each) for position, each in enumerate(value_rows(observed))]
+    rows.inserts["observation"].append((own, number, node, observed.name, time, event.monotonic_ns))
+    rows.inserts["observation_value"].extend(values)
+
+
 # --- parts ----------------------------------------------------------------------------------------------------
 
 
@@ -342,4 +352,5 @@ _FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {
     "LocationResolved": _location_resolved,
     "ObjectDetected": _object_detected,
     "StateSampled": _state_sampled,
+    "Observed": _observed,
 }

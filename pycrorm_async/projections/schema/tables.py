@@ -212,6 +212,27 @@ CORE: dict[str, dict[str, Storage]] = {
         "time": "time",
         "ns": "integer",
     },
+    "observation": {
+        "id": "key",
+        "process_metadata_id": "row",
+        "node_id": "row",
+        "name": "text",
+        "time": "time",
+        "ns": "integer",
+    },
+    "observation_value": {
+        "id": "key",
+        "position": "key",
+        "process_metadata_id": "row",
+        "key": "text",
+        "number": "real",
+        "text": "text",
+        "truth": "boolean",
+        "blob": "text",
+        "media_type": "text",
+        "size": "integer",
+        "missing": "text",
+    },
 }
 """The columns of each table, in the order in which the fold writes their values.
 
@@ -236,6 +257,8 @@ _INDEXED = {
     "location_refusal": ("process_metadata_id",),
     "detection": ("process_metadata_id", "node_id"),
     "state_sample": ("process_metadata_id", "node_id"),
+    "observation": ("process_metadata_id", "node_id", "name"),
+    "observation_value": ("process_metadata_id",),
 }
 
 _SECOND_COLUMNS = {("task_tree_node", "dtype"): ("status",)}
