@@ -1,4 +1,4 @@
-"""A recorder on a queue that is a list: what was told, in order, and what is wrong with it."""
+"""A recorder on a queue that is a list, with checks of the order of its events."""
 
 import asyncio
 import threading
@@ -26,7 +26,7 @@ from pycrorm_async.world.observers import watcher
 
 
 class ListSink:
-    """The queue's promise in a list: sequences without gaps, room or none."""
+    """The queue's contract in a list: sequences without gaps, and a limit on space that tests set."""
 
     def __init__(self) -> None:
         self.records: list[tuple[EpisodeId | None, int, Happening]] = []
@@ -41,7 +41,7 @@ class ListSink:
         self.fails_at: int | None = None
         """The sequence whose put raises, once."""
         self.before_end: Callable[[], None] = lambda: None
-        """Called before each end of a node is put."""
+        """Called before the end of each node is put."""
 
     def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
         if heading.type == "NodeEnded":
@@ -91,7 +91,7 @@ class ListSink:
         return self.of(name)
 
 
-class Rig:
+class RecorderCase:
     def __init__(self, settings: Settings) -> None:
         self.sink = ListSink()
         self.emitter = Emitter(self.sink, settings)
@@ -113,15 +113,15 @@ class Rig:
 
 
 @contextmanager
-def rigged(settings: Settings | None = None) -> Iterator[Rig]:
-    rig = Rig(settings or Settings())
-    tokens = recorder.set(rig.recorder), watcher.set(rig.recorder)
+def recorder_case(settings: Settings | None = None) -> Iterator[RecorderCase]:
+    case = RecorderCase(settings or Settings())
+    tokens = recorder.set(case.recorder), watcher.set(case.recorder)
     try:
-        yield rig
+        yield case
     finally:
         recorder.reset(tokens[0])
         watcher.reset(tokens[1])
-        rig.recorder.close()
+        case.recorder.close()
 
 
 def findings(events: list[tuple[int, Happening]]) -> list[Any]:
@@ -146,7 +146,7 @@ class CarryActionPerformable(ActionAbstract):
     part: ObjectPart | None = None
 
     async def perform(self) -> None:
-        """Nothing."""
+        """Succeed without doing anything."""
 
 
 def kinds(events: list[tuple[int, Happening]]) -> list[str]:

@@ -1,4 +1,4 @@
-"""A designator class becomes a declaration by its fields; what cannot be a column is refused by name."""
+"""The fields of a designator class become a declaration; a class that cannot have columns is refused by name."""
 
 import enum
 from collections.abc import Sequence
@@ -56,7 +56,7 @@ class EverythingActionPerformable(ActionAbstract):
     made: int = field(init=False, default=3)
 
     async def perform(self) -> None:
-        """Nothing."""
+        """Succeed without doing anything."""
 
 
 def test_every_kind_of_field_has_its_column() -> None:
@@ -114,7 +114,7 @@ def test_a_reserved_name_is_refused() -> None:
         robot_state: str
 
         async def perform(self) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
     with pytest.raises(DeclarationRefused, match=r"ReservedActionPerformable cannot be declared: field 'robot_state'"):
         declared_type(ReservedActionPerformable)
@@ -125,18 +125,18 @@ def test_a_class_with_fields_that_is_no_dataclass_is_refused() -> None:
         text: str
 
         async def perform(self) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
     with pytest.raises(DeclarationRefused, match="add @dataclass"):
         declared_type(BareActionPerformable)
 
 
-def test_a_dtype_that_would_take_a_table_of_ours_is_refused() -> None:
+def test_a_dtype_whose_table_is_one_of_the_memorys_own_is_refused() -> None:
     class Odd(ActionAbstract):
         dtype = "Pose"
 
         async def perform(self) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
     with pytest.raises(DeclarationRefused, match="'pose', which the memory itself uses"):
         declared_type(Odd)
@@ -150,7 +150,7 @@ def saying(place: int) -> type[ActionAbstract]:
             text: str
 
             async def perform(self) -> None:
-                """Nothing."""
+                """Succeed without doing anything."""
 
         return SayingActionPerformable
 
@@ -159,12 +159,12 @@ def saying(place: int) -> type[ActionAbstract]:
         text: str
 
         async def perform(self) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
     return SayingAction
 
 
-def test_two_live_classes_of_one_dtype_are_refused_with_both_paths() -> None:
+def test_two_live_classes_with_one_dtype_are_refused_with_both_paths() -> None:
     first, second = saying(0), saying(1)
     declarations = Declarations()
     seen: list[DeclaredType] = []
@@ -176,7 +176,7 @@ def test_two_live_classes_of_one_dtype_are_refused_with_both_paths() -> None:
     assert len(seen) == 1
 
 
-def test_a_class_defined_again_at_the_same_place_takes_over() -> None:
+def test_a_class_defined_again_at_the_same_place_replaces_the_first() -> None:
     first, again = saying(0), saying(0)
     declarations = Declarations()
     seen: list[DeclaredType] = []
@@ -189,7 +189,7 @@ def test_a_class_defined_again_at_the_same_place_takes_over() -> None:
 def test_a_class_defined_again_with_another_type_is_refused_with_both_types() -> None:
     def counting(kind: type) -> type[ActionAbstract]:
         async def perform(self: Any) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
         namespace = {"__annotations__": {"many": kind}, "perform": perform, "__qualname__": "CountingAction"}
         return dataclass(type("CountingAction", (ActionAbstract,), namespace))
@@ -208,7 +208,7 @@ def test_a_class_with_the_name_of_a_built_in_one_is_refused() -> None:
         where: str
 
         async def perform(self) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
     with pytest.raises(
         DeclarationRefused, match=r"plan\.actions\.basic\.NavigateActionPerformable already has the dtype"
@@ -226,12 +226,12 @@ def test_a_dtype_that_is_no_name_is_refused(dtype: str) -> None:
 
 def renamed(aliases: Any, name: str = "WelcomeAction", base: type[Any] = ActionAbstract) -> type[ActionAbstract]:
     async def perform(self: Any) -> None:
-        """Nothing."""
+        """Succeed without doing anything."""
 
     return dataclass(type(name, (base,), {"aliases": aliases, "perform": perform, "__module__": __name__}))
 
 
-def test_what_a_class_was_called_is_declared_and_not_inherited() -> None:
+def test_the_aliases_of_a_class_are_declared_and_not_inherited() -> None:
     welcome = renamed(("GreetAction", "SaluteAction"))
     assert declared_type(welcome).declaration.aliases == ("GreetAction", "SaluteAction")
     loud = type("LoudWelcomeAction", (welcome,), {"__module__": __name__})
@@ -245,7 +245,7 @@ def test_a_field_may_be_called_aliases() -> None:
         aliases: str = "many"
 
         async def perform(self) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
     declaration = declared_type(ListAction).declaration
     assert ([each.name for each in declaration.fields], declaration.aliases) == (["aliases"], ())
@@ -265,12 +265,12 @@ def test_a_field_may_be_called_aliases() -> None:
         (("EverythingAction",), r"its alias 'EverythingAction' is the dtype of one of its base classes"),
     ],
 )
-def test_an_alias_that_cannot_be_one_is_refused(aliases: Any, reason: str) -> None:
+def test_an_invalid_alias_is_refused(aliases: Any, reason: str) -> None:
     with pytest.raises(DeclarationRefused, match=reason):
         declared_type(renamed(aliases, base=EverythingActionPerformable))
 
 
-def test_two_live_classes_that_had_one_name_are_refused() -> None:
+def test_two_live_classes_with_one_former_name_are_refused() -> None:
     live = Declarations()
     welcome, hello = renamed(("GreetAction",)), renamed(("GreetAction",), "HelloAction")
     live.of(welcome, lambda _: None)
@@ -278,7 +278,7 @@ def test_two_live_classes_that_had_one_name_are_refused() -> None:
         live.of(hello, lambda _: None)
 
 
-def test_a_mapped_class_of_ones_own_belongs_to_its_designator_and_not_to_its_descendants() -> None:
+def test_a_users_mapped_class_belongs_to_its_designator_and_not_to_its_descendants() -> None:
     class Mapped:
         __tablename__ = "my_sayings"
 
@@ -288,7 +288,7 @@ def test_a_mapped_class_of_ones_own_belongs_to_its_designator_and_not_to_its_des
         orm_class = Mapped
 
         async def perform(self) -> None:
-            """Nothing."""
+            """Succeed without doing anything."""
 
     @dataclass
     class WhisperActionPerformable(SayActionPerformable):
@@ -298,7 +298,7 @@ def test_a_mapped_class_of_ones_own_belongs_to_its_designator_and_not_to_its_des
     assert declared_type(WhisperActionPerformable).declaration.table == "whisper_action"
 
 
-def test_names_that_a_database_cannot_take_are_mapped_by_the_name_alone() -> None:
+def test_names_that_no_database_accepts_are_mapped_to_others_by_the_name_alone() -> None:
     long = "x" * 70
     for names in ((long, "true"), ("true", "other", long)):
         made: Any = dataclass(
@@ -317,4 +317,4 @@ def test_names_that_a_database_cannot_take_are_mapped_by_the_name_alone() -> Non
 
 
 async def perform(self: Any) -> None:
-    """Does nothing."""
+    """Succeed without doing anything."""

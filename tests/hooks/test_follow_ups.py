@@ -1,4 +1,4 @@
-"""An episode that comes near its last sequence goes on in a follow-up episode; the plan notices nothing."""
+"""An episode that comes near its last sequence is continued in a follow-up episode, without effect on the plan."""
 
 from __future__ import annotations
 
@@ -37,7 +37,14 @@ from pycrorm_async.plan.motions.process_modules import simulated_robot
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from tests.hooks.fakes import CarryActionPerformable, ListSink, NoteActionPerformable, Rig, findings, rigged
+from tests.hooks.fakes import (
+    CarryActionPerformable,
+    ListSink,
+    NoteActionPerformable,
+    RecorderCase,
+    findings,
+    recorder_case,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -47,7 +54,7 @@ SMALL = Settings(episode_events_max=MAX)
 
 @dataclass
 class ShiftActionPerformable(ActionAbstract):
-    """Notes so many times, and gives back how often."""
+    """Take this many notes and return the number."""
 
     notes: int
     of: str = "day"
@@ -60,7 +67,7 @@ class ShiftActionPerformable(ActionAbstract):
 
 @dataclass
 class SpoilingActionPerformable(ActionAbstract):
-    """Changes its own parameter to what no event can hold, and goes on for more than an episode."""
+    """Change its own parameter to an unrecordable value, and continue for more than an episode."""
 
     weight: float
 
@@ -70,7 +77,7 @@ class SpoilingActionPerformable(ActionAbstract):
 
 
 class LeavingActionPerformable(ActionAbstract):
-    """Leaves a task behind, which goes on in its context."""
+    """Leave a task behind, which continues in its context."""
 
     def __init__(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         self.work = work
@@ -81,7 +88,7 @@ class LeavingActionPerformable(ActionAbstract):
 
 
 def parts_of(sink: ListSink) -> list[list[tuple[int, Happening]]]:
-    """The events of each episode, in the order they began."""
+    """Return the events of each episode, in the order of their starts."""
     return [sink.of(each) for each in sink.sequences]
 
 
@@ -89,9 +96,9 @@ def only(events: list[tuple[int, Happening]], kind: type[Happening]) -> list[tup
     return [(sequence, event) for sequence, event in events if isinstance(event, kind)]
 
 
-def no_faults(rig: Rig) -> bool:
-    assert rig.emitter.faults.total == 0, rig.emitter.faults.last
-    for events in parts_of(rig.sink):
+def assert_no_faults(case: RecorderCase) -> bool:
+    assert case.emitter.faults.total == 0, case.emitter.faults.last
+    for events in parts_of(case.sink):
         assert findings(events) == []
         assert [sequence for sequence, _ in events] == list(range(1, len(events) + 1))
         assert isinstance(events[0][1], EpisodeStarted)
@@ -100,19 +107,19 @@ def no_faults(rig: Rig) -> bool:
     return True
 
 
-async def test_each_part_names_the_next_and_every_perform_has_one_row_that_says_how_it_ended() -> None:
-    with rigged(SMALL) as rig:
-        with rig.episode() as episode:
+async def test_each_part_names_the_next_and_every_perform_has_one_row_with_its_outcome() -> None:
+    with recorder_case(SMALL) as case:
+        with case.episode() as episode:
             assert await ShiftActionPerformable(200).perform() == 200
             last = episode.id
-        names: list[EpisodeId] = list(rig.sink.sequences)
+        names: list[EpisodeId] = list(case.sink.sequences)
         assert names[-1] == last
-        assert len(names) == 1 + rig.recorder.continued_count > 4
-        assert rig.recorder.recent_episodes == tuple(map(episode_text, names))
-        assert rig.recorder.open_episodes == ()
-    assert no_faults(rig)
+        assert len(names) == 1 + case.recorder.continued_count > 4
+        assert case.recorder.recent_episodes == tuple(map(episode_text, names))
+        assert case.recorder.open_episodes == ()
+    assert assert_no_faults(case)
 
-    parts = parts_of(rig.sink)
+    parts = parts_of(case.sink)
     starts = [events[0][1] for events in parts]
     ends = [events[-1][1] for events in parts]
     assert all(isinstance(each, EpisodeStarted) and each.description == "d" for each in starts)
@@ -135,13 +142,13 @@ async def test_each_part_names_the_next_and_every_perform_has_one_row_that_says_
     assert performed == Counter(["root", "200", *(f"day {number}" for number in range(200))])
 
 
-async def test_a_node_that_was_open_is_started_again_under_its_parent_and_names_the_sequence_it_continues() -> None:
-    with rigged(SMALL) as rig, rig.episode():
+async def test_an_open_node_is_started_again_under_its_parent_and_names_the_sequence_it_continues() -> None:
+    with recorder_case(SMALL) as case, case.episode():
         await ShiftActionPerformable(60).perform()
-    assert no_faults(rig)
-    first, second = parts_of(rig.sink)
-    # The 88th event starts a note. What is open is cut, innermost first, and begins again, outermost first.
-    why = f"the episode continues in episode {episode_text(list(rig.sink.sequences)[1])}"
+    assert assert_no_faults(case)
+    first, second = parts_of(case.sink)
+    # The 88th event starts a note. Open nodes are cut, innermost first, and start again, outermost first.
+    why = f"the episode continues in episode {episode_text(list(case.sink.sequences)[1])}"
     assert [sequence for sequence, _ in first][-5:] == [88, 89, 90, 91, 92]
     assert [event.node for _, event in first[-4:] if isinstance(event, NodeEnded)] == [88, 3, 2]
     assert {event.failure.message for _, event in first[-4:] if isinstance(event, NodeEnded) and event.failure} == {why}
@@ -153,20 +160,20 @@ async def test_a_node_that_was_open_is_started_again_under_its_parent_and_names_
     assert next((event.node, event.status) for _, event in second if isinstance(event, NodeEnded)) == (4, "SUCCEEDED")
 
 
-async def test_the_world_is_announced_again_as_it_is_then_and_what_follows_names_its_new_rows() -> None:
-    with rigged(SMALL) as rig, rig.episode(), BulletWorld(), simulated_robot:
+async def test_the_world_is_announced_again_in_its_state_and_later_events_name_its_new_rows() -> None:
+    with recorder_case(SMALL) as case, case.episode(), BulletWorld(), simulated_robot:
         robot = Object("pr2", ObjectType.ROBOT)
         milk = Object("milk", ObjectType.MILK, pose=Pose([1, 0, 1]))
         bowl = Object("bowl", ObjectType.BOWL, pose=Pose([2, 0, 1]))
         robot.attach(milk)
-        while len(rig.sink.sequences) == 1:
-            bowl.set_pose(Pose([2, bowl.pose.position.y + 0.01, 1]))  # of no node: the world itself brings it near
+        while len(case.sink.sequences) == 1:
+            bowl.set_pose(Pose([2, bowl.pose.position.y + 0.01, 1]))  # of no node: the world itself announces it
         there = bowl.pose.position
         bowl.set_pose(Pose([3, 3, 1]))
         await CarryActionPerformable(ObjectDesignator("bowl", ObjectType.BOWL, bowl)).perform()
         milk.remove()
-    assert no_faults(rig)
-    _, second = parts_of(rig.sink)
+    assert assert_no_faults(case)
+    _, second = parts_of(case.sink)
     assert [(event.name, event.pose.position) for _, event in second[2:5] if isinstance(event, ObjectAdded)] == [
         ("pr2", (0, 0, 0)), ("milk", (1, 0, 1)), ("bowl", tuple(there)),
     ]  # fmt: skip
@@ -185,17 +192,17 @@ async def test_the_world_is_announced_again_as_it_is_then_and_what_follows_names
 
 async def test_the_first_sample_after_it_holds_all_channels() -> None:
     settings = Settings(episode_events_max=MAX, sample_interval_ms=1_000_000)
-    with rigged(settings) as rig, rig.episode(), BulletWorld(), simulated_robot:
+    with recorder_case(settings) as case, case.episode(), BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)
         height = 0.0
-        while len(rig.sink.sequences) == 1:
+        while len(case.sink.sequences) == 1:
             height = 0.3 - height
             await MoveTorsoActionPerformable(height).perform()
         await MoveTorsoActionPerformable(0.1).perform()
-    assert no_faults(rig)
+    assert assert_no_faults(case)
     first, second = (
         [event.channels for _, event in only(part, StateSampled) if isinstance(event, StateSampled)]
-        for part in parts_of(rig.sink)
+        for part in parts_of(case.sink)
     )
     assert len(first[0]) > 20
     assert {tuple(each) for each in first[1:]} == {("torso_lift_joint",)}
@@ -204,7 +211,7 @@ async def test_the_first_sample_after_it_holds_all_channels() -> None:
 
 
 class Driving:
-    """Moves the base in small steps until the episode was continued, and once more."""
+    """Move the base in small steps until the episode was continued, and once more."""
 
     def __init__(self, sink: ListSink) -> None:
         self._sink = sink
@@ -222,13 +229,13 @@ class Driving:
     async def move_joints(self, motion: object) -> None: ...
 
 
-async def test_a_motion_that_runs_meanwhile_is_sampled_on_as_the_rest_of_it_with_all_channels() -> None:
+async def test_a_motion_across_the_cut_is_sampled_further_with_all_channels() -> None:
     settings = Settings(episode_events_max=MAX, sample_interval_ms=1_000_000)
-    with rigged(settings) as rig, rig.episode(), BulletWorld(), ChosenRobot("mine", Driving(rig.sink)):
+    with recorder_case(settings) as case, case.episode(), BulletWorld(), ChosenRobot("mine", Driving(case.sink)):
         Object("pr2", ObjectType.ROBOT)
         await NavigateActionPerformable(Pose([5, 0, 0])).perform()
-    assert no_faults(rig)
-    first, second = (only(part, StateSampled) for part in parts_of(rig.sink))
+    assert assert_no_faults(case)
+    first, second = (only(part, StateSampled) for part in parts_of(case.sink))
     assert len(first) == len(second) == 1
     whole, rest = first[0][1], second[0][1]
     assert isinstance(whole, StateSampled)
@@ -236,19 +243,19 @@ async def test_a_motion_that_runs_meanwhile_is_sampled_on_as_the_rest_of_it_with
     assert len(whole.channels) > 20
     assert rest.channels.keys() == whole.channels.keys()
     assert (whole.channels["base.x"], rest.channels["base.x"]) == (0.0, 5.0)
-    assert rest.node in dict(only(parts_of(rig.sink)[1], NodeStarted))
+    assert rest.node in dict(only(parts_of(case.sink)[1], NodeStarted))
 
 
-async def test_plans_at_once_in_one_episode_go_on_together() -> None:
-    with rigged(SMALL) as rig, rig.episode() as episode:
+async def test_concurrent_plans_in_one_episode_are_continued_together() -> None:
+    with recorder_case(SMALL) as case, case.episode() as episode:
         async with asyncio.TaskGroup() as tasks:
             for name in ("one", "two"):
                 tasks.create_task(ShiftActionPerformable(60, name).perform())
         assert current_episode.get() is episode
-    assert no_faults(rig)
+    assert assert_no_faults(case)
     noted = Counter(
         event.parameters["text"]
-        for part in parts_of(rig.sink)
+        for part in parts_of(case.sink)
         for _, event in only(part, NodeStarted)
         if isinstance(event, NodeStarted) and "text" in event.parameters and event.continues is None
     )
@@ -256,18 +263,18 @@ async def test_plans_at_once_in_one_episode_go_on_together() -> None:
 
 
 async def test_a_parameter_that_became_unrecordable_is_missing_in_the_rest_of_its_node_and_refuses_nothing() -> None:
-    with rigged(Settings(episode_events_max=MAX, on_unrecordable="refuse")) as rig, rig.episode():
+    with recorder_case(Settings(episode_events_max=MAX, on_unrecordable="refuse")) as case, case.episode():
         await SpoilingActionPerformable(0.5).perform()
-    assert no_faults(rig)
-    first, second = ([event for _, event in only(part, NodeStarted)] for part in parts_of(rig.sink))
+    assert assert_no_faults(case)
+    first, second = ([event for _, event in only(part, NodeStarted)] for part in parts_of(case.sink))
     assert getattr(first[1], "parameters", None) == {"weight": 0.5}
     assert getattr(second[1], "parameters", None) == {
         "weight": {"missing": "nan is not a finite number", "repr": "nan"}
     }
 
 
-async def test_what_a_node_that_ended_in_the_former_part_left_behind_belongs_to_the_root_of_the_follow_up() -> None:
-    with rigged(SMALL) as rig, rig.episode(), BulletWorld():
+async def test_a_task_of_a_node_that_ended_in_the_former_part_belongs_to_the_root_of_the_follow_up() -> None:
+    with recorder_case(SMALL) as case, case.episode(), BulletWorld():
         milk = Object("milk", ObjectType.MILK)
         waiting = asyncio.Event()
 
@@ -282,48 +289,48 @@ async def test_what_a_node_that_ended_in_the_former_part_left_behind_belongs_to_
         await ShiftActionPerformable(60).perform()
         waiting.set()
         await leaving.task
-    assert no_faults(rig)
-    _, second = parts_of(rig.sink)
+    assert assert_no_faults(case)
+    _, second = parts_of(case.sink)
     notes = [event for _, event in only(second, NodeStarted) if getattr(event, "parameters", {}).get("text") == "late"]
     assert [getattr(each, "parent", None) for each in notes] == [2]
     assert [getattr(event, "node", 0) for _, event in only(second, ObjectMoved)] == [None]
 
 
-async def test_a_thought_goes_on_as_a_thought_of_the_same_thinker() -> None:
-    with rigged(SMALL) as rig, rig.episode() as episode:
+async def test_a_simulation_is_continued_as_a_simulation_of_the_same_node() -> None:
+    with recorder_case(SMALL) as case, case.episode() as episode:
         with SimulatedTaskTree():
             await ShiftActionPerformable(60).perform()
         thinker = NodeReference(str(episode), 2)
-    assert no_faults(rig)
-    _, *thoughts = [part[0][1] for part in parts_of(rig.sink)]
-    assert len(thoughts) == 2
-    for each in thoughts:
+    assert assert_no_faults(case)
+    _, *simulated_episodes = [part[0][1] for part in parts_of(case.sink)]
+    assert len(simulated_episodes) == 2
+    for each in simulated_episodes:
         assert isinstance(each, EpisodeStarted)
         assert (each.simulated, each.thought_by) == (True, thinker)
 
 
 async def test_a_world_with_more_objects_than_an_episode_has_events_is_not_continued_for_ever() -> None:
-    with rigged(SMALL) as rig, rig.episode(), BulletWorld():
+    with recorder_case(SMALL) as case, case.episode(), BulletWorld():
         for number in range(2 * MAX):
             Object(f"milk {number}", ObjectType.MILK)
-        count = len(rig.sink.sequences)
+        count = len(case.sink.sequences)
         for _ in range(2 * MAX):
             await NoteActionPerformable().perform()
-        assert len(rig.sink.sequences) < count + 3
-    assert rig.emitter.faults.total == 0
+        assert len(case.sink.sequences) < count + 3
+    assert case.emitter.faults.total == 0
 
 
-def test_how_many_events_an_episode_may_have_is_checked() -> None:
+def test_the_limit_on_the_events_of_an_episode_is_checked() -> None:
     assert Settings().episode_events_max == SEQUENCE_MAX
     for wrong in (0, 99, SEQUENCE_MAX + 1, 150.5):
         with pytest.raises(CallerError, match="from 100 to 67,108,863"):
             Settings(episode_events_max=wrong)  # type: ignore[arg-type]
 
 
-def outcomes(rig: Rig) -> Counter[str]:
-    """How often each note ended with an outcome of its own, by text; every part is in legal order."""
+def outcomes(case: RecorderCase) -> Counter[str]:
+    """Count the ends of each note with an outcome of its own, by text; every part is in legal order."""
     ended: Counter[str] = Counter()
-    for events in parts_of(rig.sink):
+    for events in parts_of(case.sink):
         assert [each for each in findings(events) if each.kind != "remark"] == []
         assert isinstance(events[-1][1], EpisodeEnded)
         nodes = dict(only(events, NodeStarted))
@@ -335,32 +342,32 @@ def outcomes(rig: Rig) -> Counter[str]:
 
 
 @pytest.mark.parametrize("put", range(1, 6))
-async def test_a_follow_up_whose_event_cannot_be_written_is_tried_again_and_every_node_ends_once(put: int) -> None:
-    """The put of the follow-up that fails: the ends of note, shift and move, then of the root and the episode."""
-    with rigged(SMALL) as rig, rig.episode(), BulletWorld():
+async def test_a_follow_up_whose_event_cannot_be_written_is_retried_and_every_node_ends_once(put: int) -> None:
+    """Fail one put of the follow-up: an end of note, shift or move, or that of the root or the episode."""
+    with recorder_case(SMALL) as case, case.episode(), BulletWorld():
         milk = Object("milk", ObjectType.MILK)
 
         @dataclass
         class MovingActionPerformable(ActionAbstract):
             async def perform(self) -> None:
-                rig.sink.fails_at = MAX - MAX // 8 + put
+                case.sink.fails_at = MAX - MAX // 8 + put
                 await ShiftActionPerformable(60).perform()
                 milk.set_pose(Pose([1, 2, 3]))
 
         await MovingActionPerformable().perform()
-    assert rig.emitter.faults.total == 1
-    assert rig.recorder.continued_count == 1
+    assert case.emitter.faults.total == 1
+    assert case.recorder.continued_count == 1
     ended = {f"day {number} SUCCEEDED": 1 for number in range(60)} | {"other SUCCEEDED": 3}
-    if put > 1:  # its end says that the episode continues, and it had ended before the second attempt
+    if put > 1:  # it ended before the second attempt, and its end says that the episode continues
         del ended["day 41 SUCCEEDED"]
-    assert outcomes(rig) == Counter(ended)
-    moves = [event for events in parts_of(rig.sink) for _, event in only(events, ObjectMoved)]
+    assert outcomes(case) == Counter(ended)
+    moves = [event for events in parts_of(case.sink) for _, event in only(events, ObjectMoved)]
     assert [getattr(each, "pose", None).position for each in moves] == [(1, 2, 3)]  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("continued", [True, False])
 async def test_the_end_of_an_episode_waits_for_a_node_that_another_thread_is_ending(*, continued: bool) -> None:
-    with rigged(SMALL) as rig, rig.episode():
+    with recorder_case(SMALL) as case, case.episode():
 
         async def late() -> None:
             await NoteActionPerformable("late").perform()
@@ -372,7 +379,7 @@ async def test_the_end_of_an_episode_waits_for_a_node_that_another_thread_is_end
                 ending.set()
                 go.wait(5)
 
-        rig.sink.before_end = pause
+        case.sink.before_end = pause
         context = contextvars.copy_context()
         thread = threading.Thread(target=lambda: context.run(asyncio.run, late()))
         thread.start()
@@ -383,6 +390,6 @@ async def test_the_end_of_an_episode_waits_for_a_node_that_another_thread_is_end
             await ShiftActionPerformable(60).perform()
     thread.join()
     timer.join()
-    assert rig.emitter.faults.total == 0
+    assert case.emitter.faults.total == 0
     shifts = {f"day {number} SUCCEEDED": 1 for number in range(60)} | {"other SUCCEEDED": 2}
-    assert outcomes(rig) == Counter({"late SUCCEEDED": 1} | (shifts if continued else {"other SUCCEEDED": 1}))
+    assert outcomes(case) == Counter({"late SUCCEEDED": 1} | (shifts if continued else {"other SUCCEEDED": 1}))

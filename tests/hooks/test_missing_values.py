@@ -1,4 +1,4 @@
-"""A plan that runs without a memory runs with one: what cannot be recorded is missing, counted, warned about once."""
+"""A plan that runs without a memory runs with one: an unrecordable value is missing, counted, and warned about once."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models.catalog import built_in_urdf
-from tests.hooks.fakes import NoteActionPerformable, findings, rigged
+from tests.hooks.fakes import NoteActionPerformable, findings, recorder_case
 
 
 @dataclass
 class Inner:
     depth: Any = 1.0
-    """Of no type that a column has."""
+    """A value of no type that a column has."""
     width: float = 2.0
 
 
 @dataclass
 class AnythingActionPerformable(ActionAbstract):
-    """Every field gets the same value, whatever its type."""
+    """An action whose fields all get the same value, whatever their types."""
 
     integer: int
     real: float
@@ -59,11 +59,11 @@ class AnythingActionPerformable(ActionAbstract):
 
 
 nasty: ContextVar[bool] = ContextVar("nasty", default=False)
-"""Other tests look at every object of the process, and these must let them."""
+"""Other tests inspect every object of the process, and these values must permit that."""
 
 
 class Raising(str):
-    """Raises wherever it can."""
+    """A value that raises in every method that it can."""
 
     __slots__ = ()
 
@@ -88,7 +88,7 @@ class RaisingAny:
 
 
 class Endless(Sequence[int]):
-    """Its length is a lie."""
+    """A value with a false length."""
 
     def __len__(self) -> int:
         return 3
@@ -98,13 +98,13 @@ class Endless(Sequence[int]):
 
 
 class Foreign(enum.Enum):
-    """Not the enum that was declared; its names are no texts that can be recorded."""
+    """A member of another enum than the declared one, whose names cannot be recorded."""
 
     ODD = math.nan
 
 
 def circle() -> list[Any]:
-    """Ten times itself, at every depth."""
+    """Return a list that contains itself ten times, at every depth."""
     round_: list[Any] = []
     round_.extend([round_] * 10)
     return round_
@@ -132,7 +132,7 @@ SCALARS = [
 
 
 class Nasty(NamedTuple):
-    """Stands for one of `SCALARS`, of which some cannot even be shown."""
+    """A placeholder for one of `SCALARS`, some of which cannot even be printed."""
 
     number: int
 
@@ -159,7 +159,7 @@ def failure_of(kind: Any, value: Any) -> BaseException:
 
 
 def outcome_of(action: ActionAbstract) -> list[Any]:
-    """Its result, or what it raised; no task holds it, for asyncio shows the results of its tasks."""
+    """Return its result or what it raised; no task holds it, because asyncio prints the results of its tasks."""
     outcome: list[Any] = []
 
     async def plan() -> None:
@@ -180,7 +180,7 @@ def started(events: list[tuple[int, Happening]]) -> NodeStarted:
 @pytest.mark.parametrize("bytes_max", [2**20, 3_000])
 @given(described=VALUES, fails=st.none() | FAILURES)
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
-def test_with_a_memory_a_plan_does_what_it_does_without_one(
+def test_a_memory_does_not_change_the_behaviour_of_a_plan(
     bytes_max: int, described: Any, fails: tuple[type, Any] | None
 ) -> None:
     value = meant(described)
@@ -192,12 +192,12 @@ def test_with_a_memory_a_plan_does_what_it_does_without_one(
     logging.disable()
     token = nasty.set(True)
     try:
-        with rigged(Settings(record_bytes_max=bytes_max)) as rig, rig.episode() as episode:
+        with recorder_case(Settings(record_bytes_max=bytes_max)) as case, case.episode() as episode:
             (recorded_outcome,) = outcome_of(action)
             is_same = recorded_outcome is outcome
             assert is_same
-        assert rig.emitter.faults.total == 0, rig.emitter.faults.last
-        events = rig.sink.of(episode)
+        assert case.emitter.faults.total == 0, case.emitter.faults.last
+        events = case.sink.of(episode)
         assert findings(events) == []
         start = started(events)
         assert start.parameters["note"] == "kept"
@@ -209,16 +209,16 @@ def test_with_a_memory_a_plan_does_what_it_does_without_one(
         logging.disable(logging.NOTSET)
 
 
-async def test_what_cannot_be_recorded_is_counted_and_warned_about_once_for_each_type_and_field(
+async def test_unrecordable_values_are_counted_and_warned_about_once_for_each_type_and_field(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with rigged() as rig, rig.episode() as episode:
+    with recorder_case() as case, case.episode() as episode:
         for _ in range(3):
             assert await NoteActionPerformable("a\x00", weight=math.nan).perform() == "a\x00"
-    parameters = started(rig.sink.of(episode)).parameters
+    parameters = started(case.sink.of(episode)).parameters
     assert parameters["text"] == {"missing": "the text holds U+0000", "repr": "'a\\x00'"}
     assert parameters["weight"] == {"missing": "nan is not a finite number", "repr": "nan"}
-    assert rig.emitter.missing.count == (9, "NoteAction.result: the text holds U+0000")
+    assert case.emitter.missing.count == (9, "NoteAction.result: the text holds U+0000")
     assert [record.getMessage().partition(":")[0] for record in caplog.records] == [
         "NoteAction.text is recorded as missing",
         "NoteAction.weight is recorded as missing",
@@ -227,9 +227,9 @@ async def test_what_cannot_be_recorded_is_counted_and_warned_about_once_for_each
 
 
 async def test_a_long_text_is_cut_and_marked_and_every_other_field_is_recorded() -> None:
-    with rigged() as rig, rig.episode() as episode:
+    with recorder_case() as case, case.episode() as episode:
         await NoteActionPerformable("x" * 2**21, weight=2.5).perform()
-    start = started(rig.sink.of(episode))
+    start = started(case.sink.of(episode))
     assert start.parameters["weight"] == 2.5
     assert (
         start.parameters["text"]["missing"]
@@ -242,7 +242,7 @@ async def test_a_long_text_is_cut_and_marked_and_every_other_field_is_recorded()
 
 @dataclass
 class OddActionPerformable(ActionAbstract):
-    """One field of no type that a column has, one whose type is nowhere, one with a reserved name."""
+    """An action with a field of no type that a column has, one of an undefined type, and one with a reserved name."""
 
     odd: set[str]
     nowhere: Nowhere  # type: ignore[name-defined]  # noqa: F821  the fault here
@@ -251,13 +251,13 @@ class OddActionPerformable(ActionAbstract):
     weight: float = 1.5
 
     async def perform(self) -> None:
-        """Nothing."""
+        """Succeed without doing anything."""
 
 
 async def test_fields_that_cannot_be_declared_are_missing_and_the_others_recorded() -> None:
-    with rigged() as rig, rig.episode() as episode:
+    with recorder_case() as case, case.episode() as episode:
         await OddActionPerformable({"a"}, 3, "upright").perform()
-    parameters = started(rig.sink.of(episode)).parameters
+    parameters = started(case.sink.of(episode)).parameters
     assert {name: value for name, value in parameters.items() if not isinstance(value, dict)} == {
         "inner_width": 2.0,
         "weight": 1.5,
@@ -268,8 +268,8 @@ async def test_fields_that_cannot_be_declared_are_missing_and_the_others_recorde
     assert reasons["nowhere"] == "has a type that cannot be resolved: name 'Nowhere' is not defined"
     assert reasons["robot_state"] == "field 'robot_state' has a reserved name (robot_state)"
     assert parameters["odd"]["repr"] == "{'a'}"
-    assert rig.emitter.missing.count.total == 4
-    (declared,) = [event for owner, _, event in rig.sink.records if owner is None]
+    assert case.emitter.missing.count.total == 4
+    (declared,) = [event for owner, _, event in case.sink.records if owner is None]
     assert [each.name for each in declared.fields] == ["inner_width", "weight"]  # type: ignore[attr-defined]
     assert [each.slot for each in declared.fields] == [2, 3]  # type: ignore[attr-defined]
 
@@ -283,13 +283,13 @@ async def test_nodes_of_a_class_that_cannot_be_declared_are_recorded_without_a_t
         async def perform(self) -> str:
             return self.text
 
-    with rigged() as rig, rig.episode() as episode:
+    with recorder_case() as case, case.episode() as episode:
         assert await PoseActionPerformable("a").perform() == "a"
-    start = started(rig.sink.of(episode))
+    start = started(case.sink.of(episode))
     assert (start.designator, start.parameters) == (None, {"text": "a"})
-    assert findings(rig.sink.of(episode)) == []
-    assert rig.emitter.missing.count.total == 1
-    assert "'pose', which the memory itself uses" in str(rig.emitter.missing.count.last)
+    assert findings(case.sink.of(episode)) == []
+    assert case.emitter.missing.count.total == 1
+    assert "'pose', which the memory itself uses" in str(case.emitter.missing.count.last)
 
 
 def test_warnings_are_bounded_by_a_number_of_fields(caplog: pytest.LogCaptureFixture) -> None:
@@ -304,32 +304,32 @@ def test_warnings_are_bounded_by_a_number_of_fields(caplog: pytest.LogCaptureFix
 
 
 async def test_texts_of_an_episode_that_are_too_long_are_cut_and_marked() -> None:
-    with rigged(Settings(record_bytes_max=4_000)) as rig:
-        episode = rig.recorder.open_episode(description="d" * 3_000_000, plan="\x00p" * 6_000)
-        rig.recorder.close_episode(episode, None)
-    start = rig.sink.of(episode)[0][1]
+    with recorder_case(Settings(record_bytes_max=4_000)) as case:
+        episode = case.recorder.open_episode(description="d" * 3_000_000, plan="\x00p" * 6_000)
+        case.recorder.close_episode(episode, None)
+    start = case.sink.of(episode)[0][1]
     assert isinstance(start, EpisodeStarted)
     assert start.description == "d" * 1_000 + "… (3,000,000 characters)"
     assert start.plan == ("\\x00p" * 200) + "… (30,000 characters)"
-    assert rig.emitter.missing.count.total == 2
+    assert case.emitter.missing.count.total == 2
 
 
 async def test_names_in_the_world_that_cannot_be_recorded_are_cleaned_and_cut() -> None:
-    with rigged(Settings(record_bytes_max=8_000)) as rig, rig.episode() as episode, BulletWorld():
+    with recorder_case(Settings(record_bytes_max=8_000)) as case, case.episode() as episode, BulletWorld():
         carton = built_in_urdf("milk", ObjectType.MILK)
         Object("milk\x00" * 3_000, ObjectType.MILK, carton)
         cup = Object("cup\ud800", ObjectType.MILK, carton)
         cup.set_pose(Pose([1, 0, 0]))
-    names = [event.name for _, event in rig.sink.of(episode) if isinstance(event, ObjectAdded)]
+    names = [event.name for _, event in case.sink.of(episode) if isinstance(event, ObjectAdded)]
     assert names == ["milk\\x00" * 125 + "… (24,000 characters)", "cup\\ud800"]
-    assert findings(rig.sink.of(episode)) == []
-    assert rig.emitter.faults.total == 0
+    assert findings(case.sink.of(episode)) == []
+    assert case.emitter.faults.total == 0
 
 
-async def test_of_two_worlds_in_one_episode_the_first_is_recorded_and_nothing_is_mixed_up(
+async def test_of_two_worlds_in_one_episode_only_the_first_is_recorded(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    with rigged() as rig, rig.episode() as episode, BulletWorld():
+    with recorder_case() as case, case.episode() as episode, BulletWorld():
         Object("pr2", ObjectType.ROBOT, pose=Pose([1, 0, 0]))
         with BulletWorld() as second:
             other = Object("pr2", ObjectType.ROBOT, pose=Pose([2, 0, 0]))
@@ -337,7 +337,7 @@ async def test_of_two_worlds_in_one_episode_the_first_is_recorded_and_nothing_is
             await NoteActionPerformable("in the second").perform()
             assert len(second.objects) == 1
         await NoteActionPerformable("in the first").perform()
-    events = rig.sink.of(episode)
+    events = case.sink.of(episode)
     assert [event.pose.position[0] for _, event in events if isinstance(event, ObjectAdded)] == [1.0]
     robots = {
         event.parameters["text"]: event.robot and event.robot.pose.position[0]
@@ -348,8 +348,8 @@ async def test_of_two_worlds_in_one_episode_the_first_is_recorded_and_nothing_is
     assert findings(events) == []
     assert isinstance(events[-1][1], EpisodeEnded)
     assert events[-1][1].status == "SUCCEEDED"
-    assert rig.emitter.faults.total == 0
-    assert rig.emitter.missing.count.total == 2
+    assert case.emitter.faults.total == 0
+    assert case.emitter.missing.count.total == 2
     assert [record.getMessage().partition(" is ")[0] for record in caplog.records] == [
         "Episode.second world",
         "Episode.robot of a second world",

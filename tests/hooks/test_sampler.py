@@ -1,4 +1,4 @@
-"""While a motion runs the robot's state is sampled: when, what, and what never comes of it."""
+"""The sampling of the robot's state during a motion: times, channels and values."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.hooks.fakes import Rig, findings, rigged
+from tests.hooks.fakes import RecorderCase, findings, recorder_case
 
 SAMPLED = Settings(sample_interval_ms=1)
 BASE = {"base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw"}
@@ -35,7 +35,7 @@ TURNED = yaw_quaternion(1.0)
 
 
 class Robot:
-    """A robot of one's own: its base goes where the test sends it."""
+    """A user's robot, whose base goes where the test sends it."""
 
     def __init__(self, drive: Callable[[Object, Pose], object]) -> None:
         self.drive = drive
@@ -52,11 +52,11 @@ class Robot:
     async def move_joints(self, motion: object) -> None: ...
 
 
-def samples(rig: Rig) -> list[StateSampled]:
-    """All of them, in the order they were written, which is checked: each inside its motion."""
+def samples(case: RecorderCase) -> list[StateSampled]:
+    """Return all samples in the order of writing, and assert that each is inside its motion."""
     found = []
-    for name in rig.sink.sequences:
-        events = rig.sink.of(name)
+    for name in case.sink.sequences:
+        events = case.sink.of(name)
         assert findings(events) == []
         started = {sequence: event for sequence, event in events if isinstance(event, NodeStarted)}
         ended = {event.node: sequence for sequence, event in events if isinstance(event, NodeEnded)}
@@ -69,37 +69,39 @@ def samples(rig: Rig) -> list[StateSampled]:
     return found
 
 
-def values(rig: Rig, channel: str) -> list[float]:
-    return [each.channels[channel] for each in samples(rig) if channel in each.channels]
+def values(case: RecorderCase, channel: str) -> list[float]:
+    return [each.channels[channel] for each in samples(case) if channel in each.channels]
 
 
-def written(rig: Rig, channel: str, value: float) -> bool:
-    """Whether a sample with this value is there; asked while others write."""
-    with rig.sink.lock:
-        events: list[Happening] = [event for _, _, event in rig.sink.records]
+def written(case: RecorderCase, channel: str, value: float) -> bool:
+    """Return whether a sample with this value is written yet, while other threads write."""
+    with case.sink.lock:
+        events: list[Happening] = [event for _, _, event in case.sink.records]
     return any(isinstance(each, StateSampled) and each.channels.get(channel) == value for each in events)
 
 
-async def seen(rig: Rig, channel: str, value: float) -> None:
+async def seen(case: RecorderCase, channel: str, value: float) -> None:
     async with asyncio.timeout(10):
-        while not written(rig, channel, value):  # noqa: ASYNC110  the sampler sets no event of ours
+        while not written(case, channel, value):  # noqa: ASYNC110  the sampler sets no event of ours
             await asyncio.sleep(0.001)
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
-    with rigged(SAMPLED) as made, BulletWorld(), simulated_robot:
+def case() -> Iterator[RecorderCase]:
+    with recorder_case(SAMPLED) as made, BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)
         yield made
 
 
-async def test_the_first_sample_of_an_episode_has_every_channel_and_the_next_what_differs(rig: Rig) -> None:
-    with rig.episode():
+async def test_the_first_sample_of_an_episode_has_every_channel_and_the_next_one_only_changes(
+    case: RecorderCase,
+) -> None:
+    with case.episode():
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
         await MoveTorsoActionPerformable(0.25).perform()
         await NavigateActionPerformable(Pose([0.5, 0.25, 0], TURNED)).perform()
     robot = require_robot().body
-    first, *others = samples(rig)
+    first, *others = samples(case)
     assert set(first.channels) == BASE | set(robot.joints)
     assert (first.channels["base.x"], first.channels["base.qw"], first.channels["torso_lift_joint"]) == (0.0, 1.0, 0.0)
     assert [each.channels for each in others] == [
@@ -109,114 +111,114 @@ async def test_the_first_sample_of_an_episode_has_every_channel_and_the_next_wha
     ]
 
 
-async def test_a_motion_that_changes_nothing_has_no_sample(rig: Rig) -> None:
-    with rig.episode():
+async def test_a_motion_that_changes_nothing_has_no_sample(case: RecorderCase) -> None:
+    with case.episode():
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
-        count = len(samples(rig))
+        count = len(samples(case))
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
         await LookAtActionPerformable(Pose([9, 0, 1.2])).perform()
-        looked = samples(rig)[count:]
+        looked = samples(case)[count:]
     assert len(looked) == 1
     assert set(looked[0].channels) <= {"head_pan_joint", "head_tilt_joint"}
 
 
-async def test_what_changed_between_motions_is_in_the_first_sample_of_the_next(rig: Rig) -> None:
-    with rig.episode():
+async def test_changes_between_motions_are_in_the_first_sample_of_the_next(case: RecorderCase) -> None:
+    with case.episode():
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
         require_robot().body.set_pose(Pose([2, 3, 0]))
         await NavigateActionPerformable(Pose([4, 3, 0])).perform()
-    assert [each.channels for each in samples(rig)[2:]] == [{"base.x": 2.0, "base.y": 3.0}, {"base.x": 4.0}]
+    assert [each.channels for each in samples(case)[2:]] == [{"base.x": 2.0, "base.y": 3.0}, {"base.x": 4.0}]
 
 
-async def test_every_episode_begins_anew(rig: Rig) -> None:
+async def test_every_episode_begins_with_all_channels(case: RecorderCase) -> None:
     for _ in range(2):
-        with rig.episode():
+        with case.episode():
             await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
-    whole = [each for each in samples(rig) if len(each.channels) > len(BASE)]
+    whole = [each for each in samples(case) if len(each.channels) > len(BASE)]
     assert [each.channels["base.x"] for each in whole] == [0.0, 0.5]
 
 
-async def test_a_motion_that_takes_its_time_is_sampled_on_the_way(rig: Rig) -> None:
+async def test_a_long_motion_is_sampled_in_between(case: RecorderCase) -> None:
     steps = [step / 20 for step in range(1, 21)]
 
     async def drive(body: Object, target: Pose) -> None:
         for share in steps:
             body.set_pose(Pose([target.position.x * share, 0, 0]))
-            await seen(rig, "base.x", share)
+            await seen(case, "base.x", share)
 
-    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    assert values(rig, "base.x") == [0.0, *steps]
-    assert {tuple(each.channels) for each in samples(rig)[1:]} == {("base.x",)}
+    assert values(case, "base.x") == [0.0, *steps]
+    assert {tuple(each.channels) for each in samples(case)[1:]} == {("base.x",)}
 
 
-async def test_a_plan_that_never_suspends_is_sampled_too(rig: Rig) -> None:
+async def test_a_motion_without_an_await_is_sampled_too(case: RecorderCase) -> None:
     def drive(body: Object, target: Pose) -> None:
         for x in (0.5, target.position.x):
             body.set_pose(Pose([x, 0, 0]))
             end_s = time.monotonic() + 10
-            while not written(rig, "base.x", x) and time.monotonic() < end_s:
+            while not written(case, "base.x", x) and time.monotonic() < end_s:
                 pass
 
-    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    assert values(rig, "base.x") == [0.0, 0.5, 1.0]
+    assert values(case, "base.x") == [0.0, 0.5, 1.0]
 
 
-async def test_between_start_and_end_only_what_changed_by_more_than_the_margin_is_written() -> None:
+async def test_between_start_and_end_only_changes_beyond_the_margin_are_written() -> None:
     settings = Settings(sample_interval_ms=1, sample_change_min=0.1)
-    with rigged(settings) as rig, BulletWorld():
+    with recorder_case(settings) as case, BulletWorld():
 
         async def drive(body: Object, target: Pose) -> None:
             body.set_pose(Pose([0.5, 0.0, 0]))
-            await seen(rig, "base.x", 0.5)
+            await seen(case, "base.x", 0.5)
             body.set_pose(Pose([0.59, 0.09, 0]))
             await asyncio.sleep(0.03)
             body.set_pose(Pose([0.62, 0.09, 0]))
-            await seen(rig, "base.x", 0.62)
+            await seen(case, "base.x", 0.62)
             body.set_pose(target)
 
         Object("pr2", ObjectType.ROBOT)
-        with rig.episode(), ChosenRobot("mine", Robot(drive)):
+        with case.episode(), ChosenRobot("mine", Robot(drive)):
             await NavigateActionPerformable(Pose([0.625, 0.095, 0])).perform()
-        assert [each.channels for each in samples(rig)[1:]] == [
+        assert [each.channels for each in samples(case)[1:]] == [
             {"base.x": 0.5},
             {"base.x": 0.62},
-            {"base.x": 0.625, "base.y": 0.095},  # where it ended, to the last bit
+            {"base.x": 0.625, "base.y": 0.095},  # the final position, to the last bit
         ]
 
 
-async def test_a_motion_that_is_cancelled_ends_with_the_state_it_was_left_in(rig: Rig) -> None:
+async def test_a_cancelled_motion_ends_with_the_state_in_which_it_stopped(case: RecorderCase) -> None:
     arrived = asyncio.Event()
 
     async def drive(body: Object, _target: Pose) -> None:
         body.set_pose(Pose([0.25, 0, 0]))
-        await seen(rig, "base.x", 0.25)
+        await seen(case, "base.x", 0.25)
         body.set_pose(Pose([0.375, 0, 0]))
         arrived.set()
         await asyncio.sleep(60)
 
-    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
         task = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
         await arrived.wait()
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
             await task
-        count = len(samples(rig))
+        count = len(samples(case))
         require_robot().body.set_pose(Pose([7, 0, 0]))
         await asyncio.sleep(0.02)
-        assert len(samples(rig)) == count
-    assert values(rig, "base.x") == [0.0, 0.25, 0.375]
+        assert len(samples(case)) == count
+    assert values(case, "base.x") == [0.0, 0.25, 0.375]
 
 
-async def test_motions_at_the_same_time_each_have_the_state_they_ended_in(rig: Rig) -> None:
+async def test_concurrent_motions_each_have_the_state_in_which_they_ended(case: RecorderCase) -> None:
     first_ended = asyncio.Event()
 
     async def drive(body: Object, target: Pose) -> None:
-        await seen(rig, "base.z", 0.0)
+        await seen(case, "base.z", 0.0)
         if target.position.x:
             body.set_pose(Pose([target.position.x, body.pose.position.y, 0]))
-            await seen(rig, "base.x", 1.0)
+            await seen(case, "base.x", 1.0)
         else:
             await first_ended.wait()
             body.set_pose(Pose([body.pose.position.x, target.position.y, 0]))
@@ -225,12 +227,12 @@ async def test_motions_at_the_same_time_each_have_the_state_they_ended_in(rig: R
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
         first_ended.set()
 
-    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
         await asyncio.gather(first(), NavigateActionPerformable(Pose([0, 2, 0])).perform())
-    # A channel is written where it differs from what was: the state at a moment is what was written last before it.
+    # A channel is written when it differs from its last value: the state at a moment is the last written one before it.
     state: dict[str, float] = {}
     ends: dict[int, dict[str, float]] = {}
-    for each in samples(rig):
+    for each in samples(case):
         assert each.node is not None
         state |= each.channels
         ends[each.node] = dict(state)
@@ -239,50 +241,52 @@ async def test_motions_at_the_same_time_each_have_the_state_they_ended_in(rig: R
     assert (two["base.x"], two["base.y"]) == (1.0, 2.0)
 
 
-async def test_a_sample_without_room_is_left_out_and_the_next_has_what_changed_since_the_last_written(rig: Rig) -> None:
-    with rig.episode():
+async def test_a_sample_without_space_is_left_out_and_the_next_one_has_all_changes_since_the_last_written(
+    case: RecorderCase,
+) -> None:
+    with case.episode():
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
-        count = len(samples(rig))
-        rig.sink.full = True
+        count = len(samples(case))
+        case.sink.full = True
         target = MoveMotion(Pose([1, 0, 0]))
-        rig.sink.space.set()
+        case.sink.space.set()
         await target.perform()
-        assert len(samples(rig)) == count
-        assert rig.recorder.samples_left_out == 1
-        rig.sink.full = False
+        assert len(samples(case)) == count
+        assert case.recorder.samples_left_out == 1
+        case.sink.full = False
         await NavigateActionPerformable(Pose([1, 2, 0])).perform()
-    assert [each.channels for each in samples(rig)[count:]] == [{"base.x": 1.0}, {"base.y": 2.0}]
-    assert rig.recorder.samples_left_out == 1
-    assert rig.emitter.faults.total == 0
+    assert [each.channels for each in samples(case)[count:]] == [{"base.x": 1.0}, {"base.y": 2.0}]
+    assert case.recorder.samples_left_out == 1
+    assert case.emitter.faults.total == 0
 
 
-async def test_a_fault_of_ours_is_counted_and_the_motion_goes_on(rig: Rig) -> None:
-    with rig.episode():
+async def test_a_fault_of_the_recorder_is_counted_and_the_motion_continues(case: RecorderCase) -> None:
+    with case.episode():
         await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
-        before = rig.emitter.faults.total
+        before = case.emitter.faults.total
 
         def broken(*_arguments: object) -> None:
             raise RuntimeError("the sampler is on fire")
 
-        rig.emitter.offer = broken  # type: ignore[method-assign,assignment]
+        case.emitter.offer = broken  # type: ignore[method-assign,assignment]
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
     assert require_robot().body.pose == Pose([1, 0, 0])
-    assert rig.emitter.faults.total == before + 1
-    assert rig.emitter.faults.last == "StateSampled: RuntimeError: the sampler is on fire"
+    assert case.emitter.faults.total == before + 1
+    assert case.emitter.faults.last == "StateSampled: RuntimeError: the sampler is on fire"
 
 
-async def test_another_robot_begins_with_every_channel(rig: Rig) -> None:
+async def test_another_robot_begins_with_every_channel(case: RecorderCase) -> None:
     async def drive(body: Object, target: Pose) -> None:
         body.set_pose(target)
-        await seen(rig, "base.x", target.position.x)
+        await seen(case, "base.x", target.position.x)
         body.remove()
         other = Object("pr2", ObjectType.ROBOT, pose=Pose([8, 8, 0]))
-        await seen(rig, "base.x", 8.0)
+        await seen(case, "base.x", 8.0)
         other.set_pose(Pose([9, 8, 0]))
 
-    with rig.episode(), ChosenRobot("mine", Robot(drive)):
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    found = samples(rig)
+    found = samples(case)
     objects = [each.object.object for each in found]
     assert [len(each.channels) > len(BASE) for each in found] == [True, False, True, False]
     assert objects[0] == objects[1] != objects[2] == objects[3]
@@ -296,20 +300,20 @@ class ThinkActionPerformable(ActionAbstract):
             await NavigateActionPerformable(Pose([3, 0, 0])).perform()
 
 
-async def test_the_robot_of_a_thought_is_sampled_in_the_thought(rig: Rig) -> None:
-    with rig.episode() as episode:
+async def test_the_robot_of_a_simulation_is_sampled_in_the_simulation(case: RecorderCase) -> None:
+    with case.episode() as episode:
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
         await ThinkActionPerformable().perform()
         await NavigateActionPerformable(Pose([2, 0, 0])).perform()
-    (thought,) = (name for name in rig.sink.sequences if name != episode.id)
-    real = [event for _, event in rig.sink.of(episode) if isinstance(event, StateSampled)]
-    only_thought = [event for _, event in rig.sink.of(thought) if isinstance(event, StateSampled)]
+    (thought,) = (name for name in case.sink.sequences if name != episode.id)
+    real = [event for _, event in case.sink.of(episode) if isinstance(event, StateSampled)]
+    only_thought = [event for _, event in case.sink.of(thought) if isinstance(event, StateSampled)]
     assert [each.channels["base.x"] for each in real] == [0.0, 1.0, 2.0]
     assert [each.channels["base.x"] for each in only_thought] == [1.0, 3.0]
-    assert len(samples(rig)) == 5
+    assert len(samples(case)) == 5
 
 
-async def test_a_motion_that_outlives_its_episode_is_not_sampled_afterwards(rig: Rig) -> None:
+async def test_a_motion_that_outlives_its_episode_is_not_sampled_afterwards(case: RecorderCase) -> None:
     going = asyncio.Event()
 
     async def drive(body: Object, _target: Pose) -> None:
@@ -318,46 +322,46 @@ async def test_a_motion_that_outlives_its_episode_is_not_sampled_afterwards(rig:
         body.set_pose(Pose([0.5, 0, 0]))
 
     with ChosenRobot("mine", Robot(drive)):
-        with rig.episode():
+        with case.episode():
             task = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
-            await seen(rig, "base.x", 0.25)
+            await seen(case, "base.x", 0.25)
         going.set()
         await task
         await asyncio.sleep(0.01)
-    assert values(rig, "base.x") == [0.0, 0.25]
+    assert values(case, "base.x") == [0.0, 0.25]
 
 
-async def test_without_a_robot_or_a_world_nothing_is_sampled_and_no_thread_runs() -> None:
+async def test_without_a_robot_or_a_world_no_samples_are_taken_and_no_thread_runs() -> None:
     async def drive(*_: object) -> None: ...
 
     class Bodiless(Robot):
         async def navigate(self, motion: MoveMotion) -> None: ...
 
-    with rigged(SAMPLED) as rig, ChosenRobot("mine", Bodiless(drive)):
-        with rig.episode():
+    with recorder_case(SAMPLED) as case, ChosenRobot("mine", Bodiless(drive)):
+        with case.episode():
             await MoveMotion(Pose()).perform()
-        with rig.episode(), BulletWorld():
+        with case.episode(), BulletWorld():
             await MoveMotion(Pose()).perform()
         assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
-        assert samples(rig) == []
+        assert samples(case) == []
 
 
-async def test_a_thread_samples_only_where_it_is_asked_for_and_ends_with_the_memory() -> None:
+async def test_a_thread_samples_only_on_request_and_ends_with_the_memory() -> None:
     def threads() -> list[str]:
         return [each.name for each in threading.enumerate() if each.name == "pycrorm sampler"]
 
     for settings, running in ((Settings(), []), (SAMPLED, ["pycrorm sampler"])):
-        with rigged(settings) as rig, BulletWorld(), simulated_robot:
+        with recorder_case(settings) as case, BulletWorld(), simulated_robot:
             Object("pr2", ObjectType.ROBOT)
             await NavigateActionPerformable(Pose([1, 0, 0])).perform()
             await NavigateActionPerformable(Pose([2, 0, 0])).perform()
             assert threads() == running
-            assert bool(samples(rig)) is bool(running)
+            assert bool(samples(case)) is bool(running)
         assert threads() == []
 
 
 class Interrupting(Object):
-    """Its first reading in the sampler's thread is when the collector closes the plan that moves it."""
+    """At its first reading in the sampler's thread, the collector closes the plan that moves this robot."""
 
     def __init__(self) -> None:
         self.close: Callable[[], None] | None = None
@@ -371,11 +375,11 @@ class Interrupting(Object):
         return super().joint_positions()
 
 
-async def test_a_motion_that_ends_in_the_midst_of_its_own_sample_has_none_after_its_end() -> None:
-    """As when the collector, which may run in any thread, closes a plan that nobody awaits."""
-    with rigged(SAMPLED) as rig, BulletWorld():
+async def test_a_motion_that_ends_during_its_own_sample_has_none_after_its_end() -> None:
+    """The collector, which may run in any thread, closes an abandoned plan like this."""
+    with recorder_case(SAMPLED) as case, BulletWorld():
         robot = Interrupting()
-        with rig.episode() as episode:
+        with case.episode() as episode:
             driving, ended = threading.Event(), threading.Event()
 
             async def drive(_body: Object, _target: Pose) -> None:
@@ -385,7 +389,7 @@ async def test_a_motion_that_ends_in_the_midst_of_its_own_sample_has_none_after_
             with ChosenRobot("mine", Robot(drive)):
                 dropped = MoveMotion(Pose([1, 0, 0])).perform()
                 context = contextvars.copy_context()
-                while not driving.is_set():  # the hook may give the loop a turn first
+                while not driving.is_set():  # the hook may let the loop run first
                     context.run(dropped.send, None)
             robot.set_pose(Pose([0.5, 0, 0]))
 
@@ -397,27 +401,27 @@ async def test_a_motion_that_ends_in_the_midst_of_its_own_sample_has_none_after_
             robot.close = close
             assert await asyncio.to_thread(ended.wait, 10)
             await asyncio.sleep(0.01)
-            events = [type(event).__name__ for _, event in rig.sink.of(episode)]
+            events = [type(event).__name__ for _, event in case.sink.of(episode)]
         last_end = len(events) - 1 - events[::-1].index("NodeEnded")
         assert "StateSampled" not in events[last_end:]
-        assert values(rig, "base.x")[-1] == 0.75
-        assert rig.emitter.faults.total == 0
+        assert values(case, "base.x")[-1] == 0.75
+        assert case.emitter.faults.total == 0
 
 
 class Suspended:
-    """An await that nobody ends."""
+    """An await that never ends."""
 
     def __await__(self) -> Generator[None, None, None]:
         yield
 
 
 @pytest.mark.parametrize("interval", [0, -1, "5", float("nan")])
-def test_an_interval_that_is_no_time_is_refused(interval: object) -> None:
+def test_an_invalid_interval_is_refused(interval: object) -> None:
     with pytest.raises(CallerError, match=r"sample_interval_ms is .*: it must be a number above zero"):
         Settings(sample_interval_ms=interval)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("margin", [-0.1, float("nan"), float("inf"), None, "1"])
-def test_a_margin_that_is_no_distance_is_refused(margin: object) -> None:
+def test_an_invalid_margin_is_refused(margin: object) -> None:
     with pytest.raises(CallerError, match=r"sample_change_min is .*: it must be a number, zero or above"):
         Settings(sample_change_min=margin)  # type: ignore[arg-type]

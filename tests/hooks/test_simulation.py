@@ -1,4 +1,4 @@
-"""What is thought through is an episode of its own, beside the one around it and never mixed with it."""
+"""A simulation is an episode of its own, beside the one around it and never mixed with it."""
 
 from __future__ import annotations
 
@@ -31,14 +31,21 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.object_designators import ObjectDesignator, designator_of, in_world
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from tests.hooks.fakes import CarryActionPerformable, NoteActionPerformable, Rig, findings, kinds, rigged
+from tests.hooks.fakes import (
+    CarryActionPerformable,
+    NoteActionPerformable,
+    RecorderCase,
+    findings,
+    kinds,
+    recorder_case,
+)
 
 THERE = Pose([0.5, 0.25, 0])
 
 
 @dataclass
 class ThinkActionPerformable(ActionAbstract):
-    """Thinks a note, and takes another one."""
+    """Simulate a note, and take another one."""
 
     text: str = ""
 
@@ -48,11 +55,11 @@ class ThinkActionPerformable(ActionAbstract):
         await NoteActionPerformable("real").perform()
 
 
-def thoughts(rig: Rig) -> list[EpisodeId]:
-    """Which episodes were only thought, in order; every event of every episode is in its legal place."""
+def simulated_episodes(case: RecorderCase) -> list[EpisodeId]:
+    """Return the simulated episodes in order; every event of every episode is in its legal place."""
     found = []
-    for name in rig.sink.sequences:
-        events = rig.sink.of(name)
+    for name in case.sink.sequences:
+        events = case.sink.of(name)
         assert findings(events) == []
         started = events[0][1]
         assert isinstance(started, EpisodeStarted)
@@ -67,66 +74,66 @@ def only(events: list[tuple[int, Happening]], kind: type) -> list[Any]:
     return [event for _, event in events if isinstance(event, kind)]
 
 
-def started(rig: Rig, name: EpisodeId) -> EpisodeStarted:
-    event = rig.sink.of(name)[0][1]
+def started(case: RecorderCase, name: EpisodeId) -> EpisodeStarted:
+    event = case.sink.of(name)[0][1]
     assert isinstance(event, EpisodeStarted)
     return event
 
 
-async def test_a_thought_is_an_episode_that_names_the_node_that_thinks() -> None:
-    with rigged() as rig, rig.episode() as real:
+async def test_a_simulation_is_an_episode_that_names_the_node_that_simulates() -> None:
+    with recorder_case() as case, case.episode() as real:
         await ThinkActionPerformable("thought").perform()
         assert current_episode.get() is real
-    (thought,) = thoughts(rig)
-    assert kinds(rig.sink.of(real)) == [
+    (thought,) = simulated_episodes(case)
+    assert kinds(case.sink.of(real)) == [
         "EpisodeStarted", "NodeStarted", "NodeStarted", "NodeStarted", "NodeEnded", "NodeEnded", "NodeEnded",
         "EpisodeEnded",
     ]  # fmt: skip
-    assert [each.parameters for each in only(rig.sink.of(real), NodeStarted)[1:]] == [
+    assert [each.parameters for each in only(case.sink.of(real), NodeStarted)[1:]] == [
         {"text": "thought"},
         {"text": "real", "weight": 0.0, "ran": False},
     ]
-    beginning = started(rig, thought)
+    beginning = started(case, thought)
     assert beginning.thought_by == NodeReference(episode_text(real.id), 3)
     assert beginning.description == "simulation in ThinkAction"
-    assert [each.parameters.get("text") for each in only(rig.sink.of(thought), NodeStarted)] == [None, "thought"]
-    assert only(rig.sink.of(thought), EpisodeEnded)[0].status == "SUCCEEDED"
+    assert [each.parameters.get("text") for each in only(case.sink.of(thought), NodeStarted)] == [None, "thought"]
+    assert only(case.sink.of(thought), EpisodeEnded)[0].status == "SUCCEEDED"
 
 
-async def test_a_thought_outside_any_node_is_thought_by_the_root_and_without_an_episode_by_nobody() -> None:
-    with rigged() as rig:
-        with rig.episode() as real, SimulatedTaskTree(description="what if"):
+async def test_a_simulation_outside_any_node_is_caused_by_the_root_and_without_an_episode_by_none() -> None:
+    with recorder_case() as case:
+        with case.episode() as real, SimulatedTaskTree(description="what if"):
             await NoteActionPerformable("a").perform()
         with SimulatedTaskTree():
             await NoteActionPerformable("b").perform()
         assert current_episode.get() is None
-    first, second = thoughts(rig)
-    assert started(rig, first).thought_by == NodeReference(episode_text(real.id), 2)
-    assert started(rig, first).description == "what if"
-    assert (started(rig, second).thought_by, started(rig, second).description) == (None, "simulation")
-    assert len(rig.sink.sequences) == 3
+    first, second = simulated_episodes(case)
+    assert started(case, first).thought_by == NodeReference(episode_text(real.id), 2)
+    assert started(case, first).description == "what if"
+    assert (started(case, second).thought_by, started(case, second).description) == (None, "simulation")
+    assert len(case.sink.sequences) == 3
 
 
-async def test_in_a_perform_without_an_episode_the_one_it_opened_is_the_thinkers() -> None:
-    with rigged() as rig:
+async def test_a_simulation_in_an_implicit_episode_is_caused_by_that_episode() -> None:
+    with recorder_case() as case:
         await ThinkActionPerformable("t").perform()
-    (thought,) = thoughts(rig)
-    real = next(name for name in rig.sink.sequences if name != thought)
-    assert started(rig, thought).thought_by == NodeReference(episode_text(real), 3)
-    assert [each.parameters.get("text") for each in only(rig.sink.of(real), NodeStarted)] == [None, "t", "real"]
+    (thought,) = simulated_episodes(case)
+    real = next(name for name in case.sink.sequences if name != thought)
+    assert started(case, thought).thought_by == NodeReference(episode_text(real), 3)
+    assert [each.parameters.get("text") for each in only(case.sink.of(real), NodeStarted)] == [None, "t", "real"]
 
 
-async def test_the_world_of_a_thought_is_the_copy_and_that_of_the_episode_the_real_one() -> None:
-    with rigged() as rig, BulletWorld(), simulated_robot:
+async def test_a_simulation_has_the_copy_as_its_world_and_the_episode_the_real_one() -> None:
+    with recorder_case() as case, BulletWorld(), simulated_robot:
         robot = Object("pr2", ObjectType.ROBOT)
         milk = Object("milk", ObjectType.MILK, pose=Pose([1, 0, 1]))
         robot.attach(milk, "r_gripper_tool_frame")
-        with rig.episode() as real:
+        with case.episode() as real:
             with SimulatedTaskTree():
                 await NavigateActionPerformable(THERE).perform()
             robot.set_pose(Pose([0, 1, 0]))
-    (thought,) = thoughts(rig)
-    events = rig.sink.of(thought)
+    (thought,) = simulated_episodes(case)
+    events = case.sink.of(thought)
     assert [(each.name, each.pose.position) for each in only(events, ObjectAdded)] == [
         ("pr2", (0.0, 0.0, 0.0)), ("milk", (1.0, 0.0, 1.0)),
     ]  # fmt: skip
@@ -136,18 +143,18 @@ async def test_the_world_of_a_thought_is_the_copy_and_that_of_the_episode_the_re
     assert [(each.name, each.pose.position, each.node) for each in moved] == [
         ("pr2", (0.5, 0.25, 0.0), motion), ("milk", (1.5, 0.25, 1.0), motion),
     ]  # fmt: skip
-    really = only(rig.sink.of(real), ObjectMoved)
+    really = only(case.sink.of(real), ObjectMoved)
     assert [(each.name, each.pose.position, each.node) for each in really] == [
         ("pr2", (0.0, 1.0, 0.0), None), ("milk", (1.0, 1.0, 1.0), None),
     ]  # fmt: skip
     assert "ObjectRemoved" not in kinds(events)
 
 
-async def test_objects_are_those_of_the_episode_that_names_them_in_both_directions() -> None:
-    with rigged() as rig, BulletWorld():
+async def test_objects_belong_to_the_episode_that_names_them_in_both_directions() -> None:
+    with recorder_case() as case, BulletWorld():
         milk = designator_of(Object("milk", ObjectType.MILK))
         inside: list[ObjectDesignator] = []
-        with rig.episode() as real:
+        with case.episode() as real:
             with SimulatedTaskTree():
                 in_world(milk).set_pose(Pose([1, 0, 0]))
                 await CarryActionPerformable(milk).perform()
@@ -155,15 +162,15 @@ async def test_objects_are_those_of_the_episode_that_names_them_in_both_directio
                 spoon = designator_of(Object("spoon", ObjectType.SPOON, pose=Pose([2, 0, 0])))
             await CarryActionPerformable(inside[0]).perform()
             await CarryActionPerformable(spoon).perform()
-    (thought,) = thoughts(rig)
+    (thought,) = simulated_episodes(case)
 
     def named(name: EpisodeId) -> list[Any]:
-        return [each.parameters["what"] for each in only(rig.sink.of(name), NodeStarted) if each.parameters]
+        return [each.parameters["what"] for each in only(case.sink.of(name), NodeStarted) if each.parameters]
 
-    added = {event.name: sequence for sequence, event in rig.sink.of(thought) if isinstance(event, ObjectAdded)}
-    row = next(sequence for sequence, event in rig.sink.of(thought) if isinstance(event, ObjectMoved))
+    added = {event.name: sequence for sequence, event in case.sink.of(thought) if isinstance(event, ObjectAdded)}
+    row = next(sequence for sequence, event in case.sink.of(thought) if isinstance(event, ObjectMoved))
     assert named(thought) == [{"object": added["milk"], "row": row}]
-    really = next(sequence for sequence, event in rig.sink.of(real.id) if isinstance(event, ObjectAdded))
+    really = next(sequence for sequence, event in case.sink.of(real.id) if isinstance(event, ObjectAdded))
     first, second = named(real.id)
     assert first == {"object": really, "row": really}
     assert (second["dtype"], second["name"], second["pose"]["position"]) == ("Object", "spoon", [2.0, 0.0, 0.0])
@@ -179,38 +186,38 @@ async def test_objects_are_those_of_the_episode_that_names_them_in_both_directio
         (asyncio.CancelledError(), "INTERRUPTED"),
     ],
 )
-async def test_a_thought_ends_as_what_leaves_it_says_and_the_episode_goes_on(
+async def test_a_simulation_ends_with_the_outcome_of_its_block_and_the_episode_continues(
     raised: BaseException | None, status: str
 ) -> None:
-    with rigged() as rig, rig.episode() as real:
+    with recorder_case() as case, case.episode() as real:
         with suppress(BaseException), SimulatedTaskTree():
             if raised is not None:
                 raise raised
         await NoteActionPerformable("a").perform()
-    (thought,) = thoughts(rig)
-    assert only(rig.sink.of(thought), EpisodeEnded)[0].status == status
-    assert only(rig.sink.of(real), EpisodeEnded)[0].status == "SUCCEEDED"
-    assert len(only(rig.sink.of(real), NodeStarted)) == 2
+    (thought,) = simulated_episodes(case)
+    assert only(case.sink.of(thought), EpisodeEnded)[0].status == status
+    assert only(case.sink.of(real), EpisodeEnded)[0].status == "SUCCEEDED"
+    assert len(only(case.sink.of(real), NodeStarted)) == 2
 
 
-async def test_thoughts_nest_and_each_names_the_node_of_the_one_around() -> None:
+async def test_nested_simulations_each_name_the_node_of_the_one_around() -> None:
     @dataclass
     class ThinkTwiceActionPerformable(ActionAbstract):
         async def perform(self) -> None:
             with SimulatedTaskTree():
                 await ThinkActionPerformable("deep").perform()
 
-    with rigged() as rig, rig.episode() as real:
+    with recorder_case() as case, case.episode() as real:
         await ThinkTwiceActionPerformable().perform()
-    outer, inner = thoughts(rig)
-    assert started(rig, outer).thought_by == NodeReference(episode_text(real.id), 3)
-    assert started(rig, inner).thought_by == NodeReference(episode_text(outer), 3)
-    texts = [[each.parameters.get("text") for each in only(rig.sink.of(name), NodeStarted)] for name in (outer, inner)]
+    outer, inner = simulated_episodes(case)
+    assert started(case, outer).thought_by == NodeReference(episode_text(real.id), 3)
+    assert started(case, inner).thought_by == NodeReference(episode_text(outer), 3)
+    texts = [[each.parameters.get("text") for each in only(case.sink.of(name), NodeStarted)] for name in (outer, inner)]
     assert texts == [[None, "deep", "real"], [None, "deep"]]
 
 
-async def test_thoughts_of_two_tasks_never_mix_with_each_other_or_with_what_happens() -> None:
-    with rigged() as rig, BulletWorld(), simulated_robot:
+async def test_simulations_in_two_tasks_mix_neither_with_each_other_nor_with_real_events() -> None:
+    with recorder_case() as case, BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)
         together = asyncio.Barrier(3)
 
@@ -226,99 +233,99 @@ async def test_thoughts_of_two_tasks_never_mix_with_each_other_or_with_what_happ
                 await together.wait()
                 await NoteActionPerformable("real").perform()
 
-        with rig.episode() as real:
+        with case.episode() as real:
             await asyncio.gather(dreaming("a"), dreaming("b"), acting())
-    for name, text, moves in zip((real.id, *thoughts(rig)), ("real", "a", "b"), (0, 5, 5), strict=True):
-        events = rig.sink.of(name)
+    for name, text, moves in zip((real.id, *simulated_episodes(case)), ("real", "a", "b"), (0, 5, 5), strict=True):
+        events = case.sink.of(name)
         texts = [each.parameters["text"] for each in only(events, NodeStarted) if "text" in each.parameters]
         assert texts == [text] * 5
         assert len(only(events, ObjectMoved)) == moves
 
 
-async def test_what_outlives_its_thought_is_still_only_thought() -> None:
-    with rigged() as rig:
+async def test_a_task_that_outlives_its_simulation_is_still_simulated() -> None:
+    with recorder_case() as case:
         over = asyncio.Event()
 
         async def late() -> None:
             await over.wait()
             await NoteActionPerformable("late").perform()
 
-        with rig.episode() as real:
+        with case.episode() as real:
             with SimulatedTaskTree():
                 task = asyncio.create_task(late())
                 await asyncio.sleep(0)
             over.set()
             await task
-    first, second = thoughts(rig)
-    assert len(only(rig.sink.of(first), NodeStarted)) == 1
-    assert [each.parameters.get("text") for each in only(rig.sink.of(second), NodeStarted)] == [None, "late"]
-    assert started(rig, second).thought_by == NodeReference(episode_text(real.id), 2)
-    assert len(only(rig.sink.of(real), NodeStarted)) == 1
+    first, second = simulated_episodes(case)
+    assert len(only(case.sink.of(first), NodeStarted)) == 1
+    assert [each.parameters.get("text") for each in only(case.sink.of(second), NodeStarted)] == [None, "late"]
+    assert started(case, second).thought_by == NodeReference(episode_text(real.id), 2)
+    assert len(only(case.sink.of(real), NodeStarted)) == 1
 
 
-async def test_an_episode_opened_in_a_thought_is_one_too() -> None:
-    with rigged() as rig, rig.episode() as real, SimulatedTaskTree():
+async def test_an_episode_opened_in_a_simulation_is_a_simulation_too() -> None:
+    with recorder_case() as case, case.episode() as real, SimulatedTaskTree():
         with pytest.raises(EpisodeRefused, match="is open in this task already"):
-            rig.recorder.open_episode(description="second")
+            case.recorder.open_episode(description="second")
 
         async def another() -> None:
-            with rig.episode():
+            with case.episode():
                 await NoteActionPerformable("a").perform()
 
         await asyncio.create_task(another())
-    _, inner = thoughts(rig)
-    assert started(rig, inner).thought_by == NodeReference(episode_text(real.id), 2)
+    _, inner = simulated_episodes(case)
+    assert started(case, inner).thought_by == NodeReference(episode_text(real.id), 2)
 
 
-async def test_a_world_entered_in_a_thought_without_one_belongs_to_it() -> None:
-    with rigged() as rig, rig.episode() as real, SimulatedTaskTree(), BulletWorld():
+async def test_a_world_entered_in_a_simulation_without_one_belongs_to_it() -> None:
+    with recorder_case() as case, case.episode() as real, SimulatedTaskTree(), BulletWorld():
         Object("milk", ObjectType.MILK)
-    (thought,) = thoughts(rig)
-    assert [each.name for each in only(rig.sink.of(thought), ObjectAdded)] == ["milk"]
-    assert only(rig.sink.of(real), ObjectAdded) == []
+    (thought,) = simulated_episodes(case)
+    assert [each.name for each in only(case.sink.of(thought), ObjectAdded)] == ["milk"]
+    assert only(case.sink.of(real), ObjectAdded) == []
 
 
-async def test_a_thought_that_could_not_be_begun_is_a_fault_of_ours_and_nothing_of_it_happened() -> None:
-    with rigged() as rig, BulletWorld(), simulated_robot:
+async def test_a_simulation_whose_start_fails_by_a_fault_of_the_recorder_leaves_no_events() -> None:
+    with recorder_case() as case, BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)
-        with rig.episode() as real:
+        with case.episode() as real:
             thought = SimulatedTaskTree()
-            rig.sink.broken = True
+            case.sink.broken = True
             with thought:
-                rig.sink.broken = False
+                case.sink.broken = False
                 await NavigateActionPerformable(THERE).perform()
                 assert current_episode.get() is None
             assert current_episode.get() is real
             await NoteActionPerformable("real").perform()
-    assert rig.emitter.faults.total == 1
-    (alone,) = thoughts(rig)
-    assert started(rig, alone).thought_by == NodeReference(episode_text(real.id), 2)
-    assert [each.kind for each in only(rig.sink.of(alone), NodeStarted)] == ["root", "action", "motion"]
-    assert [each.parameters.get("text") for each in only(rig.sink.of(real), NodeStarted)] == [None, "real"]
-    assert only(rig.sink.of(real), ObjectMoved) == []
+    assert case.emitter.faults.total == 1
+    (alone,) = simulated_episodes(case)
+    assert started(case, alone).thought_by == NodeReference(episode_text(real.id), 2)
+    assert [each.kind for each in only(case.sink.of(alone), NodeStarted)] == ["root", "action", "motion"]
+    assert [each.parameters.get("text") for each in only(case.sink.of(real), NodeStarted)] == [None, "real"]
+    assert only(case.sink.of(real), ObjectMoved) == []
 
 
-async def test_a_thought_whose_end_cannot_be_written_goes_on_as_it_would_without_a_memory() -> None:
-    with rigged() as rig, rig.episode() as real:
+async def test_a_simulation_whose_end_cannot_be_written_continues_as_without_a_memory() -> None:
+    with recorder_case() as case, case.episode() as real:
         with SimulatedTaskTree():
-            rig.sink.broken = True
-        rig.sink.broken = False
+            case.sink.broken = True
+        case.sink.broken = False
         await NoteActionPerformable("real").perform()
         assert current_episode.get() is real
-    assert rig.emitter.faults.total == 1
+    assert case.emitter.faults.total == 1
 
 
-async def test_thoughts_are_not_among_the_recent_episodes() -> None:
-    with rigged() as rig:
-        with rig.episode() as real, SimulatedTaskTree():
+async def test_simulations_are_not_among_the_recent_episodes() -> None:
+    with recorder_case() as case:
+        with case.episode() as real, SimulatedTaskTree():
             pass
-        assert rig.recorder.recent_episodes == (str(real),)
-        assert rig.recorder.opened_count == 1
-        assert rig.recorder.open_episodes == ()
+        assert case.recorder.recent_episodes == (str(real),)
+        assert case.recorder.opened_count == 1
+        assert case.recorder.open_episodes == ()
 
 
 async def test_a_description_that_is_too_long_is_cut() -> None:
-    with rigged() as rig, SimulatedTaskTree("x" * 20_000):
+    with recorder_case() as case, SimulatedTaskTree("x" * 20_000):
         pass
-    (thought,) = thoughts(rig)
-    assert started(rig, thought).description == "x" * 10_000
+    (thought,) = simulated_episodes(case)
+    assert started(case, thought).description == "x" * 10_000

@@ -23,12 +23,12 @@ from pycrorm_async.world.enums import Arms, ObjectType
 from pycrorm_async.world.pose import Pose
 
 
-class Nobody:
+class UnknownClass:
     def reference(self, world_object: object) -> ObjectReference | None:
         return None
 
 
-NOBODY = Nobody()
+NOBODY = UnknownClass()
 POSE = Pose([1, 2, 3], [0, 0, 0, 2], "map", 7)
 
 
@@ -94,7 +94,7 @@ def test_lists_and_dicts_are_written_item_by_item() -> None:
         ("object", "milk", "declared as object designator, got a str"),
     ],
 )
-def test_what_cannot_be_written_is_refused_with_the_reason(kind: FieldType, value: Any, reason: str) -> None:
+def test_an_unrecordable_value_is_refused_with_the_reason(kind: FieldType, value: Any, reason: str) -> None:
     with pytest.raises(UnrecordableValue) as refused:
         write(kind, value)
     assert reason in str(refused.value)
@@ -105,7 +105,7 @@ def test_a_member_of_another_enum_is_refused() -> None:
         write("enum", ObjectType.MILK, Arms)
 
 
-def test_an_object_outside_the_recorded_world_brings_its_own_value() -> None:
+def test_an_object_outside_the_recorded_world_is_recorded_by_value() -> None:
     pose = PoseValue((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0), "map", 7)
     assert write("object", BelieveObject("cup", ObjectType.JEROEN_CUP, POSE)) == ObjectValue(
         "BelieveObject", "cup", "JEROEN_CUP", pose
@@ -115,7 +115,7 @@ def test_an_object_outside_the_recorded_world_brings_its_own_value() -> None:
     )
 
 
-def test_a_result_is_written_as_far_as_it_can_be() -> None:
+def test_the_recordable_part_of_a_result_is_written() -> None:
     moment = datetime(2024, 7, 1, tzinfo=UTC)
     result = {"arm": Arms.LEFT, "n": [np.int8(1), 2.5, None], "when": moment}
     assert encode_or_missing(result, NOBODY) == {
@@ -125,7 +125,7 @@ def test_a_result_is_written_as_far_as_it_can_be() -> None:
     }
 
 
-def test_a_result_without_a_form_is_missing_with_reason_and_repr() -> None:
+def test_a_result_of_an_unknown_class_is_missing_with_reason_and_repr() -> None:
     assert encode_or_missing({1, 2}, NOBODY) == MissingValue("JSON cannot hold a set", "{1, 2}")
     assert encode_or_missing(math.nan, NOBODY) == MissingValue("nan is not a finite number", "nan")
     assert encode_or_missing(Broken(), NOBODY) == MissingValue(
@@ -133,7 +133,7 @@ def test_a_result_without_a_form_is_missing_with_reason_and_repr() -> None:
     )
 
 
-def test_a_circle_is_missing_and_no_recursion_error() -> None:
+def test_a_circular_result_is_missing_and_raises_no_recursion_error() -> None:
     circle: list[Any] = []
     circle.append(circle)
     missing = encode_or_missing(circle, NOBODY)
@@ -156,7 +156,7 @@ def test_a_failure_keeps_class_message_and_arguments() -> None:
     ]
 
 
-def test_a_failure_whose_message_cannot_be_made_is_kept_all_the_same() -> None:
+def test_a_failure_whose_message_raises_is_kept_without_it() -> None:
     class Mute(Exception):
         def __str__(self) -> str:
             raise RuntimeError
@@ -164,7 +164,7 @@ def test_a_failure_whose_message_cannot_be_made_is_kept_all_the_same() -> None:
     assert failure_value(Mute(), NOBODY).message == "<its __str__ raised RuntimeError>"
 
 
-def test_of_a_group_each_failure_is_kept_with_class_message_and_arguments() -> None:
+def test_a_group_keeps_each_failure_with_class_message_and_arguments() -> None:
     inner = ExceptionGroup("inner", [PlanFailure("late", {1})])
     failure = failure_value(PlanFailures("2 of 2 branches failed", [ObjectLost("gone \ud800", "milk"), inner]), NOBODY)
     assert failure.type == "pycrorm_async.plan.failures.PlanFailures"
@@ -227,6 +227,6 @@ def test_none_in_a_list_or_a_dict_is_none() -> None:
     assert write("dict", {"a": None}, item="pose") == {"a": None}
 
 
-def test_two_keys_of_one_text_are_refused() -> None:
+def test_two_keys_with_one_text_are_refused() -> None:
     with pytest.raises(UnrecordableValue, match="two keys of the dict have the same text"):
         write("dict", {"LEFT": 1, Arms.LEFT: 2}, item="integer")

@@ -1,4 +1,4 @@
-"""What a plan says and what the log can write are the same words, though neither imports the other."""
+"""The words of the plan layer and of the log are the same, though neither imports the other."""
 
 from __future__ import annotations
 

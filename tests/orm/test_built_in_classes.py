@@ -1,4 +1,4 @@
-"""The mapped classes that ship agree with the designators that ship, field by field."""
+"""The shipped mapped classes agree with the shipped designators, field by field."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PERFORMABLES = [getattr(module, name) for module in MODULES for name in module._
 
 
 @pytest.mark.parametrize("designator", PERFORMABLES, ids=lambda each: each.dtype)
-def test_every_action_and_motion_of_a_plan_has_its_class(designator: type) -> None:
+def test_every_action_and_motion_has_a_mapped_class(designator: type) -> None:
     declaration = declared_type(designator).declaration
     mapped = getattr(pycrorm_async.orm, declaration.dtype)
     assert issubclass(mapped, Action if declaration.kind == "action" else Motion)
@@ -43,7 +43,7 @@ def test_every_declaration_of_a_plan_fits_into_the_tables_of_the_classes(designa
     assert layout.with_declaration(declaration) == layout
 
 
-def test_the_thesis_names_are_all_there() -> None:
+def test_every_name_of_the_thesis_exists() -> None:
     table_4_1 = (
         "CloseAction DetectAction GraspingAction GripAction LookAtAction MoveTorsoAction NavigateAction OpenAction"
         " ParkArmsAction PickUpAction PlaceAction ReleaseAction SetGripperAction TransportAction"

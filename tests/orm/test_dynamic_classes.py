@@ -1,4 +1,4 @@
-"""Types this process has no class for, classes made for them, and classes their authors declared."""
+"""Types without a class in this process, the classes made for them, and classes that authors declared."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tests.projections.event_script import PICK_UP, SAYING, Script, declarations
 from tests.projections.sql_queries import stored_and_folded
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 CAREFUL = declared(
     "CarefulPickUpAction",
@@ -48,7 +48,7 @@ STATE = RobotValue(pose(0.5), "ROBOT", 0.25)
 
 
 class ORMRemark(Action):
-    """What an author declares, as the thesis does; `init=False` is from there."""
+    """A class as an author declares it in the thesis, including `init=False`."""
 
     id: Mapped[int] = mapped_column(ForeignKey(f"{Action.__tablename__}.id"), primary_key=True, init=False)
     text: Mapped[str]
@@ -92,7 +92,7 @@ async def classes_of(log: EventLog) -> AsyncIterator[DynamicClasses]:
         classes.dispose()
 
 
-async def test_a_type_without_a_class_is_there_as_the_nearest_class_there_is(log: EventLog) -> None:
+async def test_a_type_without_a_class_is_read_as_its_nearest_class(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
     assert names(await every(log, select(PickUpAction))) == ["PickUpAction"]
@@ -134,7 +134,7 @@ async def test_a_class_is_made_for_it_with_its_fields(log: EventLog) -> None:
         assert nodes[0].action.via.position.x == 7.0
 
 
-async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_they_are_called(log: EventLog) -> None:
+async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_their_names(log: EventLog) -> None:
     trip = declared(
         "TripAction",
         "trip_action",
@@ -158,7 +158,7 @@ async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_the
         assert found.loads == {"milk": 2, "cup": 1}
 
 
-async def test_a_field_of_a_made_class_is_the_field_if_every_action_has_an_attribute_of_its_name(log: EventLog) -> None:
+async def test_a_field_of_a_made_class_hides_an_attribute_that_every_action_has(log: EventLog) -> None:
     fields = field("duration", "real", 2), field("reason", "text", 3), field("episode", "integer", 4)
     wait = declared("WaitAction", "wait_action", *fields)
     script = Script()
@@ -172,7 +172,7 @@ async def test_a_field_of_a_made_class_is_the_field_if_every_action_has_an_attri
         assert await every(log, select(made.duration).where(made.duration > 50)) == [60.0]
 
 
-async def test_a_class_is_found_by_type_table_or_designator(log: EventLog) -> None:
+async def test_a_class_can_be_requested_by_type_table_or_designator(log: EventLog) -> None:
     class SayingActionPerformable:
         dtype = "SayingAction"
 
@@ -187,7 +187,7 @@ async def test_a_class_is_found_by_type_table_or_designator(log: EventLog) -> No
             classes.of("Waving")
 
 
-async def test_a_type_that_appears_after_the_question_was_first_asked_is_in_the_answer(log: EventLog) -> None:
+async def test_a_type_that_appears_after_the_first_query_is_in_the_answer(log: EventLog) -> None:
     projector = Projector(log)
     await projector.open()
     async with classes_of(log) as classes:
@@ -201,7 +201,7 @@ async def test_a_type_that_appears_after_the_question_was_first_asked_is_in_the_
         assert names(await every(log, select(PickUpAction))) == ["CarefulPickUpAction"]
 
 
-async def test_a_field_that_appears_later_is_an_attribute_of_the_class_there_is(log: EventLog) -> None:
+async def test_a_field_that_appears_later_is_an_attribute_of_the_existing_class(log: EventLog) -> None:
     louder = declared("SayingAction", "saying_action", field("text", "text", 2), field("volume", "real", 3))
     script = all_kinds()
     projector = await stored_and_folded(log, [*KINDS, *script.records])
@@ -219,7 +219,7 @@ async def test_a_field_that_appears_later_is_an_attribute_of_the_class_there_is(
         assert [each.text for each in await every(log, select(grown).where(grown.volume > 0.1))] == ["HI"]
 
 
-async def test_two_memories_with_types_of_one_name_do_not_meet(log: EventLog, tmp_path: Path) -> None:
+async def test_two_memories_with_types_of_one_name_do_not_share_classes(log: EventLog, tmp_path: Path) -> None:
     other_saying = declared("SayingAction", "saying_action", field("words", "integer", 2))
     other = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/other.db"), create=True)
     try:
@@ -240,7 +240,7 @@ async def test_two_memories_with_types_of_one_name_do_not_meet(log: EventLog, tm
         await other.close()
 
 
-async def test_disposed_classes_leave_nothing_behind(log: EventLog) -> None:
+async def test_disposed_classes_leave_no_references(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     identities = dict(Designator.__mapper__.polymorphic_map)
     made: list[weakref.ref[type]] = []
@@ -256,7 +256,7 @@ async def test_disposed_classes_leave_nothing_behind(log: EventLog) -> None:
     assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
 
 
-async def test_what_an_author_declared_is_the_class_of_its_rows(log: EventLog) -> None:
+async def test_an_authors_class_is_the_class_of_its_rows(log: EventLog) -> None:
     remark = declared("RemarkAction", "ORMRemark", field("text", "text", 2))
     script = Script()
     script.put(NodeStarted("action", None, name_of(remark), {"text": "Where is my Patchie?"}, STATE))
@@ -270,12 +270,12 @@ async def test_what_an_author_declared_is_the_class_of_its_rows(log: EventLog) -
         assert classes.of("RemarkAction") is ORMRemark
 
 
-async def test_what_an_author_declared_has_a_table_before_anything_was_done(log: EventLog) -> None:
+async def test_an_authors_class_has_a_table_before_its_first_row(log: EventLog) -> None:
     await Projector(log).open()
     assert await every(log, select(ORMRemark)) == []
 
 
-async def test_rows_from_before_the_author_declared_a_class_are_of_that_class_too(log: EventLog) -> None:
+async def test_rows_from_before_an_authors_class_was_declared_are_of_that_class_too(log: EventLog) -> None:
     before = declared("RemarkAction", "remark_action", field("text", "text", 2))
     after = declared("RemarkAction", "ORMRemark", field("text", "text", 2))
     script = Script()
@@ -290,7 +290,7 @@ async def test_rows_from_before_the_author_declared_a_class_are_of_that_class_to
 
 
 @pytest.mark.parametrize("declaration", [SAYING, CAREFUL], ids=lambda each: each.dtype)
-async def test_a_type_is_answered_for_while_its_base_is_unknown(
+async def test_a_type_can_be_queried_while_its_base_is_unknown(
     log: EventLog, declaration: DesignatorTypeDeclared
 ) -> None:
     bases = ("NobodyAction", declaration.dtype)
@@ -320,7 +320,7 @@ configure_mappers()
 """
 
 
-def test_a_class_that_is_gone_before_anything_was_asked_is_in_nobodys_way() -> None:
+def test_a_class_that_is_deleted_before_any_query_affects_none() -> None:
     root = Path(__file__).parents[2]
     command = [sys.executable, "-c", IN_A_NEW_PROCESS]
     done = subprocess.run(command, cwd=root, env=environment(), capture_output=True, text=True, check=False)

@@ -27,7 +27,7 @@ COLUMNS = {
 
 
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=lambda each: each.__name__)
-def test_every_expression_has_its_class(expression: type) -> None:
+def test_every_expression_has_a_mapped_class(expression: type) -> None:
     declaration = declared_type(expression).declaration
     mapped = getattr(pycrorm_async.orm, expression.__name__)
     table = inspect(mapped).local_table
@@ -42,7 +42,7 @@ def test_every_expression_has_its_class(expression: type) -> None:
     assert layout.with_declaration(declaration) == layout
 
 
-async def test_a_fresh_memory_answers_all_of_them_with_nothing(log: EventLog) -> None:
+async def test_a_fresh_memory_has_an_empty_table_for_each_expression(log: EventLog) -> None:
     await stored_and_folded(log, [])
     async with AsyncSession(log.engine) as session:
         for name in ("Language", *(each.__name__ for each in EXPRESSIONS)):

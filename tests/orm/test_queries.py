@@ -1,4 +1,4 @@
-"""The thesis' queries, and what an object names being there without another question."""
+"""The queries of the thesis, and the attributes of a row that are loaded without another query."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ WAIT = declared("WaitAction", "orm_wait", field("duration", "real", 2), field("s
 
 
 class ORMWait(Action):
-    """Its fields have names that every action has."""
+    """A class whose fields have the names of attributes that every action has."""
 
     __tablename__ = "orm_wait"
 
@@ -108,7 +108,7 @@ def moment(sequence: int) -> datetime:
 
 @pytest.fixture
 async def script(log: EventLog) -> Script:
-    """A robot drives (with a motion inside), picks up the milk, opens the fridge, all in one episode."""
+    """A robot drives (with a motion inside), picks up the milk, and opens the fridge, all in one episode."""
     script = Script()
     put = script.put
     put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))  # 1
@@ -144,14 +144,14 @@ async def every(log: EventLog, question: Any) -> list[Any]:
         return list((await session.scalars(question)).unique().all())
 
 
-async def test_a_fresh_memory_answers_every_class_with_nothing(log: EventLog) -> None:
+async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
     await Projector(log).open()
     mapped = [each for each in CLASSES if each is not Base]
     assert len(mapped) > 50
     assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
 
 
-async def test_the_episode_says_who_did_what_and_how_it_ended(log: EventLog, script: Script) -> None:
+async def test_the_episode_has_its_author_and_its_outcome(log: EventLog, script: Script) -> None:
     (metadata,) = await every(log, select(ProcessMetaData))
     assert repr(metadata) == (
         "ProcessMetaData(id=1, uuid='00000000-0000-7000-8000-000000000001',"
@@ -161,13 +161,15 @@ async def test_the_episode_says_who_did_what_and_how_it_ended(log: EventLog, scr
     )
 
 
-async def test_the_version_of_an_episode_answers_to_the_name_of_the_thesis(log: EventLog, script: Script) -> None:
+async def test_the_version_of_an_episode_has_the_name_from_the_thesis_as_a_synonym(
+    log: EventLog, script: Script
+) -> None:
     (metadata,) = await every(log, select(ProcessMetaData).where(ProcessMetaData.pycram_version == "1.0"))
     assert metadata.pycram_version == metadata.version == "1.0"
     assert await every(log, select(ProcessMetaData.pycram_version)) == ["1.0"]
 
 
-async def test_a_navigation_knows_where_from_and_where_to(log: EventLog, script: Script) -> None:
+async def test_a_navigation_has_its_start_and_its_target(log: EventLog, script: Script) -> None:
     (drive,) = await every(log, select(NavigateAction))
     assert (drive.id, drive.dtype, drive.kind) == (row(6), "NavigateAction", "action")
     state = drive.robot_state
@@ -181,7 +183,7 @@ async def test_a_navigation_knows_where_from_and_where_to(log: EventLog, script:
     assert state.pose.process_metadata is drive.process_metadata
 
 
-async def test_an_action_shows_what_it_is_and_the_robot_it_was_done_with(log: EventLog, script: Script) -> None:
+async def test_the_text_of_an_action_has_its_fields_and_its_robot(log: EventLog, script: Script) -> None:
     (pick,) = await every(log, select(PickUpAction))
     assert repr(pick) == (
         f"PickUpAction(id={row(11)}, process_metadata_id=1, dtype='PickUpAction', kind='action',"
@@ -191,7 +193,7 @@ async def test_an_action_shows_what_it_is_and_the_robot_it_was_done_with(log: Ev
     )
 
 
-async def test_every_action_comes_as_its_own_class(log: EventLog, script: Script) -> None:
+async def test_every_action_is_an_instance_of_its_own_class(log: EventLog, script: Script) -> None:
     actions = await every(log, select(Action).order_by(Action.id))
     assert [type(each) for each in actions] == [NavigateAction, PickUpAction, OpenAction]
     assert actions[1].arm is Arms.LEFT
@@ -209,7 +211,7 @@ async def test_every_action_comes_as_its_own_class(log: EventLog, script: Script
     assert designators[0].target_location.position.x == 7.0
 
 
-async def test_the_pose_of_what_was_picked_up_is_the_one_at_execution(log: EventLog, script: Script) -> None:
+async def test_the_pose_of_a_picked_up_object_is_the_one_at_execution(log: EventLog, script: Script) -> None:
     for picked in (PickUpAction.object, PickUpAction.object_designator):
         poses = await every(log, select(Pose).join(picked).join(Object.pose))
         assert [(each.position.x, each.position.y, each.position.z) for each in poses] == [(1.0, 2.0, 3.0)]
@@ -262,7 +264,7 @@ async def test_a_node_has_children_and_ancestors(log: EventLog, script: Script) 
     ("class_", "sequence", "name"),
     [(TaskTreeNode, 2, "children"), (TaskTreeNode, 8, "ancestors"), (Object, 12, "node")],
 )
-async def test_what_is_not_loaded_says_how_to_load_it(
+async def test_an_attribute_that_is_not_loaded_names_the_remedy(
     log: EventLog, script: Script, class_: type[Base], sequence: int, name: str
 ) -> None:
     message = rf"^{name} of {class_.__name__} \(\d+,\) is not loaded: .*awaitable_attrs.{name}`"
@@ -270,7 +272,7 @@ async def test_what_is_not_loaded_says_how_to_load_it(
         loaded = await session.get_one(class_, row(sequence))
         with pytest.raises(CallerError, match=message):
             getattr(loaded, name)
-        assert await getattr(loaded.awaitable_attrs, name)  # the session goes on
+        assert await getattr(loaded.awaitable_attrs, name)  # the session is still usable
         getattr(loaded, name)
     (closed,) = await every(log, select(class_).where(class_.id == row(sequence)))  # type: ignore[attr-defined]
     with pytest.raises(CallerError, match=message):
@@ -300,7 +302,7 @@ async def test_the_parts_of_a_pose_can_be_joined(log: EventLog, script: Script) 
         assert (await session.execute(question)).all() == [(0.5, 0.6)]
 
 
-async def test_objects_are_rows_of_moments_and_parts_know_what_they_belong_to(log: EventLog, script: Script) -> None:
+async def test_objects_are_rows_of_moments_and_parts_know_their_whole(log: EventLog, script: Script) -> None:
     milk = await every(log, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
     assert [(each.id, each.pose.position.x, each.node_id) for each in milk] == [
         (row(4), 1.0, None),
@@ -313,7 +315,7 @@ async def test_objects_are_rows_of_moments_and_parts_know_what_they_belong_to(lo
     assert robot.joints == {"torso": 0.25}
 
 
-async def test_what_happened_to_objects_can_be_asked(log: EventLog, script: Script) -> None:
+async def test_the_changes_of_objects_can_be_queried(log: EventLog, script: Script) -> None:
     (held,) = await every(log, select(Attachment))
     assert (held.kind, held.parent.name, held.child.name, held.link) == (
         "attached", "pr2", "milk", "l_gripper_tool_frame",
@@ -331,7 +333,7 @@ async def test_a_resolved_location_has_its_candidates(log: EventLog, script: Scr
     assert [(each.x, each.reachable_arms, each.taken) for each in resolved.candidates] == [(7.0, [Arms.LEFT], True)]
 
 
-async def test_the_parameters_as_they_were_recorded_are_there_when_asked_for(log: EventLog, script: Script) -> None:
+async def test_the_recorded_parameters_are_loaded_on_request(log: EventLog, script: Script) -> None:
     async with AsyncSession(log.engine) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
         asked = await pick.awaitable_attrs.parameters
@@ -340,7 +342,7 @@ async def test_the_parameters_as_they_were_recorded_are_there_when_asked_for(log
     assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
 
 
-async def test_an_action_leads_to_its_node_when_asked(log: EventLog, script: Script) -> None:
+async def test_an_action_loads_its_node_on_request(log: EventLog, script: Script) -> None:
     async with AsyncSession(log.engine) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
         assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
@@ -348,7 +350,7 @@ async def test_an_action_leads_to_its_node_when_asked(log: EventLog, script: Scr
     assert (pick.node.status, pick.node.reason) == (TaskStatus.FAILED, "IKError")
 
 
-async def test_an_action_says_when_it_was_performed_and_how_it_ended(log: EventLog, script: Script) -> None:
+async def test_an_action_has_its_times_and_its_outcome(log: EventLog, script: Script) -> None:
     drive, pick, opening = await every(log, select(Action).order_by(Action.start_time))
     assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
     assert (pick.status, pick.reason, pick.duration) == (TaskStatus.FAILED, "IKError", 3.0)
@@ -370,7 +372,7 @@ async def test_an_action_says_when_it_was_performed_and_how_it_ended(log: EventL
         (Action.episode.has(description="Tutorial"), [6, 11, 15]),
     ],
 )
-async def test_actions_are_filtered_and_ordered_by_their_course(
+async def test_actions_are_filtered_and_ordered_by_times_and_outcome(
     log: EventLog, script: Script, condition: Any, expected: list[int]
 ) -> None:
     slowest_last = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
@@ -384,7 +386,7 @@ async def test_an_action_joins_its_episode(log: EventLog, script: Script) -> Non
 
 
 @pytest.mark.parametrize("view", ["action", "motion", "designator", "task_tree_node"])
-async def test_sql_by_hand_reads_the_course_of_an_action_from_one_view(
+async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(
     log: EventLog, script: Script, view: str
 ) -> None:
     columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
@@ -395,7 +397,7 @@ async def test_sql_by_hand_reads_the_course_of_an_action_from_one_view(
 
 
 def failing() -> Script:
-    """A transport fails in a motion of its second try, and the plan goes on; then the plan itself breaks."""
+    """A transport fails in a motion of its second attempt, and the plan continues; then the plan itself raises."""
     script = Script()
     put = script.put
     put(EpisodeStarted("Breakfast", "me", "host", "1.0", "3.11"))  # 1
@@ -428,7 +430,7 @@ def failing() -> Script:
     return script
 
 
-async def test_a_failure_is_shown_where_it_began_with_path_object_arm_and_message(log: EventLog) -> None:
+async def test_a_failure_is_listed_where_it_began_with_path_object_arm_and_message(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
     first, second, opening, plan = await every(log, select(RootFailure).order_by(RootFailure.id))
     path = "root > Retry > PickUpAction > MoveMotion"
@@ -474,7 +476,7 @@ async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:
 
 async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventLog) -> None:
     script = failing()
-    for place, each in enumerate(script.records[:-3]):  # the second episode is none
+    for place, each in enumerate(script.records[:-3]):  # the second episode has none
         if each.type in ("EpisodeStarted", "NodeStarted"):
             simulated = each.payload.replace(b"{", b'{"simulated":true,', 1)
             script.records[place] = each._replace(payload=simulated)
@@ -487,7 +489,7 @@ async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventL
     assert counts == [1, 4]
 
 
-async def test_sql_by_hand_counts_where_failures_began(log: EventLog) -> None:
+async def test_plain_sql_counts_where_failures_began(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
     question = "SELECT path, object, count(*) FROM root_failure GROUP BY path, object ORDER BY path"
     assert await ask(log, question) == [
@@ -497,7 +499,7 @@ async def test_sql_by_hand_counts_where_failures_began(log: EventLog) -> None:
     ]
 
 
-async def test_a_field_named_like_the_course_of_an_action_is_the_field(log: EventLog) -> None:
+async def test_a_field_with_the_name_of_an_action_attribute_hides_it(log: EventLog) -> None:
     script = Script()
     node = script.put(NodeStarted("action", None, name_of(WAIT), {"duration": 60.0, "status": "patient"}))
     script.put(NodeEnded(node, "SUCCEEDED"))
@@ -507,7 +509,7 @@ async def test_a_field_named_like_the_course_of_an_action_is_the_field(log: Even
     assert await every(log, select(Action.duration)) == [1.0]
 
 
-async def test_an_enum_member_this_process_does_not_know_is_its_name(log: EventLog) -> None:
+async def test_an_enum_member_that_is_unknown_to_this_process_is_its_name(log: EventLog) -> None:
     script = Script()
     milk = script.put(ObjectAdded("milk", "OAT_MILK", pose()))
     parameters = {"object_designator": ObjectReference(milk, milk), "arm": "THIRD", "grasp": "TOP"}
@@ -517,7 +519,7 @@ async def test_an_enum_member_this_process_does_not_know_is_its_name(log: EventL
     assert (pick.arm, pick.grasp, pick.object.obj_type) == ("THIRD", Grasp.TOP, "OAT_MILK")
 
 
-async def test_moments_can_be_compared_and_a_naive_one_is_refused(log: EventLog, script: Script) -> None:
+async def test_times_can_be_compared_and_a_naive_one_is_refused(log: EventLog, script: Script) -> None:
     later = select(TaskTreeNode.id).where(TaskTreeNode.start_time > moment(11)).order_by(TaskTreeNode.id)
     assert await every(log, later) == [row(15), row(16)]
     with pytest.raises(ValueError, match="has no time zone"):
@@ -537,7 +539,7 @@ async def test_a_row_knows_its_event_and_queries_filter_and_order_by_it(log: Eve
         assert sequences == sum(each.sequence for each in await every(log, select(class_))) > 0, class_
 
 
-async def test_sql_by_hand_has_the_events_of_a_row(log: EventLog, script: Script) -> None:
+async def test_plain_sql_has_the_events_of_a_row(log: EventLog, script: Script) -> None:
     nodes = await every(log, select(TaskTreeNode).order_by(TaskTreeNode.id))
     expected = [(each.sequence, each.end_sequence) for each in nodes]
     async with log.engine.connect() as connection:

@@ -1,4 +1,4 @@
-"""Where Bullet's own forward kinematics puts a link: asked past everything of ours, in single precision."""
+"""Return a link's frame by Bullet's own forward kinematics, in single precision, without the package's code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.world.fakes import Matrix
 
 
 def bullet_frame(thing: Object, link: str) -> Matrix:
-    """The link's frame in the map as a 4 by 4 matrix."""
+    """Return the link's frame in the map as a 4 by 4 matrix."""
     number, client = thing.body.number, thing.world.client
     names = [
         pybullet.getJointInfo(number, joint, physicsClientId=client)[12].decode()

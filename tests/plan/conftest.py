@@ -24,7 +24,7 @@ class Scene(NamedTuple):
 
 @contextmanager
 def kitchen() -> Iterator[Scene]:
-    """Robot at the origin, kitchen, milk and cereal on its counter; the simulated robot carries motions out."""
+    """Robot at the origin, kitchen, milk and cereal on its counter; the simulated robot performs motions."""
     with BulletWorld(mode=WorldMode.DIRECT) as world, simulated_robot:
         yield Scene(
             world,
@@ -37,12 +37,12 @@ def kitchen() -> Iterator[Scene]:
 
 @pytest.fixture
 def scene() -> Iterator[Scene]:
-    """The kitchen, for a test's whole length."""
+    """The kitchen, for the whole of a test."""
     with kitchen() as there:
         yield there
 
 
 @pytest.fixture
 def one_armed(scene: Scene) -> None:
-    """The scene's robot is of a kind that has a left arm only."""
+    """Replace the scene's robot by one that has only a left arm."""
     scene.robot.robot_description = replace(PR2, arms={Arms.LEFT: PR2.arms[Arms.LEFT]})

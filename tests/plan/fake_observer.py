@@ -1,4 +1,4 @@
-"""A small recorder: it keeps what it is told and refuses, loudly, what may not happen."""
+"""A fake observer of plans that keeps every notification and refuses an impossible order."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pycrorm_async.world import ObjectType
 
 
 class OrderBroken(AssertionError):
-    """The plan layer told something in an order that cannot be."""
+    """The plan layer notified the observer in an impossible order."""
 
 
 class Recording:
-    """Implements `PlanObserver`. `told` holds "start X", "end X STATUS" and "place X" in order."""
+    """Implements `PlanObserver`. `notes` has "start X", "end X STATUS" and "place X" in order."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.notes: list[str] = []
         self.refused: list[tuple[Refusal, ...]] = []
         self.offered_beyond: list[int] = []
         self.places: list[tuple[str, tuple[Candidate, ...], int | None, int, TaskTreeNode | None]] = []
@@ -28,10 +28,10 @@ class Recording:
         self.ended: list[TaskTreeNode] = []
         self.thoughts: list[Simulation] = []
 
-    async def heard(self, count: int) -> None:
-        """Until it was told so much."""
+    async def wait_for_notes(self, count: int) -> None:
+        """Wait until it has this many notes."""
         async with asyncio.timeout(10):
-            while len(self.told) < count:  # noqa: ASYNC110  whoever tells does not know of this test
+            while len(self.notes) < count:  # noqa: ASYNC110  whoever tells does not know of this test
                 await asyncio.sleep(0)
 
     def admit(self) -> Awaitable[None] | None:
@@ -46,7 +46,7 @@ class Recording:
             raise OrderBroken(f"{node} starts inside {node.parent}, which is over")
         node.record = self
         self.open.append(node)
-        self.told.append(f"start {type(node.designator).__name__}")
+        self.notes.append(f"start {type(node.designator).__name__}")
 
     def node_ended(self, node: TaskTreeNode) -> None:
         if node not in self.open:
@@ -57,7 +57,7 @@ class Recording:
             raise OrderBroken(f"{node} ends before its children")
         self.open.remove(node)
         self.ended.append(node)
-        self.told.append(f"end {type(node.designator).__name__} {node.status.name}")
+        self.notes.append(f"end {type(node.designator).__name__} {node.status.name}")
 
     def location_resolved(
         self,
@@ -73,7 +73,7 @@ class Recording:
         self.refused.append(refused)
         self.offered_beyond.append(offered_beyond)
         self.places.append((location, offered, taken, considered, node))
-        self.told.append(f"place {location}")
+        self.notes.append(f"place {location}")
 
     def object_detected(
         self,
@@ -83,21 +83,21 @@ class Recording:
         seen: tuple[Seen, ...],
         node: TaskTreeNode | None,
     ) -> None:
-        self.told.append(f"saw {' '.join(each.thing.name for each in seen)}".strip())
+        self.notes.append(f"saw {' '.join(each.thing.name for each in seen)}".strip())
 
     def simulation_started(self, thought: Simulation) -> None:
         if thought.record is not None or current_simulation.get() is not thought or current_node.get() is not None:
             raise OrderBroken(f"{thought} begins, and is not what is thought")
         thought.record = self
         self.thoughts.append(thought)
-        self.told.append(f"think {thought.description}")
+        self.notes.append(f"think {thought.description}")
 
     def simulation_ended(self, thought: Simulation, failure: BaseException | None) -> None:
         if not self.thoughts or self.thoughts.pop() is not thought:
             raise OrderBroken(f"{thought} ends, and is not the innermost")
         if thought.world is not None and not thought.world.entered:
             raise OrderBroken("the copy is closed before the thought is over")
-        self.told.append(f"thought {type(failure).__name__ if failure is not None else 'through'}")
+        self.notes.append(f"thought {type(failure).__name__ if failure is not None else 'through'}")
 
     @contextmanager
     def listening(self) -> Iterator[Recording]:

@@ -1,4 +1,4 @@
-"""Actions that say what they do, for tests of the plan language."""
+"""Actions that log their runs, for tests of the plan language."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Step(ActionAbstract):
 
 @dataclass
 class Around(ActionAbstract):
-    """Performs one action inside of itself, and holds what it needs meanwhile."""
+    """Perform one action inside itself, and hold the resources meanwhile."""
 
     inner: ActionAbstract
     needs: Iterable[Resource] = ()
@@ -60,5 +60,5 @@ def failing(name: str, message: str = "", turns: int = 0) -> Step:
 
 
 def drawn(tree: CollectedTree) -> list[str]:
-    """The tree without durations."""
+    """Return the drawing of the tree without durations."""
     return re.sub(r" \d+\.\d ms", "", str(tree)).splitlines()

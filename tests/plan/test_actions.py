@@ -1,4 +1,4 @@
-"""What the actions do in the world, by which motions, and how they fail."""
+"""The effects of actions in the world, the motions that they perform, and their failures."""
 
 from __future__ import annotations
 
@@ -88,14 +88,14 @@ def targets(tree: CollectedTree) -> list[Pose]:
         ),
     ],
 )
-def test_actions_have_the_names_concepts_and_fields_that_are_known(
+def test_actions_have_the_names_concepts_and_fields_of_the_thesis(
     action: type[ActionAbstract], dtype: str, concept: str | None, names: list[str]
 ) -> None:
     assert (action.dtype, action.concept, action.kind) == (dtype, concept, "action")
     assert [field.name for field in fields(action)] == names  # type: ignore[arg-type]  # each is a dataclass
 
 
-async def test_a_pick_up_goes_before_the_object_to_it_and_up(scene: Scene) -> None:
+async def test_a_pick_up_moves_in_front_of_the_object_to_it_and_up(scene: Scene) -> None:
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
     with collected_tree() as tree:
         await PickUpActionPerformable(designator_of(scene.milk), Arms.LEFT, Grasp.FRONT).perform()
@@ -107,7 +107,7 @@ async def test_a_pick_up_goes_before_the_object_to_it_and_up(scene: Scene) -> No
         "  MoveGripperMotion",
         "  MoveTCPMotion",
     ]
-    # with all joints at zero the gripper points ahead: along x of the map
+    # With all joints at zero the gripper points ahead: along x of the map.
     assert [list(each.position) for each in targets(tree)] == [
         pytest.approx([1.2, 1, 0.9]),
         pytest.approx([1.3, 1, 0.9]),
@@ -119,7 +119,7 @@ async def test_a_pick_up_goes_before_the_object_to_it_and_up(scene: Scene) -> No
     assert scene.robot.joint_position("l_gripper_l_finger_joint") == 0.0
 
 
-async def test_the_approach_is_along_the_gripper_as_it_points_at_the_start(scene: Scene) -> None:
+async def test_the_approach_follows_the_direction_of_the_gripper_at_its_start(scene: Scene) -> None:
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
     await MoveTCPMotion(Pose([1.2, 1.1, 0.9], yaw_quaternion(0.5)), Arms.LEFT).perform()
     with collected_tree() as tree:
@@ -129,7 +129,7 @@ async def test_the_approach_is_along_the_gripper_as_it_points_at_the_start(scene
     assert before.orientation == pytest.approx((0, 0, 0, 1))
 
 
-async def test_a_turned_object_is_grasped_from_its_own_front(scene: Scene) -> None:
+async def test_a_rotated_object_is_grasped_from_its_own_front(scene: Scene) -> None:
     scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(math.pi / 2)))
     await NavigateActionPerformable(Pose([1.2, 0.3, 0], yaw_quaternion(math.pi / 2))).perform()
     with collected_tree() as tree:
@@ -141,7 +141,9 @@ async def test_a_turned_object_is_grasped_from_its_own_front(scene: Scene) -> No
 
 
 @pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -2.0])
-async def test_a_grasp_from_the_top_comes_from_above_however_the_object_is_turned(scene: Scene, yaw: float) -> None:
+async def test_a_grasp_from_the_top_comes_from_above_whatever_the_orientation_of_the_object(
+    scene: Scene, yaw: float
+) -> None:
     scene.milk.set_pose(Pose([0.6, 0.2, 0.75], yaw_quaternion(yaw)))
     await MoveTorsoActionPerformable(0.3).perform()
     with collected_tree() as tree:
@@ -150,7 +152,7 @@ async def test_a_grasp_from_the_top_comes_from_above_however_the_object_is_turne
         assert rotated(goal.orientation, (1, 0, 0)) == pytest.approx((0, 0, -1), abs=1e-9)
 
 
-async def test_picking_up_what_is_out_of_reach_fails_at_the_first_motion(scene: Scene) -> None:
+async def test_picking_up_an_unreachable_object_fails_at_the_first_motion(scene: Scene) -> None:
     with collected_tree() as tree, pytest.raises(IKError) as caught:
         await PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.FRONT).perform()
     assert (caught.value.arm, caught.value.tip_frame) == (Arms.RIGHT, RIGHT_TOOL)
@@ -161,7 +163,7 @@ async def test_picking_up_what_is_out_of_reach_fails_at_the_first_motion(scene: 
     assert scene.robot.attachments == {}
 
 
-async def test_what_is_not_in_the_world_cannot_be_picked_up(scene: Scene) -> None:
+async def test_an_object_outside_the_world_cannot_be_picked_up(scene: Scene) -> None:
     scene.world.remove(scene.milk)
     believed = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.3, 1, 0.9]))
     for meant in (scene.milk, believed, ObjectPart("sink_area", scene.kitchen)):
@@ -199,7 +201,7 @@ async def test_furniture_and_robots_are_not_picked_up_however_near_they_are(scen
             assert (caught.value.data, scene.world.save_state()) == ((thing.name,), before)
 
 
-async def test_an_object_is_taken_over_from_what_it_hung_on(scene: Scene) -> None:
+async def test_a_picked_up_object_is_detached_from_its_former_parent(scene: Scene) -> None:
     tray = Object("tray", ObjectType.GENERIC_OBJECT, pose=Pose([1.3, 1, 0.75]))
     tray.attach(scene.milk)
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
@@ -249,7 +251,7 @@ async def test_a_place_out_of_reach_keeps_the_object_in_the_hand(scene: Scene) -
     assert scene.robot.attachments == {scene.milk: LEFT_TOOL}
 
 
-async def test_facing_turns_base_and_head_and_stays(scene: Scene) -> None:
+async def test_facing_turns_base_and_head_without_moving_the_base(scene: Scene) -> None:
     await NavigateActionPerformable(Pose([0.5, 0.5, 0], yaw_quaternion(3.0))).perform()
     with collected_tree() as tree:
         await FaceAtPerformable(Pose([0.5, -1.5, 1.0])).perform()
@@ -292,7 +294,7 @@ async def test_parked_arms_are_at_their_park_positions(scene: Scene, arm: Arms, 
     assert shape(tree) == ["ParkArmsActionPerformable", "  MoveArmJointsMotion"]
 
 
-async def test_the_torso_goes_up_and_not_too_far(scene: Scene) -> None:
+async def test_the_torso_moves_up_within_its_limits(scene: Scene) -> None:
     with collected_tree() as tree:
         await MoveTorsoActionPerformable(0.3).perform()
     assert scene.robot.joint_position("torso_lift_joint") == 0.3
@@ -313,7 +315,7 @@ async def test_gripper_and_look_at_are_one_motion_each(scene: Scene) -> None:
     ]
 
 
-async def test_one_arm_at_a_time(scene: Scene) -> None:
+async def test_actions_accept_one_arm_at_a_time(scene: Scene) -> None:
     for action in (
         PickUpActionPerformable(scene.milk, Arms.BOTH, Grasp.FRONT),
         PlaceActionPerformable(scene.milk, Arms.BOTH, Pose()),
@@ -322,7 +324,7 @@ async def test_one_arm_at_a_time(scene: Scene) -> None:
             await action.perform()
 
 
-def test_an_action_is_built_from_what_its_fields_say(scene: Scene) -> None:
+def test_an_action_can_be_built_from_its_fields_alone(scene: Scene) -> None:
     with pytest.raises(ResolutionError, match="grasp: expected Grasp, got str 'front'"):
         PickUpActionPerformable(scene.milk, Arms.LEFT, "front")  # type: ignore[arg-type]  # the fault here
     with pytest.raises(ResolutionError, match="missing: target_location"):

@@ -1,4 +1,4 @@
-"""Which joint a handle moves, how far, and where it passes: reckoned from the kitchen's drawing."""
+"""The joint that a handle moves, its range, and its path, computed from the kitchen's drawing."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def test_opening_leaves_a_margin_and_never_closes(scene: Scene) -> None:
     assert [opened_position(door), closed_position(door)] == pytest.approx([1.85, 0.0])
 
 
-def test_a_drawers_handle_goes_straight_in_steps_of_five_centimetres(scene: Scene) -> None:
+def test_a_drawers_handle_moves_straight_in_steps_of_five_centimetres(scene: Scene) -> None:
     drawer = handle_of(ObjectPart(DRAWER, scene.kitchen))
     way = handle_poses(drawer, 0.30)
-    # the front is at x 1.05, the handle 5 cm before it, in the middle of z 0.57 to 0.76
+    # The front is at x 1.05, the handle 5 cm before it, in the middle of z 0.57 to 0.76.
     expected = [(1.0 - 0.05 * number, 1.3, 0.665) for number in range(7)]
     np.testing.assert_allclose([each.position for each in way], expected, atol=1e-9)
     assert {each.orientation for each in way} == {(0.0, 0.0, 0.0, 1.0)}
@@ -55,7 +55,7 @@ def test_a_drawers_handle_goes_straight_in_steps_of_five_centimetres(scene: Scen
 
 
 @pytest.mark.parametrize(("start", "goal", "steps"), [(0.0, 1.85, 19), (1.0, 0.0, 10), (0.3, 0.3, 1)])
-def test_a_doors_handle_goes_round_the_hinge_and_turns_with_the_door(
+def test_a_doors_handle_moves_around_the_hinge_and_rotates_with_the_door(
     scene: Scene, start: float, goal: float, steps: int
 ) -> None:
     scene.kitchen.set_pose(Pose([0.1, -0.2, 0.0], [0, 0, 0.6, 0.8]))
@@ -70,7 +70,9 @@ def test_a_doors_handle_goes_round_the_hinge_and_turns_with_the_door(
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, 1.85])
-def test_a_hand_takes_a_drawer_from_the_front_and_a_door_from_the_side_of_its_hinge(scene: Scene, angle: float) -> None:
+def test_a_hand_grasps_a_drawer_from_the_front_and_a_door_from_the_side_of_its_hinge(
+    scene: Scene, angle: float
+) -> None:
     scene.kitchen.set_pose(Pose([0.1, -0.2, 0.0], [0, 0, 0.6, 0.8]))
     scene.kitchen.set_joint_position("fridge_door_joint", angle)
     drawer = ObjectPart(DRAWER, scene.kitchen)
@@ -87,14 +89,14 @@ def test_a_hand_takes_a_drawer_from_the_front_and_a_door_from_the_side_of_its_hi
     assert len(way) == 6
 
 
-def test_a_door_that_is_hinged_on_the_other_side_is_taken_from_there(scene: Scene) -> None:
+def test_a_door_with_its_hinge_on_the_other_side_is_grasped_from_there(scene: Scene) -> None:
     mirrored = scene.kitchen.description_text.replace('xyz="-0.1 0.59 0.95"', 'xyz="-0.1 -0.59 0.95"')
     cupboard = Object("cupboard", ObjectType.ENVIRONMENT, mirrored)
     expected = shifted(1.05, -1.25, 0) @ shifted(-0.10, -0.59, 0.95) @ turned(Z, -math.pi / 2)
     np.testing.assert_allclose(matrix(grasp_pose(ObjectPart(FRIDGE, cupboard))), expected, atol=1e-9)
 
 
-def test_things_and_parts_that_nothing_moves_are_taken_as_they_are(scene: Scene) -> None:
+def test_objects_and_parts_without_a_joint_are_grasped_at_their_pose(scene: Scene) -> None:
     scene.milk.set_pose(Pose([1.3, 1, 0.9], [0.1, 0.2, 0.3, 0.9]))
     assert grasp_pose(scene.milk) == scene.milk.pose
     tap = ObjectPart("sink_area_tap", scene.kitchen)
@@ -104,7 +106,7 @@ def test_things_and_parts_that_nothing_moves_are_taken_as_they_are(scene: Scene)
         grasp_pose(scene.milk)
 
 
-def test_what_cannot_be_opened_is_said_in_one_line(scene: Scene) -> None:
+def test_an_object_that_cannot_be_opened_is_refused_in_one_line(scene: Scene) -> None:
     for part, message in (
         (ObjectPart("kitchen_counter_surface", scene.kitchen), "no joint of kitchen moves kitchen_counter_surface"),
         (scene.kitchen, "kitchen is not part of an object"),

@@ -1,4 +1,4 @@
-"""Picking up from anywhere around an object: the success rate that the thesis measured for its default policy."""
+"""Picking up from random poses around an object: the success rate of the default policy in the thesis."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def test_one_value_needs_no_list(scene: Scene) -> None:
     assert [each.object_designator for each in two] == [scene.milk, scene.cereal]
 
 
-def test_what_is_no_alternative_at_all_is_refused_whole_and_by_name(scene: Scene) -> None:
+def test_a_value_that_is_no_alternative_is_refused_whole_and_by_name(scene: Scene) -> None:
     with pytest.raises(ResolutionError, match="wrong: arm: expected Arms, got str 'LEFT'"):
         ParkArmsAction("LEFT").resolve()  # type: ignore[arg-type]
     with pytest.raises(ResolutionError, match=r"missing: arm$"):
@@ -78,7 +78,7 @@ def test_what_is_no_alternative_at_all_is_refused_whole_and_by_name(scene: Scene
         PickUpAction("milk", [Arms.LEFT], [Grasp.FRONT]).resolve()  # type: ignore[arg-type]
 
 
-def test_what_hands_and_eyes_do_takes_objects_and_handles(scene: Scene) -> None:
+def test_grasping_and_perceiving_actions_accept_objects_and_handles(scene: Scene) -> None:
     milk = ObjectDesignatorDescription(names=["milk"])
     meant = designator_of(scene.milk)
     handles = [ObjectPart(f"{name}_handle", scene.kitchen) for name in ("fridge_door", "sink_area_drawer")]
@@ -128,7 +128,7 @@ def test_objects_may_be_described_given_or_several(scene: Scene) -> None:
     )
 
 
-def test_objects_are_looked_for_when_the_description_is_asked(scene: Scene) -> None:
+def test_objects_are_searched_when_the_description_is_resolved(scene: Scene) -> None:
     wanted = PickUpAction(ObjectDesignatorDescription(names=["milk"]), [Arms.LEFT], [Grasp.FRONT])
     assert len(list(wanted)) == 1
     scene.world.remove(scene.milk)

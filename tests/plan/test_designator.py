@@ -1,4 +1,4 @@
-"""What a designator class needs, what it is called, and what is refused."""
+"""The requirements on a designator class, its names, and the refused classes."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_names_in_the_memory_come_from_the_class() -> None:
     assert (SayingActionPerformable.concept, SayingActionPerformable.orm_class) == (None, None)
 
 
-def test_a_dtype_of_ones_own_wins_and_is_not_inherited() -> None:
+def test_an_own_dtype_is_used_and_not_inherited() -> None:
     class Waving(ActionAbstract):
         dtype: ClassVar[str] = "GreetingAction"
 
@@ -116,7 +116,7 @@ async def test_super_perform_makes_one_node_over_three_generations_and_two_bases
     assert [type(node.designator).__name__ for node in tree] == ["Both"]
 
 
-async def test_performing_the_same_object_again_inside_itself_is_a_node_of_its_own() -> None:
+async def test_performing_the_same_object_inside_itself_makes_a_node_of_its_own() -> None:
     @dataclass
     class Countdown(ActionAbstract):
         left: int
@@ -131,7 +131,7 @@ async def test_performing_the_same_object_again_inside_itself_is_a_node_of_its_o
     assert [tree.depth(node) for node in tree] == [0, 1, 2]
 
 
-async def test_an_action_performed_by_another_kind_of_itself_is_a_child() -> None:
+async def test_an_action_performed_by_another_class_of_itself_is_a_child() -> None:
     class Echo(WhisperingActionPerformable):
         async def perform(self) -> str:
             return await SayingActionPerformable(self.text).perform() + await super().perform()
@@ -157,7 +157,7 @@ async def test_a_class_with_slots_has_one_hook() -> None:
     assert len(tree) == 1
 
 
-def test_a_perform_that_is_not_async_is_refused_where_the_class_is_defined() -> None:
+def test_a_perform_that_is_not_async_is_refused_at_the_definition_of_the_class() -> None:
     with pytest.raises(TypeError, match=r"Shouting\.perform must be declared as `async def perform\(self\)`") as caught:
 
         class Shouting(ActionAbstract):
@@ -184,7 +184,7 @@ def test_a_decorator_that_hides_the_coroutine_function_is_refused() -> None:
             async def perform(self) -> None: ...
 
 
-def test_what_has_no_perform_cannot_be_made() -> None:
+def test_a_class_without_perform_cannot_be_instantiated() -> None:
     class Idle(ActionAbstract): ...
 
     with pytest.raises(TypeError, match="abstract"):
@@ -202,7 +202,7 @@ def test_what_has_no_perform_cannot_be_made() -> None:
         (1.0, None, [0, 0], ("words",), ("where: expected Pose | None, got list [0, 0]",)),
     ],
 )
-def test_a_motion_says_which_property_is_missing_or_wrong(
+def test_a_motion_names_the_property_that_is_missing_or_wrong(
     tone: Any, words: Any, where: Any, missing: tuple[str, ...], wrong: tuple[str, ...]
 ) -> None:
     with pytest.raises(ResolutionError, match="HummingMotion cannot be built") as caught:
@@ -211,11 +211,11 @@ def test_a_motion_says_which_property_is_missing_or_wrong(
     assert all(each in str(caught.value) for each in (*missing, *wrong))
 
 
-def test_a_whole_number_is_a_fine_float() -> None:
+def test_an_integer_is_accepted_as_a_float() -> None:
     assert HummingMotion(440, [], Pose()).tone == 440
 
 
-def test_a_motion_whose_types_cannot_be_read_is_not_checked() -> None:
+def test_a_motion_whose_annotations_cannot_be_read_is_not_checked() -> None:
     class Note: ...
 
     @dataclass
@@ -227,5 +227,5 @@ def test_a_motion_whose_types_cannot_be_read_is_not_checked() -> None:
     assert Whistle("c").note == "c"  # type: ignore[arg-type, comparison-overlap]  # shows that nothing is checked
 
 
-def test_perform_runs_outside_of_any_plan() -> None:
+def test_perform_runs_outside_any_plan() -> None:
     assert asyncio.run(SayingActionPerformable("alone").perform()) == "ALONE"

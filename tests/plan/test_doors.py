@@ -1,4 +1,4 @@
-"""Drawers and doors open and close with the hand on their handles; frames are reckoned from the kitchen's drawing."""
+"""Drawers and doors open and close with the hand on their handles; frames are computed from the kitchen's drawing."""
 
 from __future__ import annotations
 
@@ -38,13 +38,15 @@ from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
 from tests.plan.test_actions import shape
-from tests.world.fakes import Matrix, Witness, Z, shifted, turned
+from tests.world.fakes import ChangeLog, Matrix, Z, shifted, turned
 
 TOOL = {Arms.LEFT: "l_gripper_tool_frame", Arms.RIGHT: "r_gripper_tool_frame"}
 
 
 class Furniture(NamedTuple):
-    """What is opened, from where, and where its handle and the hand on it are at a position of its joint."""
+    """A drawer or door, the base pose to open it from, and the frames of its handle and of the hand for a joint
+    position.
+    """
 
     name: str
     arm: Arms
@@ -62,7 +64,7 @@ class Furniture(NamedTuple):
         grip = turned(Z, math.pi / 2) if self.name == "fridge_door" else np.eye(4)
         return self.handle(position) @ grip
 
-    async def stood_before_by(self, scene: Scene) -> ObjectPart:
+    async def base_placed_by(self, scene: Scene) -> ObjectPart:
         x, y, yaw = self.stand
         await MoveMotion(Pose([x, y, 0], yaw_quaternion(yaw))).perform()
         await MoveTorsoActionPerformable(0.1).perform()
@@ -79,7 +81,7 @@ ALL = pytest.mark.parametrize(
 
 
 def check(scene: Scene, which: Furniture, position: float) -> None:
-    """The joint is there, Bullet has the handle where the drawing says, and the hand on it."""
+    """Check the joint's position, the handle's frame in Bullet against the drawing, and the hand on it."""
     assert scene.kitchen.joint_position(f"{which.name}_joint") == pytest.approx(position, abs=1e-12)
     np.testing.assert_allclose(bullet_frame(scene.kitchen, f"{which.name}_handle"), which.handle(position), atol=1e-5)
     np.testing.assert_allclose(bullet_frame(scene.robot, TOOL[which.arm]), which.hand(position), atol=1e-5)
@@ -91,8 +93,10 @@ def fingers(scene: Scene, arm: Arms) -> set[float]:
 
 
 @ALL
-async def test_what_is_opened_and_closed_goes_with_the_hand_on_its_handle(scene: Scene, which: Furniture) -> None:
-    part = await which.stood_before_by(scene)
+async def test_furniture_that_opens_and_closes_moves_with_the_hand_on_its_handle(
+    scene: Scene, which: Furniture
+) -> None:
+    part = await which.base_placed_by(scene)
     with collected_tree() as tree:
         await OpenActionPerformable(part, which.arm).perform()
     check(scene, which, which.goal)
@@ -114,38 +118,38 @@ async def test_what_is_opened_and_closed_goes_with_the_hand_on_its_handle(scene:
 
 @ALL
 async def test_opening_is_one_motion_of_the_arm_and_one_of_the_furniture(scene: Scene, which: Furniture) -> None:
-    part = await which.stood_before_by(scene)
+    part = await which.base_placed_by(scene)
     await GraspingActionPerformable(which.arm, part).perform()
     check(scene, which, 0.0)
     assert fingers(scene, which.arm) == {0.0}
-    witness = Witness()
-    scene.world.observe(witness)
+    change_log = ChangeLog()
+    scene.world.observe(change_log)
     await OpeningMotion(part, which.arm).perform()
     check(scene, which, which.goal)
-    assert witness.names() == [("joints", "pr2"), ("joints", "kitchen")]
-    assert witness.told[1][2] == {f"{which.name}_joint": pytest.approx(which.goal)}
-    assert set(witness.told[0][2]) == set(scene.robot.robot_description.arms[which.arm].joints)  # type: ignore[union-attr]  # the pr2 has one
+    assert change_log.names() == [("joints", "pr2"), ("joints", "kitchen")]
+    assert change_log.notes[1][2] == {f"{which.name}_joint": pytest.approx(which.goal)}
+    assert set(change_log.notes[0][2]) == set(scene.robot.robot_description.arms[which.arm].joints)  # type: ignore[union-attr]  # the pr2 has one
 
 
-async def test_the_approach_is_along_the_way_the_hand_will_point(scene: Scene) -> None:
-    part = await SINK.stood_before_by(scene)
+async def test_the_approach_follows_the_direction_of_the_grasp(scene: Scene) -> None:
+    part = await SINK.base_placed_by(scene)
     with collected_tree() as tree:
         await GraspingActionPerformable(SINK.arm, part).perform()
     before, at = (node.designator.target for node in tree if isinstance(node.designator, MoveTCPMotion))
     np.testing.assert_allclose([before.position, at.position], [(0.9, 1.3, 0.665), (1.0, 1.3, 0.665)], atol=1e-9)
 
 
-async def test_the_hand_keeps_the_grip_it_had(scene: Scene) -> None:
-    """2 cm beside the middle of the handle, turned by 0.2 rad."""
-    part = await SINK.stood_before_by(scene)
+async def test_the_hand_keeps_its_grip(scene: Scene) -> None:
+    """2 cm beside the middle of the handle, rotated by 0.2 rad."""
+    part = await SINK.base_placed_by(scene)
     await MoveTCPMotion(Pose([1.0, 1.32, 0.665], yaw_quaternion(0.2)), SINK.arm).perform()
     await OpeningMotion(part, SINK.arm).perform()
     expected = shifted(0.7, 1.32, 0.665) @ turned(Z, 0.2)
     np.testing.assert_allclose(bullet_frame(scene.robot, TOOL[SINK.arm]), expected, atol=1e-5)
 
 
-async def test_what_is_open_further_stays_and_what_lies_in_a_drawer_comes_along(scene: Scene) -> None:
-    part = await ISLAND.stood_before_by(scene)
+async def test_a_joint_that_is_open_further_stays_and_the_content_of_a_drawer_moves_along(scene: Scene) -> None:
+    part = await ISLAND.base_placed_by(scene)
     scene.kitchen.attach(scene.milk, "kitchen_island_upper_drawer")
     await OpenActionPerformable(part, ISLAND.arm).perform()
     assert scene.milk.pose.position == pytest.approx((1.6, 1, 0.9), abs=1e-9)
@@ -159,31 +163,31 @@ async def test_what_is_open_further_stays_and_what_lies_in_a_drawer_comes_along(
 @pytest.mark.parametrize(
     ("which", "stand"),
     [
-        (FRIDGE, (0.1, -1.15, -math.pi / 2)),  # the hand reaches both ends and not the middle of the way
+        (FRIDGE, (0.1, -1.15, -math.pi / 2)),  # the hand reaches both ends and not the middle of the path
         (FRIDGE, (0.5, -0.9, 0.0)),
         (SINK, (0.4, 1.3, 0.0)),
     ],
 )
-async def test_a_way_that_the_hand_cannot_follow_moves_nothing(
+async def test_a_path_that_the_hand_cannot_follow_moves_nothing(
     scene: Scene, which: Furniture, stand: tuple[float, float, float]
 ) -> None:
     which = which._replace(stand=stand)
-    part = await which.stood_before_by(scene)
+    part = await which.base_placed_by(scene)
     await MoveTorsoActionPerformable(0.0).perform()
     await GraspingActionPerformable(which.arm, part).perform()
-    before, witness = scene.world.save_state(), Witness()
-    scene.world.observe(witness)
+    before, change_log = scene.world.save_state(), ChangeLog()
+    scene.world.observe(change_log)
     with pytest.raises(IKError) as caught:
         await OpeningMotion(part, which.arm).perform()
     assert (caught.value.arm, caught.value.tip_frame) == (which.arm, TOOL[which.arm])
-    assert (scene.world.save_state(), witness.told) == (before, [])
+    assert (scene.world.save_state(), change_log.notes) == (before, [])
     if stand[0] == 0.1:
         await MoveTCPMotion(_pose(which.hand(which.goal)), which.arm).perform()
         assert caught.value.pose.position != pytest.approx(which.hand(which.goal)[:3, 3], abs=0.01)
 
 
 def _pose(matrix: Matrix) -> Pose:
-    """Of a matrix that turns about z."""
+    """Return the pose of a matrix that rotates about z."""
     return Pose(matrix[:3, 3].tolist(), yaw_quaternion(math.atan2(matrix[1, 0], matrix[0, 0])))
 
 
@@ -191,11 +195,11 @@ def _pose(matrix: Matrix) -> Pose:
 async def test_a_hand_that_is_not_on_the_handle_moves_nothing(
     scene: Scene, motion: type[OpeningMotion | ClosingMotion]
 ) -> None:
-    part = await SINK.stood_before_by(scene)
+    part = await SINK.base_placed_by(scene)
     before = scene.world.save_state()
     with pytest.raises(EnvironmentManipulationImpossible, match=r"l_gripper_tool_frame is not on sink_area") as caught:
         await motion(part, Arms.LEFT).perform()
-    # the tool frame with all joints at 0: 1.001 m before the shoulder at (-0.05, 0.188) of the base
+    # The tool frame with all joints at 0: 1.001 m before the shoulder at (-0.05, 0.188) of the base.
     x, y, z = 0.1 - 0.05 + 0.1 + 0.4 + 0.321 + 0.18, 1.1 + 0.188, 0.051 + 0.739675 + 0.1
     apart = math.dist((x, y, z), (min(max(x, 0.992), 1.008), min(max(y, 1.23), 1.37), 0.673))
     assert caught.value.data == ("sink_area_drawer_handle", pytest.approx(apart, abs=1e-6))
@@ -203,7 +207,7 @@ async def test_a_hand_that_is_not_on_the_handle_moves_nothing(
 
 
 @pytest.mark.parametrize("action", [OpenActionPerformable, CloseActionPerformable, OpeningMotion, ClosingMotion])
-async def test_what_nothing_moves_is_neither_opened_nor_closed(
+async def test_a_part_without_a_joint_is_neither_opened_nor_closed(
     scene: Scene, action: type[OpenActionPerformable | CloseActionPerformable | OpeningMotion | ClosingMotion]
 ) -> None:
     before = scene.world.save_state()
@@ -223,7 +227,7 @@ async def test_what_nothing_moves_is_neither_opened_nor_closed(
 async def test_accessing_moves_a_joint_by_a_distance(
     scene: Scene, which: Furniture, distances: Sequence[float]
 ) -> None:
-    part = await which.stood_before_by(scene)
+    part = await which.base_placed_by(scene)
     await GraspingActionPerformable(which.arm, part).perform()
     position = 0.0
     for distance in distances:
@@ -249,10 +253,10 @@ async def test_accessing_moves_a_joint_by_a_distance(
         ({"arm": Arms.BOTH}, IllPosedGoalFailure, "does not work with BOTH"),
     ],
 )
-async def test_accessing_what_cannot_be_says_why_and_moves_nothing(
+async def test_an_impossible_access_gives_the_reason_and_moves_nothing(
     scene: Scene, changed: dict[str, object], failure: type[Exception], message: str
 ) -> None:
-    part = await SINK.stood_before_by(scene)
+    part = await SINK.base_placed_by(scene)
     await GraspingActionPerformable(SINK.arm, part).perform()
     before = scene.world.save_state()
     given: dict[str, object] = {
@@ -269,7 +273,7 @@ async def test_accessing_what_cannot_be_says_why_and_moves_nothing(
 
 
 async def test_an_arm_that_the_robot_lacks_opens_nothing(scene: Scene, one_armed: None) -> None:
-    part = await SINK.stood_before_by(scene)
+    part = await SINK.base_placed_by(scene)
     before = scene.world.save_state()
     for action in (OpenActionPerformable, CloseActionPerformable, OpeningMotion, ClosingMotion):
         with pytest.raises(CapabilityAbsenceFailure, match="pr2 has no RIGHT arm"):
@@ -279,8 +283,8 @@ async def test_an_arm_that_the_robot_lacks_opens_nothing(scene: Scene, one_armed
     check(scene, SINK, SINK.goal)
 
 
-async def test_a_plan_goes_on_to_the_next_arm(scene: Scene, one_armed: None) -> None:
-    part = await SINK.stood_before_by(scene)
+async def test_a_plan_continues_with_the_next_arm(scene: Scene, one_armed: None) -> None:
+    part = await SINK.base_placed_by(scene)
     right, left = OpenAction(part, [Arms.RIGHT]), OpenAction(part, [Arms.LEFT])
     with collected_tree() as tree:
         await (right - left).perform()
@@ -295,8 +299,8 @@ async def test_a_plan_goes_on_to_the_next_arm(scene: Scene, one_armed: None) -> 
     assert [type(each) for each in tried] == [IllPosedGoalFailure, CapabilityAbsenceFailure, type(None)]
 
 
-async def test_opening_in_thought_opens_nothing(scene: Scene) -> None:
-    part = await SINK.stood_before_by(scene)
+async def test_opening_in_a_simulation_opens_nothing(scene: Scene) -> None:
+    part = await SINK.base_placed_by(scene)
     before = scene.world.save_state()
     with SimulatedTaskTree():
         await OpenActionPerformable(part, SINK.arm).perform()

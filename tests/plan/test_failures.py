@@ -1,4 +1,4 @@
-"""Plan failures: the tree of them, what they carry, that they survive a pickle."""
+"""Plan failures: their class tree, their data, and their pickles."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ PlanFailure
 
 
 def parents() -> dict[str, str]:
-    """Class name → name of its base, read off the indentation above."""
+    """Return class name → name of its base, read off the indentation above."""
     above: list[str] = ["Exception"]
     found = {}
     for line in TREE.strip().splitlines():
@@ -89,7 +89,7 @@ def parents() -> dict[str, str]:
     return found
 
 
-def test_the_tree_is_the_one_that_plans_know() -> None:
+def test_the_tree_of_classes_is_the_documented_one() -> None:
     found = {
         name: kind.__bases__[0].__name__
         for name, kind in vars(failures).items()
@@ -115,7 +115,7 @@ def test_every_failure_takes_a_message_and_data(name: str) -> None:
     assert kind.__doc__
 
 
-def test_an_ik_error_says_who_should_have_got_where() -> None:
+def test_an_ik_error_names_the_arm_and_the_pose() -> None:
     failure = IKError(Pose([1, 2, 3]), Arms.LEFT, "l_gripper_tool_frame", "too far")
     assert str(failure) == "l_gripper_tool_frame cannot reach (1.000, 2.000, 3.000) with the LEFT arm: too far"
     assert (failure.pose, failure.arm, failure.tip_frame) == (Pose([1, 2, 3]), Arms.LEFT, "l_gripper_tool_frame")
@@ -153,7 +153,7 @@ def test_several_failures_are_a_plan_failure_and_a_group() -> None:
     ]
 
 
-def test_a_wait_without_end_names_the_part_and_the_three_concerned() -> None:
+def test_a_deadlock_names_the_part_and_the_three_nodes_involved() -> None:
     failure = ResourceDeadlock(Resource.BASE, "PickUpAction", "NavigateAction", "Tidying")
     assert str(failure) == (
         "NavigateAction would wait forever for BASE: PickUpAction holds it and waits, directly or indirectly,"
@@ -163,7 +163,7 @@ def test_a_wait_without_end_names_the_part_and_the_three_concerned() -> None:
     assert (again.args, str(again)) == (failure.args, str(failure))
 
 
-def test_an_exception_is_put_in_a_short_line_whatever_it_is() -> None:
+def test_any_exception_is_printed_in_a_short_line() -> None:
     class Broken(Exception):
         def __str__(self) -> str:
             raise ValueError

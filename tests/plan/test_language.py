@@ -1,7 +1,7 @@
-"""The plan language, in the words of the reference system's own tests: their names, and what they meant to say.
+"""The plan language, in the reference system's own tests: their names, and what they were meant to test.
 
-Where ours differs by design the test says so: expressions raise when they fail, and the same hand may be wanted
-by two branches at once, for they take turns.
+Where this language differs by design the test notes it: expressions raise when they fail, and two branches may require
+the same hand, because they take turns.
 """
 
 from __future__ import annotations
@@ -117,7 +117,8 @@ def test_code_construction() -> None:
 
 
 def test_pickup_par_construction() -> None:
-    # Refused by the reference system. Ours takes turns where both need the same parts, see test_language_resources.
+    # The reference system refuses this. Here both take turns when they need the same parts, see
+    # test_language_resources.
     left, right = (PickUpAction([], [arm], [Grasp.FRONT]) for arm in (Arms.LEFT, Arms.RIGHT))
     assert (left | right).operands == (left, right)
 
@@ -262,7 +263,7 @@ async def test_exception_try_all(scene: Scene) -> None:
     assert isinstance(tree.roots[0].designator, TryAll)
 
 
-async def test_descriptions_are_resolved_when_it_is_their_turn(scene: Scene) -> None:
+async def test_descriptions_are_resolved_when_they_are_performed(scene: Scene) -> None:
     places: list[Pose] = []
 
     class Later(NavigateAction):

@@ -1,4 +1,4 @@
-"""Monitors: when they interrupt, what is interrupted, and what goes on."""
+"""Monitors: their interruptions, the interrupted nodes, and the nodes that continue."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ INTERRUPTED = Outcome(results=(None,), interrupted=True)
 
 
 class Waiting(ActionAbstract):
-    """Waits for ever; says whether it was cancelled."""
+    """Wait for ever, and note whether it was cancelled."""
 
     def __init__(self) -> None:
         self.begun = asyncio.Event()
@@ -47,7 +47,7 @@ class Waiting(ActionAbstract):
 
 
 def after(count: int) -> Callable[[], bool]:
-    """A condition that holds from the asking after so many."""
+    """Return a condition that holds after this many checks."""
     asked = 0
 
     def holds() -> bool:
@@ -74,7 +74,7 @@ async def test_a_plan_that_never_suspends_is_interrupted_between_its_nodes() -> 
     log: list[str] = []
     with collected_tree() as tree:
         outcome = await ((Step("a", log) * 1000 >> Monitor(after(3))) + Step("b", log)).perform()
-    # Asked before the Repeat, before the first step, before the second: the fourth time it holds.
+    # Checked before the Repeat, before the first step, before the second: it holds at the fourth check.
     assert log == ["a", "a.", "a", "a.", "b", "b."]
     assert outcome.results == (INTERRUPTED, "b")
     assert drawn(tree) == [
@@ -87,7 +87,7 @@ async def test_a_plan_that_never_suspends_is_interrupted_between_its_nodes() -> 
     ]
 
 
-async def test_the_robot_stays_where_the_interruption_found_it(scene: Scene) -> None:
+async def test_the_robot_stays_where_the_interruption_stopped_it(scene: Scene) -> None:
     def beyond_one_metre() -> bool:
         return scene.robot.pose.position.x > 1
 
@@ -101,7 +101,7 @@ async def test_the_robot_stays_where_the_interruption_found_it(scene: Scene) -> 
 
 
 @pytest.mark.parametrize("kind", ["sync", "async", "event"])
-async def test_a_plan_is_interrupted_inside_of_an_await(kind: str) -> None:
+async def test_a_plan_is_interrupted_inside_an_await(kind: str) -> None:
     happened = asyncio.Event()
 
     async def later() -> bool:
@@ -142,19 +142,20 @@ async def test_a_motion_that_awaits_is_interrupted_at_its_await() -> None:
     assert [node.status.name for node in tree] == ["INTERRUPTED"] * 3
 
 
-async def test_a_monitor_that_holds_from_the_start_lets_nothing_start() -> None:
+async def test_a_monitor_that_holds_from_the_start_lets_no_node_start() -> None:
     with collected_tree() as tree:
         assert await (Step("a") >> Monitor(lambda: True)).perform() == INTERRUPTED
     assert drawn(tree) == ["Monitor INTERRUPTED"]
 
 
-async def test_all_branches_are_interrupted_whichever_notices_it() -> None:
+async def test_all_branches_are_interrupted_whichever_of_them_notices() -> None:
     waiting = Waiting()
     branches = waiting | (Step("a", turns=2) + Step("b")) | Step("c", turns=1000)
     with collected_tree() as tree:
         assert await (branches >> Monitor(after(6), interval_s=60)).perform() == INTERRUPTED
     assert waiting.cancelled
-    # Asked once by the monitor's own task, and before Parallel, Waiting, Sequential, a, c: the seventh time before b.
+    # Checked once by the monitor's own task, and before Parallel, Waiting, Sequential, a, c: the seventh check is
+    # before b.
     assert drawn(tree) == [
         "Monitor INTERRUPTED",
         "└── Parallel INTERRUPTED (CancelledError)",
@@ -165,7 +166,7 @@ async def test_all_branches_are_interrupted_whichever_notices_it() -> None:
     ]
 
 
-async def test_of_nested_monitors_each_interrupts_what_is_inside_of_it() -> None:
+async def test_each_of_nested_monitors_interrupts_what_is_inside_it() -> None:
     inner, outer, log = asyncio.Event(), asyncio.Event(), list[str]()
     first, second = Waiting(), Waiting()
     plan = (first >> Monitor(inner)) + second + Step("never", log) >> Monitor(outer)
@@ -204,7 +205,9 @@ async def test_the_outer_of_two_monitors_interrupts_the_inner_one_too() -> None:
 
 @pytest.mark.parametrize("between_nodes", [True, False])
 @pytest.mark.parametrize("asks_later", [True, False])
-async def test_what_a_condition_raises_interrupts_and_is_raised(between_nodes: bool, asks_later: bool) -> None:
+async def test_an_exception_of_a_condition_interrupts_the_plan_and_is_raised(
+    between_nodes: bool, asks_later: bool
+) -> None:
     bug = ZeroDivisionError("bug")
     asked = 0
 
@@ -228,13 +231,13 @@ async def test_what_a_condition_raises_interrupts_and_is_raised(between_nodes: b
     assert set(statuses[1:]) == {TaskStatus.INTERRUPTED}
 
 
-async def test_a_failure_inside_is_raised_and_nothing_interrupted() -> None:
+async def test_a_failure_inside_is_raised_and_nothing_is_interrupted() -> None:
     with collected_tree() as tree, pytest.raises(PlanFailure, match="a failed"):
         await (failing("a") >> Monitor(lambda: False)).perform()
     assert [node.status.name for node in tree] == ["FAILED", "FAILED"]
 
 
-async def test_a_cancellation_from_outside_is_none_of_the_monitors() -> None:
+async def test_a_cancellation_from_outside_is_not_handled_by_the_monitor() -> None:
     waiting = Waiting()
     before = asyncio.all_tasks()
     with collected_tree() as tree:
@@ -253,7 +256,7 @@ async def test_a_plan_that_cancels_itself_is_not_interrupted() -> None:
     assert [node.status.name for node in tree] == ["CANCELLED", "CANCELLED"]
 
 
-async def test_what_an_interrupted_plan_does_in_finally_is_performed() -> None:
+async def test_an_interrupted_plan_performs_its_finally_blocks() -> None:
     log: list[str] = []
 
     class Careful(ActionAbstract):
@@ -282,7 +285,7 @@ async def test_a_failing_cleanup_of_an_interrupted_plan_is_raised() -> None:
         await (Careless() >> Monitor(after(5))).perform()
 
 
-async def test_what_a_condition_performs_belongs_to_the_monitor_and_is_not_asked_about() -> None:
+async def test_nodes_of_a_condition_belong_to_the_monitor_and_are_not_checked() -> None:
     asked = 0
 
     async def looks() -> bool:
@@ -326,7 +329,7 @@ async def test_a_node_in_a_task_of_the_plan_interrupts_the_plan() -> None:
     assert {node.status.name for node in tree} == {"INTERRUPTED", "SUCCEEDED"}
 
 
-async def test_a_monitor_of_nothing_cannot_be_performed() -> None:
+async def test_a_monitor_without_an_operand_cannot_be_performed() -> None:
     with pytest.raises(NotALanguageExpression, match="this Monitor has no operand: write plan >> Monitor"):
         await Monitor(lambda: True).perform()
     with pytest.raises(NotALanguageExpression, match="so Parallel cannot perform it"):
@@ -334,12 +337,12 @@ async def test_a_monitor_of_nothing_cannot_be_performed() -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0, -1, float("inf"), float("nan"), "1", True, None])
-def test_an_interval_that_is_no_time_is_refused(interval_s: float) -> None:
+def test_an_invalid_interval_is_refused(interval_s: float) -> None:
     with pytest.raises(NotALanguageExpression, match="Monitor needs a finite interval_s > 0, got"):
         Monitor(lambda: True, interval_s)
 
 
-async def test_a_class_of_ones_own_stays_that_class() -> None:
+async def test_a_subclass_of_an_expression_keeps_its_class() -> None:
     class Careful(Monitor):
         async def perform(self) -> Outcome:
             return await super().perform()
@@ -350,11 +353,11 @@ async def test_a_class_of_ones_own_stays_that_class() -> None:
     assert (plan.interval_s, monitor.operands) == (2.0, ())
 
 
-async def test_a_recorder_is_told_of_interruptions_in_legal_order() -> None:
+async def test_a_recorder_is_notified_of_interruptions_in_legal_order() -> None:
     with Recording().listening() as recording:
         await ((Step("a") * 1000 >> Monitor(after(3))) + Step("b")).perform()
     assert recording.open == []
-    assert recording.told[-5:] == [
+    assert recording.notes[-5:] == [
         "end Repeat INTERRUPTED",
         "end Monitor INTERRUPTED",
         "start Step",

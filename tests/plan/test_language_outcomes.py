@@ -1,4 +1,4 @@
-"""What expressions do with results, failures, other exceptions and cancellations."""
+"""Results, failures, other exceptions and cancellations of expressions."""
 
 from __future__ import annotations
 
@@ -40,24 +40,24 @@ from pycrorm_async.world import Arms, GripperState
 from tests.plan.conftest import Scene
 from tests.plan.step_actions import Around, Step, drawn, failing
 
-# --- what the reference system loses ----------------------------------------------------------------------------------
+# --- errors of the reference system -----------------------------------------------------------------------------------
 
 
-async def test_a_failure_inside_of_an_inner_expression_fails_the_outer_one() -> None:
+async def test_a_failure_inside_an_inner_expression_fails_the_outer_one() -> None:
     with pytest.raises(PlanFailure, match="b failed"):
         await ((Step("a") + failing("b")) | Step("c")).perform()
     with pytest.raises(PlanFailure, match="a failed"):
         await ((failing("a") | Step("b")) + Step("c")).perform()
 
 
-async def test_what_is_in_brackets_is_performed_in_the_order_as_written() -> None:
+async def test_an_expression_in_brackets_is_performed_in_the_order_as_written() -> None:
     log: list[str] = []
     a, b, c, d = (Step(name, log) for name in "abcd")
     await (a + (b + (c + d))).perform()
     assert "".join(log) == "aa.bb.cc.dd."
 
 
-async def test_a_repetition_goes_on_and_tells_which_rounds_failed() -> None:
+async def test_a_repetition_continues_after_failed_rounds_and_returns_them() -> None:
     rounds = 0
 
     def fails_in_two_and_four() -> int:
@@ -136,7 +136,7 @@ async def test_of_many_failures_ten_are_named() -> None:
     assert len(caught.value.exceptions) == 14
 
 
-async def test_a_plan_can_go_on_after_one_kind_of_failure_and_not_after_another() -> None:
+async def test_a_plan_can_continue_after_one_class_of_failure_and_not_after_another() -> None:
     handled: list[str] = []
     with pytest.raises(PlanFailures) as caught:
         try:
@@ -147,7 +147,7 @@ async def test_a_plan_can_go_on_after_one_kind_of_failure_and_not_after_another(
     assert [str(each) for each in caught.value.exceptions] == ["far"]
 
 
-async def test_what_a_task_group_of_the_plan_raises_counts_as_a_failure() -> None:
+async def test_an_exception_group_of_the_plan_counts_as_a_failure() -> None:
     class AtOnce(ActionAbstract):
         async def perform(self) -> None:
             async with asyncio.TaskGroup() as group:
@@ -161,14 +161,14 @@ async def test_what_a_task_group_of_the_plan_raises_counts_as_a_failure() -> Non
     }
 
 
-async def test_one_success_is_enough_for_all_at_once_and_all_run_to_their_end() -> None:
+async def test_one_success_is_enough_for_concurrent_alternatives_and_all_run_to_their_end() -> None:
     log: list[str] = []
     outcome = await (failing("a") ^ Step("b", log) ^ Step("c", log, turns=5)).perform()
     assert (outcome.results, outcome.succeeded) == ((None, "b", "c"), (1, 2))
     assert log == ["b", "b.", "c", "c."]
 
 
-async def test_a_failed_branch_does_not_keep_the_others_from_their_end() -> None:
+async def test_a_failed_branch_does_not_stop_the_others() -> None:
     log: list[str] = []
     with pytest.raises(PlanFailure):
         await (failing("a") | Step("b", log, turns=5)).perform()
@@ -195,7 +195,7 @@ class Odd:
     ],
     ids=["a number", "a text", "none", "a class", "a function", "without repr"],
 )
-def test_what_is_no_operand_is_refused_on_either_side(operand: Any, named: str) -> None:
+def test_an_invalid_operand_is_refused_on_either_side(operand: Any, named: str) -> None:
     step = Step("a")
     for make, name in (
         (lambda: step + operand, "Sequential"),
@@ -216,12 +216,12 @@ def test_what_is_no_operand_is_refused_on_either_side(operand: Any, named: str) 
 
 
 @pytest.mark.parametrize("kind", [Sequential, TryInOrder, Parallel, TryAll])
-def test_an_expression_of_nothing_is_refused(kind: type[Sequential]) -> None:
+def test_an_expression_without_operands_is_refused(kind: type[Sequential]) -> None:
     with pytest.raises(NotALanguageExpression, match=f"{kind.__name__} needs something to perform"):
         kind()
 
 
-async def test_one_operand_may_stand_in_several_places() -> None:
+async def test_one_operand_may_be_used_in_several_places() -> None:
     log: list[str] = []
     step = Step("a", log)
     plan = (step | step) + step * 2
@@ -236,13 +236,13 @@ async def test_a_failed_resolution_is_a_failure_of_the_operand(scene: Scene) -> 
     assert outcome.succeeded == (1,)
 
 
-async def test_an_expression_is_written_as_what_it_performs() -> None:
+async def test_the_text_of_an_expression_has_the_operations_that_it_performs() -> None:
     plan = Step("a") + NavigateAction([]) + Code(print) * 2
     assert repr(plan) == "Sequential(StepAction, NavigateAction, Repeat)"
     assert repr(Code(print)) == "Code(print)"
 
 
-async def test_an_outcome_is_written_as_what_there_is_to_say() -> None:
+async def test_the_text_of_an_outcome_has_only_what_is_present() -> None:
     assert repr(await (Step("a") - Step("b")).perform()) == "Outcome(results=('a', None), succeeded=(0,))"
     assert repr(Outcome((None,), interrupted=False)) == "Outcome(results=(None,), interrupted=False)"
 
@@ -264,7 +264,7 @@ async def test_alternatives_of_a_description_are_tried_in_turn_until_one_succeed
     assert [node.status.name for node in tree.children(tree.roots[0])] == ["FAILED", "FAILED", "SUCCEEDED"]
 
 
-async def test_the_last_failure_is_raised_after_so_many_tries(scene: Scene) -> None:
+async def test_the_last_failure_is_raised_after_the_last_attempt(scene: Scene) -> None:
     with pytest.raises(TorsoGoalUnreachable) as caught:
         await Retry(MoveTorsoAction([5.0, 7.0, 0.2]), max_tries=2).perform()
     assert caught.value.data == (7.0,)
@@ -292,7 +292,7 @@ async def test_a_designator_is_tried_again_and_its_result_returned() -> None:
     assert tries == [0, 1, 2]
 
 
-async def test_no_alternative_at_all_is_a_failure() -> None:
+async def test_a_description_without_alternatives_is_a_failure() -> None:
     class Nothing(MoveTorsoAction):
         def __iter__(self) -> Any:
             return iter(())
@@ -304,12 +304,12 @@ async def test_no_alternative_at_all_is_a_failure() -> None:
 
 
 @pytest.mark.parametrize("tries", [0, -1, 1.5, None, True])
-def test_fewer_tries_than_one_are_refused(tries: int) -> None:
+def test_fewer_attempts_than_one_are_refused(tries: int) -> None:
     with pytest.raises(NotALanguageExpression, match="Retry needs an integer max_tries >= 1, got"):
         Retry(Step("a"), tries)
 
 
-# --- what is no failure -----------------------------------------------------------------------------------------------
+# --- exceptions that are no plan failures -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", [Parallel, TryAll])
@@ -333,7 +333,7 @@ async def test_several_other_exceptions_are_raised_as_a_group() -> None:
     assert caught.value.exceptions == (one, two)
 
 
-async def test_an_exception_of_a_cleanup_goes_before_the_cancellation() -> None:
+async def test_an_exception_of_a_cleanup_precedes_the_cancellation() -> None:
     class Careless(ActionAbstract):
         async def perform(self) -> None:
             try:
@@ -357,7 +357,7 @@ async def test_a_branch_that_is_cancelled_ends_the_expression_as_cancelled(kind:
     assert {node.status for node in tree} == {TaskStatus.CANCELLED}
 
 
-async def test_sequences_alternatives_and_retries_do_not_go_on_after_a_bug() -> None:
+async def test_sequences_alternatives_and_retries_do_not_continue_after_a_bug() -> None:
     bug, log = Step("a", fails=ValueError("bug")), list[str]()
     then = Step("b", log)
     for plan in (bug + then, bug - then, Retry(bug), bug * 3):
@@ -447,7 +447,7 @@ async def test_a_branch_that_cleans_up_is_not_cancelled_a_second_time_by_the_sam
     assert sorted(log) == sorted("0123456789" * 2)
 
 
-async def test_a_dropped_plan_cancels_its_branches() -> None:
+async def test_an_abandoned_plan_cancels_its_branches() -> None:
     before = asyncio.all_tasks()
     coroutine = (Step("a", turns=1000) | Step("b", turns=1000)).perform()
     while asyncio.all_tasks() == before:

@@ -1,4 +1,4 @@
-"""Branches take turns where they need the same part of the robot, and never wait for each other for ever."""
+"""Branches take turns when they need the same part of the robot, and never deadlock."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def step(name: str, log: list[str], *needs: Resource, turns: int = 3) -> Step:
 
 
 @pytest.mark.parametrize("kind", [Parallel, TryAll])
-async def test_branches_that_need_the_same_part_take_turns_as_they_came(kind: type[Parallel]) -> None:
+async def test_branches_that_need_the_same_part_take_turns_in_order_of_arrival(kind: type[Parallel]) -> None:
     log: list[str] = []
     await kind(*(step(name, log, BASE) for name in "abcd")).perform()
     assert "".join(log) == "aa.bb.cc.dd."
 
 
-async def test_branches_that_need_different_parts_go_at_once() -> None:
+async def test_branches_that_need_different_parts_run_concurrently() -> None:
     log: list[str] = []
     await (step("a", log, LEFT) | step("b", log, RIGHT) | step("c", log) | step("d", log)).perform()
     assert "".join(log) == "abcda.b.c.d."
@@ -54,7 +54,7 @@ async def test_a_node_that_waits_has_not_started() -> None:
     log: list[str] = []
     with collected_tree() as tree, Recording().listening() as recording:
         await (step("a", log, BASE) | step("b", log, BASE)).perform()
-    assert recording.told == [
+    assert recording.notes == [
         "start Parallel",
         "start Step",
         "end Step SUCCEEDED",
@@ -67,9 +67,9 @@ async def test_a_node_that_waits_has_not_started() -> None:
     assert two.started_ns >= one.ended_ns
 
 
-async def test_all_that_is_needed_is_taken_at_once_or_nothing_of_it() -> None:
+async def test_all_required_parts_are_taken_at_once_or_none_of_them() -> None:
     log: list[str] = []
-    # b waits for the base with nothing in its hand, so c has the left arm meanwhile; d came after b and waits for it.
+    # b waits for the base and holds nothing, so that c has the left arm meanwhile; d came after b and waits for it.
     await (
         step("a", log, BASE, turns=5)
         | step("b", log, BASE, HEAD)
@@ -79,7 +79,7 @@ async def test_all_that_is_needed_is_taken_at_once_or_nothing_of_it() -> None:
     assert "".join(log) == "acc.a.bb.dd."
 
 
-async def test_what_a_node_holds_those_inside_it_may_use_and_others_not_before_its_end() -> None:
+async def test_nodes_inside_a_holder_may_use_its_parts_and_others_not_before_its_end() -> None:
     log: list[str] = []
     holding = Around(Around(step("a", log, BASE), needs=[BASE]), needs=[BASE, LEFT])
     await (holding | step("b", log, BASE)).perform()
@@ -87,7 +87,7 @@ async def test_what_a_node_holds_those_inside_it_may_use_and_others_not_before_i
 
 
 class Two(ActionAbstract):
-    """Performs two others at once, and holds the base meanwhile."""
+    """Perform two others concurrently, and hold the base meanwhile."""
 
     def __init__(self, *parts: ActionAbstract) -> None:
         self.parts = parts
@@ -105,7 +105,7 @@ class TwoTasks(Two):
 
 
 @pytest.mark.parametrize("kind", [Two, TwoTasks])
-async def test_of_two_that_run_at_once_inside_of_a_holder_one_waits_for_the_other(kind: type[Two]) -> None:
+async def test_of_two_concurrent_nodes_inside_a_holder_one_waits_for_the_other(kind: type[Two]) -> None:
     log: list[str] = []
     await (kind(step("a", log, BASE), step("b", log, BASE)) | step("c", log, BASE)).perform()
     assert "".join(log) == "aa.bb.cc."
@@ -123,14 +123,14 @@ async def test_branches_of_an_inner_expression_take_turns_with_those_of_the_oute
     assert "".join(each for each in log if each[0] in "bce") in ("bb.ee.cc.", "ee.bb.cc.")
 
 
-async def test_outside_of_parallel_branches_nobody_waits() -> None:
+async def test_outside_parallel_branches_no_node_waits() -> None:
     log: list[str] = []
     await asyncio.gather(step("a", log, BASE).perform(), step("b", log, BASE).perform())
     assert "".join(log) == "aba.b."
 
 
 async def test_two_pick_ups_with_different_arms_both_happen_one_after_the_other(scene: Scene) -> None:
-    # The base is needed by both: 60 cm before the counter, between milk and cereal.
+    # Both need the base: 60 cm before the counter, between milk and cereal.
     await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
     await Code(scene.robot.set_joint_positions, positions={"torso_lift_joint": 0.3}).perform()
     scene.cereal.set_pose(Pose([1.3, 0.2, 0.95]))
@@ -145,7 +145,7 @@ async def test_two_pick_ups_with_different_arms_both_happen_one_after_the_other(
     assert two.started_ns >= one.ended_ns
 
 
-async def test_a_wait_that_would_never_end_is_refused_and_names_the_part(scene: Scene) -> None:
+async def test_a_deadlock_is_refused_and_names_the_part(scene: Scene) -> None:
     log: list[str] = []
     one = Around(step("a", log, RIGHT), needs=[LEFT], before=2)
     two = Around(step("b", log, LEFT), needs=[RIGHT], before=4)
@@ -173,7 +173,7 @@ async def test_a_wait_that_would_never_end_is_refused_and_names_the_part(scene: 
     assert log == ["a", "a."]
 
 
-async def test_a_ring_of_five_is_broken_once_and_the_others_get_through() -> None:
+async def test_a_cycle_of_five_is_broken_once_and_the_others_continue() -> None:
     parts = list(Resource)
     log: list[str] = []
     ring = [
@@ -186,7 +186,7 @@ async def test_a_ring_of_five_is_broken_once_and_the_others_get_through() -> Non
     assert log == ["3", "3.", "2", "2.", "1", "1.", "0", "0."]
 
 
-async def test_a_plan_may_try_again_after_a_refused_wait() -> None:
+async def test_a_plan_may_retry_after_a_refused_wait() -> None:
     log: list[str] = []
 
     class Patient(ActionAbstract):
@@ -200,15 +200,15 @@ async def test_a_plan_may_try_again_after_a_refused_wait() -> None:
     assert "".join(log) == "aa.cc."
 
 
-async def test_nobody_queues_behind_one_who_waits_for_the_end_of_what_he_is_part_of() -> None:
+async def test_no_node_queues_behind_one_that_waits_for_the_end_of_its_own_parent() -> None:
     log: list[str] = []
-    # b waits for base and head; what is inside of the holder of the base wants the head too, and goes first.
+    # b waits for base and head; a node inside the holder of the base also needs the head, and goes first.
     holding = Around(step("a", log, HEAD), needs=[BASE], before=4)
     await (holding | step("b", log, BASE, HEAD)).perform()
     assert "".join(log) == "aa.bb."
 
 
-async def test_branches_in_different_worlds_are_not_in_each_others_way() -> None:
+async def test_branches_in_different_worlds_do_not_block_each_other() -> None:
     meeting = asyncio.Barrier(3)
 
     class Meeting(ActionAbstract):
@@ -228,7 +228,7 @@ async def test_branches_in_different_worlds_are_not_in_each_others_way() -> None
     assert current_world.get() is None
 
 
-async def test_waiting_can_be_cancelled_and_leaves_its_place_to_the_next() -> None:
+async def test_a_wait_can_be_cancelled_and_the_next_node_takes_its_place() -> None:
     log: list[str] = []
     waiting: list[asyncio.Task[object]] = []
 
@@ -259,7 +259,7 @@ async def test_a_wait_that_is_cancelled_just_when_it_ends_takes_nothing() -> Non
         assert len(open_ones) <= 1
 
 
-async def test_a_monitor_interrupts_one_who_waits() -> None:
+async def test_a_monitor_interrupts_a_node_that_waits() -> None:
     held, log = asyncio.Event(), list[str]()
     long = step("a", log, BASE, turns=20)
     with collected_tree() as tree:
@@ -270,7 +270,7 @@ async def test_a_monitor_interrupts_one_who_waits() -> None:
     assert [node.status.name for node in tree if isinstance(node.designator, Monitor)] == ["INTERRUPTED"]
 
 
-async def test_a_holder_that_fails_or_is_cancelled_leaves_what_it_held() -> None:
+async def test_a_holder_that_fails_or_is_cancelled_releases_its_parts() -> None:
     log: list[str] = []
     for fails in (PlanFailure("no"), asyncio.CancelledError()):
         log.clear()
@@ -285,7 +285,7 @@ async def test_a_holder_that_fails_or_is_cancelled_leaves_what_it_held() -> None
         assert "".join(log) == "abb."
 
 
-async def test_a_recorder_that_refuses_a_node_leaves_what_it_would_have_held() -> None:
+async def test_a_recorder_that_refuses_a_node_releases_its_parts() -> None:
     class Refusing(Recording):
         def node_started(self, node: object) -> None:
             if isinstance(getattr(node, "designator", None), Refused):
@@ -311,11 +311,11 @@ async def test_the_loop_of_a_thread_is_not_that_of_the_branches() -> None:
     assert [each for each in log if each[0] in "ab"] == ["a", "a.", "b", "b."]
 
 
-# --- all ways in which some can want some -----------------------------------------------------------------------------
+# --- all combinations of required parts -------------------------------------------------------------------------------
 
 
 class Checked(ActionAbstract):
-    """Holds what it needs, and is witness that nobody else who is not around it does."""
+    """Hold the required parts, and check that only nodes around it hold them too."""
 
     def __init__(self, needs: Iterable[Resource], held: list[Checked], inner: Checked | None) -> None:
         self.needs = frozenset(needs)
@@ -341,7 +341,7 @@ class Checked(ActionAbstract):
 
 
 @pytest.mark.parametrize("seed", range(200))
-async def test_whatever_is_wanted_inside_of_what_every_plan_ends(seed: int) -> None:
+async def test_every_plan_ends_whatever_its_nested_nodes_require(seed: int) -> None:
     dice = random.Random(seed)
     held: list[Checked] = []
 
@@ -362,7 +362,7 @@ async def test_whatever_is_wanted_inside_of_what_every_plan_ends(seed: int) -> N
 
 
 @pytest.mark.parametrize("order", list(itertools.permutations(range(3))))
-async def test_first_come_is_first_served_in_every_order(order: tuple[int, ...]) -> None:
+async def test_waiting_nodes_are_served_in_order_of_arrival(order: tuple[int, ...]) -> None:
     log: list[str] = []
 
     class Later(ActionAbstract):

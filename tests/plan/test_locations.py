@@ -1,4 +1,4 @@
-"""Where places are found, that what is offered works, and that a recorder hears of it once."""
+"""Resolving locations: every candidate works, and a recorder is notified once."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ OUT_OF_REACH = Pose([1.3, 1, 3])
 
 @pytest.mark.slow
 @pytest.mark.parametrize("yaw", [0.0, 1.0, math.pi])
-async def test_from_every_stand_that_is_offered_the_object_can_be_picked_up(scene: Scene, yaw: float) -> None:
+async def test_from_every_candidate_the_object_can_be_picked_up(scene: Scene, yaw: float) -> None:
     await MoveTorsoActionPerformable(0.2).perform()
     await ParkArmsActionPerformable(Arms.RIGHT).perform()
     scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(yaw)))
@@ -65,7 +65,7 @@ async def test_from_every_stand_that_is_offered_the_object_can_be_picked_up(scen
 
 
 @pytest.mark.slow
-async def test_from_every_stand_that_is_offered_the_held_object_can_be_placed(scene: Scene) -> None:
+async def test_from_every_candidate_the_held_object_can_be_placed(scene: Scene) -> None:
     await MoveTorsoActionPerformable(0.2).perform()
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
     await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.RIGHT).perform()
@@ -82,7 +82,7 @@ async def test_from_every_stand_that_is_offered_the_held_object_can_be_placed(sc
 
 
 @pytest.mark.slow
-def test_stands_are_on_the_floor_face_the_target_and_are_clear_of_furniture(scene: Scene) -> None:
+def test_candidates_are_on_the_floor_face_the_target_and_are_clear_of_furniture(scene: Scene) -> None:
     boxes = [box for link in scene.kitchen.links if (box := scene.kitchen.bounding_box(link)).size != (0, 0, 0)]
     stands = list(CostmapLocation(scene.cereal, reachable_for=scene.robot))
     for pose in (each.pose for each in stands):
@@ -98,7 +98,7 @@ def test_stands_are_on_the_floor_face_the_target_and_are_clear_of_furniture(scen
 
 
 @pytest.mark.slow
-def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
+def test_the_requested_arms_reach(scene: Scene) -> None:
     def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
         found = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=arm)
         return {each.reachable_arms for each in found}
@@ -110,7 +110,7 @@ def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
 
 
 @pytest.mark.slow
-async def test_from_where_it_is_to_be_seen_it_is_seen(scene: Scene) -> None:
+async def test_from_a_candidate_for_visibility_the_object_is_seen(scene: Scene) -> None:
     Object("wall", ObjectType.GENERIC_OBJECT, box_urdf("wall", x=(-0.02, 0.02), y=(-0.3, 0.3), z=(0, 2)),
            Pose([1.0, 0.9, 0]))  # fmt: skip
     stands = list(CostmapLocation(scene.milk, visible_for=scene.robot))
@@ -126,14 +126,14 @@ async def test_from_where_it_is_to_be_seen_it_is_seen(scene: Scene) -> None:
         assert scene.world.ray_test([eye], [scene.milk.pose.position], ignore=[scene.robot]) in ([None], [scene.milk])
 
 
-def test_looking_for_places_moves_nothing(scene: Scene) -> None:
+def test_resolving_a_location_moves_nothing(scene: Scene) -> None:
     before = scene.world.save_state()
     list(itertools.islice(CostmapLocation(scene.milk, reachable_for=scene.robot, visible_for=scene.robot), 5))
     list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk))
     assert scene.world.save_state() == before
 
 
-def test_no_place_to_reach_it_from_is_a_failure_and_is_recorded(scene: Scene) -> None:
+def test_a_location_without_a_reachable_candidate_is_a_failure_and_is_recorded(scene: Scene) -> None:
     scene.milk.set_pose(OUT_OF_REACH)
     with Recording().listening() as recording:
         with pytest.raises(ObjectUnreachable, match="pick up milk"):
@@ -148,7 +148,7 @@ def test_no_place_to_reach_it_from_is_a_failure_and_is_recorded(scene: Scene) ->
         assert all(re.fullmatch("LEFT: .+; RIGHT: .+", each.reason) for each in refused)
 
 
-def test_no_place_to_see_it_from_is_a_failure_and_is_recorded(scene: Scene) -> None:
+def test_a_location_without_a_candidate_that_sees_the_object_is_a_failure_and_is_recorded(scene: Scene) -> None:
     crate = box_urdf("crate", x=(-0.2, 0.2), y=(-0.2, 0.2), z=(-0.2, 0.2))
     Object("crate", ObjectType.GENERIC_OBJECT, crate, scene.milk.pose)
     with Recording().listening() as recording, pytest.raises(LookingHighLevelFailure):
@@ -156,7 +156,7 @@ def test_no_place_to_see_it_from_is_a_failure_and_is_recorded(scene: Scene) -> N
     assert recording.places == [("CostmapLocation", (), None, 0, None)]
 
 
-def test_a_target_that_is_gone_or_no_robot_is_said(scene: Scene) -> None:
+def test_a_removed_target_or_a_missing_robot_is_reported(scene: Scene) -> None:
     scene.world.remove(scene.milk)
     for asked in (
         SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk),
@@ -187,7 +187,7 @@ def test_a_target_that_is_gone_or_no_robot_is_said(scene: Scene) -> None:
         (DatabaseCostmapLocation, lambda s: (s.milk, None, [Arms.LEFT]), "reachable_arm: expected Arms | None"),
     ],
 )
-def test_what_no_place_can_be_looked_for_is_refused_by_name(
+def test_a_target_without_possible_locations_is_refused_by_name(
     scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], said: str
 ) -> None:
     with pytest.raises(ResolutionError, match=re.escape(said)):
@@ -195,7 +195,7 @@ def test_what_no_place_can_be_looked_for_is_refused_by_name(
 
 
 @pytest.mark.parametrize("role", ["reachable_for", "visible_for"])
-def test_a_place_in_another_frame_or_nowhere_is_refused(scene: Scene, role: str) -> None:
+def test_a_pose_in_another_frame_is_refused(scene: Scene, role: str) -> None:
     robot: Any = {role: scene.robot}
     with pytest.raises(CallerError, match="the target is in frame 'base_link', the robot in 'map'"):
         CostmapLocation(Pose([0.7, 0, 0.9], frame="base_link"), **robot).resolve()
@@ -203,21 +203,21 @@ def test_a_place_in_another_frame_or_nowhere_is_refused(scene: Scene, role: str)
         CostmapLocation(Pose([math.nan, 0, 0.9]), **robot).resolve()
 
 
-# --- what a recorder hears -----------------------------------------------------------------------------------------
+# --- notifications of a recorder --------------------------------------------------------------------------------------
 
 
-def test_resolving_is_told_with_what_was_taken(scene: Scene) -> None:
+def test_a_resolution_is_recorded_with_the_chosen_candidate(scene: Scene) -> None:
     with Recording().listening() as recording:
         stand = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.RIGHT).resolve()
     offered = (Candidate(stand.pose, (Arms.RIGHT,)),)
-    ((name, told, taken, considered, node),) = recording.places
-    assert (name, told, taken, node) == ("CostmapLocation", offered, 0, None)
+    ((name, notes, taken, considered, node),) = recording.places
+    assert (name, notes, taken, node) == ("CostmapLocation", offered, 0, None)
     first = next(iter(CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.RIGHT)))
     assert first == stand
     assert 1 <= considered <= 600
 
 
-def test_a_loop_over_places_is_told_when_it_is_left_with_the_last_one_as_taken(scene: Scene) -> None:
+def test_a_loop_over_candidates_is_recorded_at_its_end_with_the_last_one_as_chosen(scene: Scene) -> None:
     location = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk)
     with Recording().listening() as recording:
         for place in location:
@@ -229,7 +229,7 @@ def test_a_loop_over_places_is_told_when_it_is_left_with_the_last_one_as_taken(s
         assert all(each.pose.position.x >= -1.5 for each in offered[:-1])
 
 
-def test_a_loop_that_ends_took_none(scene: Scene) -> None:
+def test_a_loop_that_runs_to_its_end_chose_none(scene: Scene) -> None:
     with Recording().listening() as recording:
         places = list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk))
     reported = (*places[: CANDIDATES_MAX - 1], places[-1])
@@ -239,7 +239,7 @@ def test_a_loop_that_ends_took_none(scene: Scene) -> None:
     assert recording.offered_beyond == [len(places) - CANDIDATES_MAX]
 
 
-def test_of_thousands_of_offered_places_the_first_and_the_one_taken_are_reported(scene: Scene) -> None:
+def test_of_thousands_of_candidates_the_first_and_the_chosen_one_are_recorded(scene: Scene) -> None:
     with Recording().listening() as recording:
         places = list(itertools.islice(iter(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen)), 1_500))
     ((_, offered, taken, _, _),) = recording.places
@@ -248,13 +248,13 @@ def test_of_thousands_of_offered_places_the_first_and_the_one_taken_are_reported
     assert offered[-1].pose == places[-1].pose
 
 
-def test_a_search_that_was_never_asked_is_not_told(scene: Scene) -> None:
+def test_an_unused_location_is_not_recorded(scene: Scene) -> None:
     with Recording().listening() as recording:
         iter(CostmapLocation(scene.milk, reachable_for=scene.robot)).close()
     assert recording.places == []
 
 
-def test_a_search_that_is_dropped_is_told_to_the_recorder_it_began_with(scene: Scene) -> None:
+def test_an_abandoned_search_is_recorded_by_the_recorder_with_which_it_began(scene: Scene) -> None:
     with Recording().listening() as recording:
         places = iter(CostmapLocation(scene.milk, reachable_for=scene.robot))
         next(places)
@@ -265,7 +265,7 @@ def test_a_search_that_is_dropped_is_told_to_the_recorder_it_began_with(scene: S
     assert (len(offered), taken) == (2, 1)
 
 
-async def test_the_node_that_asks_is_told(scene: Scene) -> None:
+async def test_the_node_that_resolves_is_recorded(scene: Scene) -> None:
     class Asking(ActionAbstract):
         async def perform(self) -> Pose:
             return Location(Pose([1, 2, 0])).resolve().pose
@@ -280,7 +280,7 @@ async def test_the_node_that_asks_is_told(scene: Scene) -> None:
 # --- the other designators -----------------------------------------------------------------------------------------
 
 
-def test_a_location_is_itself_and_one_beside_an_object_moves_with_it(scene: Scene) -> None:
+def test_a_location_resolves_to_itself_and_one_beside_an_object_moves_with_it(scene: Scene) -> None:
     here = Location(Pose([1, 2, 0]), (Arms.LEFT,))
     assert (here.resolve(), list(here)) == (here, [here])
     beside = ObjectRelativeLocation(Pose([0, 0.5, 0]), designator_of(scene.milk))
@@ -289,7 +289,7 @@ def test_a_location_is_itself_and_one_beside_an_object_moves_with_it(scene: Scen
     assert beside.resolve().pose.position == pytest.approx((-0.5, 0, 1))
 
 
-def test_things_stand_on_the_surface_wholly_the_middle_first(scene: Scene) -> None:
+def test_placed_objects_are_wholly_on_the_surface_and_the_middle_comes_first(scene: Scene) -> None:
     places = list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk))
     surface = scene.kitchen.bounding_box("kitchen_island_surface")
     assert places[0].pose.position == pytest.approx((surface.centre.x, surface.centre.y, surface.max.z + 0.088))
@@ -305,14 +305,14 @@ def test_things_stand_on_the_surface_wholly_the_middle_first(scene: Scene) -> No
     assert list(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk)) == places
 
 
-def test_how_a_thing_is_held_now_does_not_matter_for_where_it_will_stand(scene: Scene) -> None:
+def test_the_current_grasp_does_not_affect_the_pose_on_the_surface(scene: Scene) -> None:
     upright = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.cereal).resolve()
     scene.cereal.set_pose(Pose([0.5, 0, 1.2], [0.5, 0.1, 0.2, 0.6]))
     scene.robot.attach(scene.cereal, LEFT_TOOL)
     assert SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.cereal).resolve() == upright
 
 
-def test_a_place_that_is_taken_is_not_offered(scene: Scene) -> None:
+def test_an_occupied_place_is_not_a_candidate(scene: Scene) -> None:
     location = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk)
     free = len(list(location))
     middle = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.cereal).resolve()
@@ -335,13 +335,13 @@ def test_a_place_that_is_taken_is_not_offered(scene: Scene) -> None:
         )
 
 
-def test_a_surface_without_room_is_a_failure(scene: Scene) -> None:
+def test_a_full_surface_is_a_failure(scene: Scene) -> None:
     Object("crate", ObjectType.GENERIC_OBJECT, box_urdf("crate", x=(-1, 1), y=(-1, 1), z=(0, 0.5)),
            Pose([-1.45, 1.0, 0.9]))  # fmt: skip
     with pytest.raises(ObjectUnavailable, match="no room for milk on kitchen_island_surface"):
         SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk).resolve()
 
 
-def test_without_a_thing_the_places_are_on_the_surface_itself(scene: Scene) -> None:
+def test_without_an_object_the_candidates_are_on_the_surface_itself(scene: Scene) -> None:
     place = SemanticCostmapLocation("kitchen_island_surface", scene.kitchen).resolve()
     assert place.pose.position == pytest.approx((-1.45, 1.0, 0.9))

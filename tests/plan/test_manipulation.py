@@ -1,4 +1,4 @@
-"""What one hand does to things: hold and let go, pick up what is turned, and what it cannot do."""
+"""The abilities of one hand: hold and release, pick up rotated objects, and its failures."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
 from tests.plan.test_actions import shape
-from tests.world.fakes import CRANE, Matrix, Witness, X, Y, Z, matrix, shifted, turned
+from tests.world.fakes import CRANE, ChangeLog, Matrix, X, Y, Z, matrix, shifted, turned
 
 LEFT_TOOL, RIGHT_TOOL = "l_gripper_tool_frame", "r_gripper_tool_frame"
 
@@ -55,15 +55,15 @@ def fingers(scene: Scene, prefix: str = "l") -> set[float]:
 
 
 async def reached(scene: Scene, x: float) -> None:
-    """The left tool frame at the milk's height and side, at that x; the milk's box is 3.3 cm to each side."""
+    """Move the left tool frame to this x at the milk's height and side; the milk's box is 3.3 cm to each side."""
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
     await MoveTCPMotion(Pose([x, 1, 0.9]), Arms.LEFT).perform()
 
 
-async def test_a_gripped_object_moves_with_the_hand_and_a_released_one_stays(scene: Scene) -> None:
+async def test_a_held_object_moves_with_the_hand_and_a_released_one_stays(scene: Scene) -> None:
     await reached(scene, 1.28)
     await SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
-    witness = Witness()
+    witness = ChangeLog()
     scene.world.observe(witness)
     with collected_tree() as tree:
         await GripActionPerformable(Arms.LEFT, designator_of(scene.milk), 20.0).perform()
@@ -71,7 +71,7 @@ async def test_a_gripped_object_moves_with_the_hand_and_a_released_one_stays(sce
     assert (scene.robot.attachments, fingers(scene)) == ({scene.milk: LEFT_TOOL}, {0.0})
     assert scene.milk.pose == Pose([1.3, 1, 0.9])
     await MoveTCPMotion(Pose([1.1, 1.1, 1.0], yaw_quaternion(math.pi / 6)), Arms.LEFT).perform()
-    # the milk is 2 cm before the hand, along the direction in which it points now
+    # The milk is 2 cm before the hand, along the direction in which it points now.
     there = (1.1 + 0.02 * math.cos(math.pi / 6), 1.1 + 0.02 * 0.5, 1.0)
     assert scene.milk.pose.position == pytest.approx(there, abs=1e-6)
     with collected_tree() as released:
@@ -84,7 +84,7 @@ async def test_a_gripped_object_moves_with_the_hand_and_a_released_one_stays(sce
 
 
 @pytest.mark.parametrize(("gap", "held"), [(0.0, True), (0.029, True), (0.031, False), (0.1, False)])
-async def test_only_what_is_within_three_centimetres_of_the_tool_frame_is_held(
+async def test_only_an_object_within_three_centimetres_of_the_tool_frame_is_held(
     scene: Scene, gap: float, held: bool
 ) -> None:
     await reached(scene, 1.3 - 0.033 - gap)
@@ -100,7 +100,7 @@ async def test_only_what_is_within_three_centimetres_of_the_tool_frame_is_held(
     assert scene.world.save_state() == before
 
 
-async def test_what_is_held_already_is_held_again_and_what_hangs_elsewhere_is_taken_over(scene: Scene) -> None:
+async def test_holding_again_changes_nothing_and_holding_detaches_an_object_from_another_parent(scene: Scene) -> None:
     tray = Object("tray", ObjectType.GENERIC_OBJECT, pose=Pose([1.3, 1, 0.75]))
     tray.attach(scene.milk)
     await reached(scene, 1.3)
@@ -109,7 +109,7 @@ async def test_what_is_held_already_is_held_again_and_what_hangs_elsewhere_is_ta
         assert (tray.attachments, scene.robot.attachments) == ({}, {scene.milk: LEFT_TOOL})
 
 
-async def test_a_full_hand_neither_holds_nor_grasps_another_thing(scene: Scene) -> None:
+async def test_a_full_hand_neither_holds_nor_grasps_another_object(scene: Scene) -> None:
     await reached(scene, 1.3)
     scene.robot.attach(scene.cereal, LEFT_TOOL)
     before = scene.world.save_state()
@@ -138,7 +138,7 @@ async def test_only_what_this_gripper_holds_can_be_released(scene: Scene) -> Non
     assert scene.robot.attachments == {}
 
 
-async def test_grasping_closes_the_hand_around_a_thing_and_attaches_nothing(scene: Scene) -> None:
+async def test_grasping_closes_the_hand_around_an_object_and_attaches_nothing(scene: Scene) -> None:
     scene.milk.set_pose(Pose([1.25, 1, 0.9], yaw_quaternion(0.4)))
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
     with collected_tree() as tree:
@@ -166,7 +166,7 @@ TILTED = turned(Z, 0.7) @ turned(X, 0.25) @ turned(Y, -0.2)
 
 @pytest.mark.parametrize("turn", [YAWED, TILTED], ids=["yawed", "tilted"])
 @pytest.mark.parametrize("grasp", list(Grasp), ids=lambda each: each.name)
-async def test_a_turned_object_is_picked_up_and_placed_in_its_own_axes(
+async def test_a_rotated_object_is_picked_up_and_placed_in_its_own_axes(
     scene: Scene, grasp: Grasp, turn: Matrix
 ) -> None:
     place = shifted(0.0, 3.0, 0.95) @ turn
@@ -182,15 +182,15 @@ async def test_a_turned_object_is_picked_up_and_placed_in_its_own_axes(
 
     with simulated_robot_within(Limits.HARD):
         await MoveTorsoActionPerformable(0.25).perform()
-        assert await done_from_somewhere(scene, picked_up_and_placed)
+        assert await done_from_some_pose(scene, picked_up_and_placed)
     np.testing.assert_allclose(matrix(scene.milk.pose), target, atol=1e-6)
     behind = target @ GRASP[grasp] @ shifted(-0.07, 0, 0)
     np.testing.assert_allclose(bullet_frame(scene.robot, LEFT_TOOL), behind, atol=1e-5)
     assert scene.robot.attachments == {}
 
 
-async def done_from_somewhere(scene: Scene, doing: Callable[[], Awaitable[None]]) -> bool:
-    """Whether it was done from a place around the milk; what an arm could not reach from elsewhere is undone."""
+async def done_from_some_pose(scene: Scene, doing: Callable[[], Awaitable[None]]) -> bool:
+    """Return whether it was done from a pose around the milk; what an arm could not reach from elsewhere is undone."""
     before, (x, y, _) = scene.world.save_state(), scene.milk.pose.position
     for away, side, aside in itertools.product((0.6, 0.5, 0.7), range(16), (0.0, 0.4, -0.4, -0.8)):
         angle = side * math.pi / 8
@@ -206,14 +206,14 @@ async def done_from_somewhere(scene: Scene, doing: Callable[[], Awaitable[None]]
 
 
 def pose_of(frame: Matrix) -> Pose:
-    """Of a matrix that turns by less than half a circle."""
+    """Return the pose of a matrix that rotates by less than half a circle."""
     turn = frame[:3, :3]
     w = math.sqrt(1 + np.trace(turn)) / 2
     x, y, z = (turn - turn.T)[(2, 0, 1), (1, 2, 0)] / (4 * w)
     return Pose(frame[:3, 3].tolist(), (x, y, z, w))
 
 
-# --- what cannot be done ------------------------------------------------------------------------------------------
+# --- failures ---------------------------------------------------------------------------------------------------------
 
 
 def one_handed(scene: Scene, arm: Arms) -> list[ActionAbstract | BaseMotion]:
@@ -229,7 +229,7 @@ def one_handed(scene: Scene, arm: Arms) -> list[ActionAbstract | BaseMotion]:
     ]
 
 
-async def test_both_arms_where_one_is_needed_is_a_failure_and_moves_nothing(scene: Scene) -> None:
+async def test_both_arms_for_an_action_of_one_are_a_failure_and_move_nothing(scene: Scene) -> None:
     before = scene.world.save_state()
     for action in one_handed(scene, Arms.BOTH):
         with pytest.raises(IllPosedGoalFailure, match="one arm, LEFT or RIGHT, and does not work with BOTH") as caught:
@@ -258,7 +258,7 @@ async def test_an_arm_that_the_robot_lacks_is_a_failure_and_moves_nothing(scene:
     assert (scene.robot.joint_position("l_shoulder_pan_joint"), fingers(scene)) == (1.712, {0.548})
 
 
-async def test_what_is_not_in_the_world_is_neither_held_nor_grasped_nor_brought(scene: Scene) -> None:
+async def test_an_object_outside_the_world_is_neither_held_nor_grasped_nor_transported(scene: Scene) -> None:
     scene.world.remove(scene.milk)
     believed = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.3, 1, 0.9]))
     before = scene.world.save_state()
@@ -274,7 +274,7 @@ async def test_what_is_not_in_the_world_is_neither_held_nor_grasped_nor_brought(
     assert scene.world.save_state() == before
 
 
-async def test_a_thing_of_several_links_is_held_only_where_it_is(scene: Scene) -> None:
+async def test_an_object_of_several_links_is_held_only_at_its_nearest_link(scene: Scene) -> None:
     """The crane's whole box reaches up to its flag, its lowest link is 0.2 m high."""
     crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([1.3, 1, 0.6]))
     await reached(scene, 1.2)
@@ -302,7 +302,7 @@ async def test_an_effort_below_zero_holds_nothing(scene: Scene) -> None:
     assert scene.robot.attachments == {}
 
 
-async def test_what_is_in_another_world_is_neither_taken_nor_opened(scene: Scene) -> None:
+async def test_an_object_of_another_world_is_neither_held_nor_opened(scene: Scene) -> None:
     handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
     before = scene.world.save_state()
     with BulletWorld():

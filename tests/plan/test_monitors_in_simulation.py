@@ -1,4 +1,4 @@
-"""A monitor's condition is asked about what really happens, also while the plan it watches only thinks."""
+"""A monitor checks its condition in the real world, even while the plan that it monitors only simulates."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ DONE = Outcome(results=(None,), succeeded=(0,), interrupted=False)
 
 @dataclass
 class ThinkOfDrivingActionPerformable(ActionAbstract):
-    """Thinks that it drives there and looks around, for a while."""
+    """Simulate driving there and looking around, for a while."""
 
     target: Pose
 
@@ -41,7 +41,7 @@ class ThinkOfDrivingActionPerformable(ActionAbstract):
 
 
 @pytest.mark.parametrize("asks_later", [True, False])
-async def test_what_is_only_thought_interrupts_nobody(scene: Scene, asks_later: bool) -> None:
+async def test_a_simulation_does_not_interrupt_a_plan(scene: Scene, asks_later: bool) -> None:
     def has_left() -> bool:
         world = current_world.get()
         assert world is not None
@@ -65,7 +65,7 @@ async def test_what_is_only_thought_interrupts_nobody(scene: Scene, asks_later: 
 
 
 @pytest.mark.parametrize("asks_later", [True, False])
-async def test_what_a_condition_performs_is_really_performed_while_the_plan_thinks(
+async def test_a_condition_performs_its_nodes_in_the_real_world_while_the_plan_simulates(
     scene: Scene, asks_later: bool
 ) -> None:
     thought: list[bool] = []
@@ -81,13 +81,13 @@ async def test_what_a_condition_performs_is_really_performed_while_the_plan_thin
     condition = looks if asks_later else functools.partial(looks)
     with collected_tree() as tree:
         await (ThinkOfDrivingActionPerformable(THERE) >> Monitor(condition, interval_s=60)).perform()
-    # Asked once by the clock, and before each node: the thinking itself, the drive, its motion, and the look.
+    # Checked once by the clock, and before each node: the simulating one, the drive, its motion, and the look.
     assert thought == [False] * 5
     below = [type(node.designator).__name__ for node in tree.children(tree.roots[0])]
     assert sorted(below) == ["Looking"] * 5 + ["ThinkOfDrivingActionPerformable"]
 
 
-async def test_a_condition_that_swallows_its_cancellation_does_not_outlive_the_plan() -> None:
+async def test_a_condition_that_ignores_its_cancellation_does_not_outlive_the_plan() -> None:
     begun, asked = asyncio.Event(), asyncio.Event()
 
     class Waiting(ActionAbstract):
@@ -107,7 +107,7 @@ async def test_a_condition_that_swallows_its_cancellation_does_not_outlive_the_p
 
 
 @pytest.mark.parametrize("asks_later", [True, False])
-async def test_a_condition_that_is_cancelled_interrupts_as_whatever_it_raises(asks_later: bool) -> None:
+async def test_a_cancelled_condition_interrupts_like_one_that_raises(asks_later: bool) -> None:
     asked = 0
 
     def broken() -> bool:
@@ -130,6 +130,6 @@ async def test_a_condition_that_is_cancelled_interrupts_as_whatever_it_raises(as
             await plan.perform()
 
 
-def test_the_wait_of_an_event_is_refused_and_the_event_asked_for() -> None:
+def test_a_condition_that_awaits_an_event_is_refused_with_the_event_suggested() -> None:
     with pytest.raises(NotALanguageExpression, match="pass the Event itself, not its wait"):
         Monitor(asyncio.Event().wait)

@@ -1,4 +1,4 @@
-"""What each motion does to the simulated robot, and how it fails: wholly or not at all."""
+"""The effect of each motion on the simulated robot, and its failures: complete or without effect."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LEFT_TOOL = "l_gripper_tool_frame"
 
 
 class Watching:
-    """A world observer that writes down what moved."""
+    """A world observer that notes the moved objects."""
 
     def __init__(self) -> None:
         self.seen: list[str] = []
@@ -59,14 +59,14 @@ def watching(scene: Scene) -> Watching:
     return observer
 
 
-async def test_the_base_is_where_it_was_sent(scene: Scene, watching: Watching) -> None:
+async def test_the_base_is_at_its_target(scene: Scene, watching: Watching) -> None:
     goal = Pose([0.6, 0.4, 0], yaw_quaternion(1.0))
     await MoveMotion(goal).perform()
     assert scene.robot.pose == goal
     assert watching.seen == ["moved pr2"]
 
 
-async def test_the_tool_frame_is_where_it_was_sent(scene: Scene, watching: Watching) -> None:
+async def test_the_tool_frame_is_at_its_target(scene: Scene, watching: Watching) -> None:
     goal = Pose([0.7, 0.3, 0.9], yaw_quaternion(0.3))
     await MoveTCPMotion(goal, Arms.LEFT).perform()
     reached = scene.robot.link_pose(LEFT_TOOL)
@@ -171,7 +171,7 @@ async def test_looking_twice_changes_nothing(scene: Scene) -> None:
     assert scene.robot.joint_positions() == pytest.approx(once, abs=1e-9)
 
 
-async def test_the_neck_turns_as_far_as_it_can_to_what_is_behind(scene: Scene, watching: Watching) -> None:
+async def test_the_neck_turns_as_far_as_it_can_to_a_point_behind(scene: Scene, watching: Watching) -> None:
     await LookingMotion(Pose([-1, -0.01, 5])).perform()
     pan, tilt = scene.robot.joint_limits("head_pan_joint"), scene.robot.joint_limits("head_tilt_joint")
     assert scene.robot.joint_position("head_pan_joint") == pan[0]
@@ -183,7 +183,7 @@ async def test_the_neck_turns_as_far_as_it_can_to_what_is_behind(scene: Scene, w
     ("target", "said"),
     [(Pose([1, 0, 0], frame="base_link"), "in frame 'base_link'"), (Pose([math.nan, 0, 0]), "not finite")],
 )
-async def test_the_head_turns_to_nothing_that_is_not_in_the_map(
+async def test_the_head_does_not_turn_to_a_point_outside_the_map(
     scene: Scene, watching: Watching, target: Pose, said: str
 ) -> None:
     with pytest.raises(CallerError, match=said):
@@ -191,7 +191,7 @@ async def test_the_head_turns_to_nothing_that_is_not_in_the_map(
     assert watching.seen == []
 
 
-def test_a_motion_needs_what_it_is_made_of() -> None:
+def test_a_motion_requires_its_properties() -> None:
     with pytest.raises(ResolutionError, match=r"target: expected Pose, got list \[1, 2, 3\]"):
         MoveMotion([1, 2, 3])  # type: ignore[arg-type]  # the fault this test is about
     with pytest.raises(ResolutionError, match="arm: expected Arms, got str 'left'"):

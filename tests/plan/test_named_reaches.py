@@ -71,7 +71,7 @@ async def test_a_motion_for_no_object_names_none(scene: Scene) -> None:
     assert len(failed.value.args) == 4
 
 
-async def test_a_failure_of_ones_own_robot_names_the_object_too(scene: Scene) -> None:
+async def test_a_failure_of_a_users_robot_names_the_object_too(scene: Scene) -> None:
     class Stopping(SimulatedModules):
         async def move_tcp(self, motion: MoveTCPMotion) -> None:
             raise ManipulationGoalNotReached("the arm stopped 0.3 m before its goal", 0.3)
@@ -82,7 +82,7 @@ async def test_a_failure_of_ones_own_robot_names_the_object_too(scene: Scene) ->
     assert failed.value.data == (0.3, "milk")
 
 
-async def test_a_reach_in_collision_names_what_it_reached_for(scene: Scene) -> None:
+async def test_a_reach_in_collision_names_its_object(scene: Scene) -> None:
     await NavigateActionPerformable(Pose([0.63, 1.0, 0])).perform()
     with simulated_robot_within(Limits.SOFT, collisions=True), pytest.raises(ManipulationGoalInCollision) as failed:
         await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
@@ -102,7 +102,7 @@ async def test_a_gripper_refuses_what_is_wider_than_its_opening_where_collisions
     if width is not None:
         assert failed.value.message == "cereal is 0.148 m wide between the fingers, the LEFT gripper opens 0.086 m"
         assert failed.value.data == ("cereal", pytest.approx(width), 0.086)
-    with pytest.raises(IKError):  # elsewhere only kinematics counts
+    with pytest.raises(IKError):  # without collisions only kinematics counts
         await pick_up.perform()
 
 

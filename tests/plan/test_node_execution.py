@@ -1,4 +1,4 @@
-"""What is told of a perform, in which order, and how it ends in every case."""
+"""The notifications of a perform, their order, and its outcomes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 
 class Abort(BaseException):
-    """Not an Exception."""
+    """A base exception that is no Exception."""
 
 
 @dataclass
@@ -39,7 +39,7 @@ class Raising(ActionAbstract):
 
 @dataclass
 class Inside(ActionAbstract):
-    """Performs one action after another."""
+    """Perform one action after another."""
 
     parts: list[ActionAbstract]
 
@@ -79,7 +79,7 @@ OUTCOMES = [
 
 @pytest.mark.parametrize("recorded", [True, False])
 @pytest.mark.parametrize(("raised", "status"), OUTCOMES, ids=lambda each: getattr(each, "name", type(each).__name__))
-async def test_every_outcome_has_its_status_and_passes_through(
+async def test_every_outcome_has_its_status_and_is_passed_on(
     raised: BaseException | None, status: TaskStatus, recorded: bool
 ) -> None:
     with maybe(Recording() if recorded else None), collected_tree() as tree:
@@ -96,7 +96,7 @@ async def test_every_outcome_has_its_status_and_passes_through(
 
 
 @pytest.mark.parametrize("raised", [KeyboardInterrupt, SystemExit])
-def test_what_ends_the_process_is_an_error_of_its_nodes_and_ends_it(raised: type[BaseException]) -> None:
+def test_an_exception_that_ends_the_process_is_an_error_of_its_nodes(raised: type[BaseException]) -> None:
     recording = Recording()
 
     async def plan() -> None:
@@ -105,15 +105,15 @@ def test_what_ends_the_process_is_an_error_of_its_nodes_and_ends_it(raised: type
 
     with pytest.raises(raised):
         asyncio.run(plan())
-    assert recording.told == ["start Inside", "start Raising", "end Raising ERROR", "end Inside ERROR"]
+    assert recording.notes == ["start Inside", "start Raising", "end Raising ERROR", "end Inside ERROR"]
 
 
-async def test_a_recorder_is_told_each_start_and_end_once_in_legal_order() -> None:
+async def test_a_recorder_is_notified_of_each_start_and_end_once_in_legal_order() -> None:
     with Recording().listening() as recording:
         await Inside([Empty(), Inside([Empty()])]).perform()
         with pytest.raises(PlanFailure):
             await Inside([Raising(PlanFailure()), Empty()]).perform()
-    assert recording.told == [
+    assert recording.notes == [
         "start Inside",
         "start Empty",
         "end Empty SUCCEEDED",
@@ -141,11 +141,11 @@ async def test_a_recorder_that_refuses_a_start_keeps_perform_from_running() -> N
         with pytest.raises(ZeroDivisionError):
             await Inside([Raising(AssertionError("perform ran"))]).perform()
         assert current_node.get() is None
-    assert recording.told == ["start Inside", "end Inside ERROR"]
+    assert recording.notes == ["start Inside", "end Inside ERROR"]
     assert len(tree) == 1
 
 
-async def test_a_node_starts_only_when_the_recorder_has_room() -> None:
+async def test_a_node_starts_only_when_the_recorder_has_space() -> None:
     class Full(Recording):
         def __init__(self) -> None:
             super().__init__()
@@ -155,21 +155,21 @@ async def test_a_node_starts_only_when_the_recorder_has_room() -> None:
             return None if self.room.is_set() else self._room()
 
         async def _room(self) -> None:
-            self.told.append("waits")
+            self.notes.append("waits")
             await self.room.wait()
 
     with Full().listening() as recording:
         assert isinstance(recording, Full)
         plan = asyncio.create_task(Empty().perform())
-        await recording.heard(1)
-        assert recording.told == ["waits"]
+        await recording.wait_for_notes(1)
+        assert recording.notes == ["waits"]
         recording.room.set()
         await plan
         await Empty().perform()
-    assert recording.told[1:] == ["start Empty", "end Empty SUCCEEDED"] * 2
+    assert recording.notes[1:] == ["start Empty", "end Empty SUCCEEDED"] * 2
 
 
-async def test_the_recorder_of_the_start_is_told_of_the_end() -> None:
+async def test_the_recorder_of_the_start_is_notified_of_the_end() -> None:
     first, second = Recording(), Recording()
 
     class Switching(ActionAbstract):
@@ -178,17 +178,17 @@ async def test_the_recorder_of_the_start_is_told_of_the_end() -> None:
 
     with first.listening():
         await Switching().perform()
-    assert (first.told, second.told) == (["start Switching", "end Switching SUCCEEDED"], [])
+    assert (first.notes, second.notes) == (["start Switching", "end Switching SUCCEEDED"], [])
 
 
-async def test_a_plan_is_cancelled_in_the_middle_and_every_open_node_says_so() -> None:
+async def test_a_plan_that_is_cancelled_in_the_middle_ends_every_open_node_as_cancelled() -> None:
     with Recording().listening() as recording:
         plan = asyncio.create_task(Inside([Empty(), Waiting(asyncio.Event()), Empty()]).perform())
-        await recording.heard(4)
+        await recording.wait_for_notes(4)
         plan.cancel()
         with pytest.raises(asyncio.CancelledError):
             await plan
-    assert recording.told[3:] == ["start Waiting", "end Waiting CANCELLED", "end Inside CANCELLED"]
+    assert recording.notes[3:] == ["start Waiting", "end Waiting CANCELLED", "end Inside CANCELLED"]
 
 
 async def test_a_plan_that_never_suspends_can_be_cancelled() -> None:
@@ -209,7 +209,7 @@ async def test_a_plan_that_never_suspends_can_be_cancelled() -> None:
     assert {node.status for node in done} == {TaskStatus.SUCCEEDED}
 
 
-def test_a_plan_that_never_suspends_hears_ctrl_c() -> None:
+def test_a_plan_that_never_suspends_is_interrupted_by_ctrl_c() -> None:
     recording = Recording()
 
     class Endless(ActionAbstract):
@@ -224,7 +224,7 @@ def test_a_plan_that_never_suspends_hears_ctrl_c() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         asyncio.run(plan())
-    assert recording.told[-1] == "end Endless CANCELLED"
+    assert recording.notes[-1] == "end Endless CANCELLED"
 
 
 async def test_plans_in_different_tasks_never_share_a_parent() -> None:
@@ -250,7 +250,7 @@ async def test_plans_in_different_tasks_never_share_a_parent() -> None:
         await asyncio.gather(*(Plan(owner).perform() for owner in "abc"))
     steps = [node for node in recording.ended if isinstance(node.designator, Step)]
     assert len(steps) == 60
-    assert recording.told[:5] == ["start Plan", "start Plan", "start Plan", "start Step", "start Step"]
+    assert recording.notes[:5] == ["start Plan", "start Plan", "start Plan", "start Step", "start Step"]
     for step in steps:
         assert isinstance(step.designator, Step)
         assert step.parent is not None
@@ -275,7 +275,7 @@ async def test_a_task_started_inside_an_action_belongs_to_it() -> None:
     ]
 
 
-async def test_a_plan_whose_parts_failed_at_the_same_time_failed() -> None:
+async def test_a_plan_with_concurrent_failures_failed() -> None:
     failures = [ObjectUnreachable("milk"), PlanFailure("cereal")]
 
     class AtOnce(ActionAbstract):
@@ -296,12 +296,12 @@ async def test_a_plan_whose_parts_failed_at_the_same_time_failed() -> None:
     assert [node.status for node in list(tree)[3:]] == [TaskStatus.CANCELLED]
 
 
-async def test_a_suspended_plan_that_is_dropped_leaves_the_current_node_of_others_alone() -> None:
+async def test_an_abandoned_suspended_plan_does_not_change_the_current_node_of_others() -> None:
     with Recording().listening() as recording:
 
         async def suspended() -> CoroutineType[Any, Any, Any]:
             coroutine = Inside([Waiting(asyncio.Event())]).perform()
-            while len(recording.told) < 2:
+            while len(recording.notes) < 2:
                 coroutine.send(None)
             assert isinstance(coroutine, CoroutineType)
             return coroutine
@@ -311,7 +311,7 @@ async def test_a_suspended_plan_that_is_dropped_leaves_the_current_node_of_other
         current_node.set(here)
         dropped.close()
         assert current_node.get() is here
-    assert recording.told[2:] == ["end Waiting ERROR", "end Inside ERROR"]
+    assert recording.notes[2:] == ["end Waiting ERROR", "end Inside ERROR"]
 
 
 async def test_a_failed_perform_leaves_nothing_for_the_garbage_collector() -> None:

@@ -1,4 +1,4 @@
-"""A description that stands where the described is meant says that `.resolve()` is missing, in one line."""
+"""A description in place of a resolved designator: one line says that `.resolve()` is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How plans name objects: found in the world, live, frozen, parts, believed."""
+"""The names of objects in plans: searched in the world, live, frozen, parts, believed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def names(description: ObjectDesignatorDescription) -> list[str]:
     return [each.name for each in description]
 
 
-def test_a_description_finds_by_name_by_type_and_by_both(scene: Scene) -> None:
+def test_a_description_matches_by_name_by_type_and_by_both(scene: Scene) -> None:
     both = [ObjectType.MILK, ObjectType.BREAKFAST_CEREAL]
     assert names(ObjectDesignatorDescription()) == ["pr2", "kitchen", "milk", "cereal"]
     assert names(ObjectDesignatorDescription(names=["cereal", "spoon", "milk", "cereal"])) == ["cereal", "milk"]
@@ -43,7 +43,7 @@ def test_a_description_finds_by_name_by_type_and_by_both(scene: Scene) -> None:
     assert (found.name, found.object_type, found.world_object) == ("milk", ObjectType.MILK, scene.milk)
 
 
-def test_a_description_that_nothing_fits_says_what_there_is(scene: Scene) -> None:
+def test_a_description_without_a_match_lists_the_objects_of_the_world(scene: Scene) -> None:
     with pytest.raises(ObjectNotFound) as caught:
         ObjectDesignatorDescription(names=["bowl", "cup"], types=[ObjectType.BOWL]).resolve()
     assert str(caught.value) == (
@@ -84,18 +84,18 @@ def test_a_part_has_the_pose_of_its_link(scene: Scene) -> None:
     assert ObjectPart("a", scene.kitchen) != ObjectPart("a", scene.milk)
 
 
-def test_a_believed_object_is_where_it_is_believed_to_be() -> None:
+def test_a_believed_object_is_at_its_believed_pose() -> None:
     cup = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1, 2, 3]))
     assert (cup.pose, cup.world_object, cup.frozen_copy()) == (Pose([1, 2, 3]), None, cup)
     assert cup != ObjectDesignator("cup", ObjectType.JEROEN_CUP, None, Pose([1, 2, 3]))
 
 
-def test_a_designator_needs_something_to_stand_for() -> None:
+def test_a_designator_needs_an_object_or_a_belief() -> None:
     with pytest.raises(ResolutionError, match="world_object or frozen_pose"):
         ObjectDesignator("cup", ObjectType.JEROEN_CUP)
 
 
-def test_what_is_meant_is_found_in_the_world_or_is_a_failure(scene: Scene) -> None:
+def test_a_designator_resolves_to_the_world_object_or_is_a_failure(scene: Scene) -> None:
     milk = designator_of(scene.milk)
     assert (designator_of(milk), in_world(milk), in_world(scene.milk)) == (milk, scene.milk, scene.milk)
     scene.world.remove(scene.milk)
@@ -107,7 +107,7 @@ def test_what_is_meant_is_found_in_the_world_or_is_a_failure(scene: Scene) -> No
 NOON = datetime(2024, 7, 30, 14, 0, 0, 123456, timezone(timedelta(hours=2)))
 
 
-def test_a_located_object_is_where_its_reference_says_and_goes_along_with_it(scene: Scene) -> None:
+def test_a_located_object_is_at_its_pose_relative_to_the_reference_and_moves_with_it(scene: Scene) -> None:
     cup = LocatedObject("cup", ObjectType.JEROEN_CUP, Pose([0, 0.2, 0.1]), scene.milk, NOON)
     assert (cup.name, cup.object_type, cup.timestamp) == ("cup", ObjectType.JEROEN_CUP, NOON)
     assert (cup.reference, cup.relative_pose) == (designator_of(scene.milk), Pose([0, 0.2, 0.1]))
@@ -127,7 +127,7 @@ def test_a_located_object_is_where_its_reference_says_and_goes_along_with_it(sce
     )
 
 
-def test_a_place_may_be_told_relative_to_a_part_or_to_another_place_that_was_told(scene: Scene) -> None:
+def test_a_location_may_be_relative_to_a_part_or_to_another_location(scene: Scene) -> None:
     island = ObjectPart("kitchen_island_surface", scene.kitchen)
     plate = LocatedObject("plate", ObjectType.GENERIC_OBJECT, Pose([0.1, 0, 0]), island)
     spoon = LocatedObject("spoon", ObjectType.SPOON, Pose([0, -0.3, 0]), plate)
@@ -135,7 +135,7 @@ def test_a_place_may_be_told_relative_to_a_part_or_to_another_place_that_was_tol
     assert spoon.pose.position == pytest.approx((-1.35, 0.7, 0.9))
 
 
-def test_the_moment_of_a_place_is_now_or_has_a_time_zone(scene: Scene) -> None:
+def test_the_time_of_a_location_is_now_or_has_a_time_zone(scene: Scene) -> None:
     before = datetime.now(UTC)
     cup = LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk)
     assert before - timedelta(microseconds=1) <= cup.timestamp <= datetime.now(UTC)
@@ -143,7 +143,7 @@ def test_the_moment_of_a_place_is_now_or_has_a_time_zone(scene: Scene) -> None:
         LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk, datetime(2024, 7, 30))  # noqa: DTZ001
 
 
-def test_an_object_that_was_only_told_of_is_not_in_the_world(scene: Scene) -> None:
+def test_an_object_that_is_only_located_is_not_in_the_world(scene: Scene) -> None:
     cup = LocatedObject("cup", ObjectType.JEROEN_CUP, Pose(), scene.milk)
     with pytest.raises(PerceptionObjectNotInWorld, match="cup is not an object of the world"):
         in_world(cup)
@@ -158,7 +158,7 @@ def test_objects_are_located_relative_to_each_of_the_others(scene: Scene) -> Non
         ("milk", "kitchen"),
         ("cereal", "kitchen"),
     ]
-    # the milk is 0.3 m along map's y from the cereal, which looks along y: straight ahead of it
+    # The milk is 0.3 m along map's y from the cereal, whose x points along y: straight ahead of it.
     assert found[0].relative_pose.position == pytest.approx((0.3, 0, -0.05))
     for each in found:
         assert each.pose.position == pytest.approx(in_world(each).pose.position)
@@ -169,7 +169,7 @@ def test_objects_are_located_relative_to_each_of_the_others(scene: Scene) -> Non
         LocatedObjectDescription([scene.milk], names=["milk"]).resolve()
 
 
-def test_one_name_or_type_needs_no_list_and_a_name_is_not_taken_apart(scene: Scene) -> None:
+def test_one_name_or_type_needs_no_list_and_a_name_is_not_split(scene: Scene) -> None:
     assert names(ObjectDesignatorDescription(names="milk")) == ["milk"]
     assert names(ObjectDesignatorDescription(types=ObjectType.MILK)) == ["milk"]
     assert names(LocatedObjectDescription([scene.kitchen], names="milk", types=ObjectType.MILK)) == ["milk"]
@@ -193,7 +193,7 @@ def test_one_name_or_type_needs_no_list_and_a_name_is_not_taken_apart(scene: Sce
         ),
     ],
 )
-def test_what_is_no_object_name_type_or_place_is_refused_by_name(
+def test_an_invalid_object_name_type_or_location_is_refused_by_name(
     scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], said: str
 ) -> None:
     with pytest.raises(ResolutionError, match=re.escape(said)):

@@ -1,4 +1,4 @@
-"""Where to stand to open and close: every place that is offered really does, and what cannot be is said."""
+"""Base poses for opening and closing: every candidate works, and an impossible request gives its reason."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ DRAWERS = [
     "kitchen_island_lower_drawer",
 ]
 TRAVEL = dict.fromkeys(DRAWERS, 0.35) | {"fridge_door": 1.9}
-"""How far each of them goes, as the kitchen's own description says: m, rad."""
+"""The range of each joint by the kitchen's own description, in m or rad."""
 ABOUT = pytest.mark.parametrize("about", [4, pytest.param(12, marks=pytest.mark.soak)])
-"""About so many of the places are tried, from all over the order."""
+"""This many of the candidates are tried, spread over the whole order."""
 
 
-def some(places: list[Location], about: int) -> list[Location]:
+def spread_candidates(places: list[Location], about: int) -> list[Location]:
     return places[:: max(1, len(places) // about)]
 
 
@@ -54,7 +54,7 @@ def some(places: list[Location], about: int) -> list[Location]:
 @pytest.mark.parametrize(
     ("name", "torso"), [*((name, 0.3 if "lower" in name else 0.0) for name in TRAVEL), ("fridge_door", 0.3)]
 )
-async def test_from_every_place_that_is_offered_it_can_be_opened_and_closed(
+async def test_from_every_candidate_the_furniture_can_be_opened_and_closed(
     scene: Scene, name: str, torso: float, about: int
 ) -> None:
     await MoveTorsoActionPerformable(torso).perform()
@@ -62,7 +62,7 @@ async def test_from_every_place_that_is_offered_it_can_be_opened_and_closed(
     before = scene.world.save_state()
     places = list(AccessingLocation(handle, scene.robot))
     assert len(places) >= 90
-    for place in some(places, about):
+    for place in spread_candidates(places, about):
         for arm in place.reachable_arms:
             await NavigateActionPerformable(place.pose).perform()
             await OpenActionPerformable(handle, arm).perform()
@@ -77,13 +77,13 @@ async def test_from_every_place_that_is_offered_it_can_be_opened_and_closed(
 
 @ABOUT
 @pytest.mark.parametrize(("name", "now"), [("sink_area_drawer", 0.13), ("fridge_door", 0.77)])
-async def test_what_stands_half_open_can_be_opened_or_closed_from_every_place_that_is_offered(
+async def test_half_open_furniture_can_be_opened_or_closed_from_every_candidate(
     scene: Scene, name: str, now: float, about: int
 ) -> None:
     handle, joint = ObjectPart(f"{name}_handle", scene.kitchen), f"{name}_joint"
     scene.kitchen.set_joint_position(joint, now)
     before = scene.world.save_state()
-    for place in some(list(AccessingLocation(handle, scene.robot)), about):
+    for place in spread_candidates(list(AccessingLocation(handle, scene.robot)), about):
         arm = place.reachable_arms[0]
         for action, there in ((OpenActionPerformable, TRAVEL[name] - 0.05), (CloseActionPerformable, 0.0)):
             await NavigateActionPerformable(place.pose).perform()
@@ -92,7 +92,7 @@ async def test_what_stands_half_open_can_be_opened_or_closed_from_every_place_th
             scene.world.restore_state(before)
 
 
-def test_places_are_on_the_floor_clear_of_furniture_and_those_that_the_drawer_sweeps_come_last(scene: Scene) -> None:
+def test_candidates_are_clear_of_furniture_and_those_in_the_path_of_the_drawer_come_last(scene: Scene) -> None:
     def gap(pose: Pose, low: tuple[float, float], high: tuple[float, float]) -> float:
         x, y, _ = pose.position
         return max(low[0] - x, x - high[0], low[1] - y, y - high[1])
@@ -115,12 +115,12 @@ def test_places_are_on_the_floor_clear_of_furniture_and_those_that_the_drawer_sw
 
 
 def _aside(pose: Pose, goal: tuple[float, float]) -> float:
-    """How far, rad, the pose looks past the point."""
+    """Return the angle, in rad, between the pose's direction and the point."""
     towards = math.atan2(goal[1] - pose.position.y, goal[0] - pose.position.x)
     return math.remainder(pose.yaw - towards, math.tau)
 
 
-def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
+def test_the_requested_arms_reach(scene: Scene) -> None:
     handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
 
     def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
@@ -131,7 +131,7 @@ def test_the_arms_that_are_wanted_reach(scene: Scene) -> None:
     assert reaching(None) == {(Arms.LEFT,), (Arms.RIGHT,), (Arms.LEFT, Arms.RIGHT)}
 
 
-def test_looking_for_a_place_moves_nothing_and_is_told_once(scene: Scene) -> None:
+def test_resolving_moves_nothing_and_is_recorded_once(scene: Scene) -> None:
     handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
     before = scene.world.save_state()
     with Recording().listening() as recording:
@@ -143,7 +143,7 @@ def test_looking_for_a_place_moves_nothing_and_is_told_once(scene: Scene) -> Non
     assert considered >= 2
 
 
-def test_a_handle_that_cannot_be_reached_from_anywhere_is_a_failure_and_is_recorded(scene: Scene) -> None:
+def test_an_unreachable_handle_is_a_failure_and_is_recorded(scene: Scene) -> None:
     scene.kitchen.set_pose(Pose([0, 0, 1.5]))
     with Recording().listening() as recording, pytest.raises(EnvironmentUnreachable, match="no place") as caught:
         AccessingLocation(ObjectPart("sink_area_drawer_handle", scene.kitchen), scene.robot).resolve()
@@ -154,7 +154,7 @@ def test_a_handle_that_cannot_be_reached_from_anywhere_is_a_failure_and_is_recor
     assert all(re.fullmatch("LEFT: .+; RIGHT: .+", each.reason) for each in recording.refused[0])
 
 
-def test_what_cannot_be_opened_is_said(scene: Scene) -> None:
+def test_an_object_that_cannot_be_opened_is_refused_with_the_reason(scene: Scene) -> None:
     def asked(part: ObjectPart) -> None:
         AccessingLocation(part, scene.robot).resolve()
 

@@ -1,4 +1,4 @@
-"""What the camera sees, what it does not and why, and what the recorder is told of it."""
+"""Detections of the camera, failed searches with their reasons, and the recorded results."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Told = tuple[str, ObjectType | None, tuple[Seen, ...], TaskTreeNode | None]
 
 
 class Listening(Recording):
-    """Keeps what perception said."""
+    """An observer that keeps the notifications of perception."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -67,12 +67,12 @@ def listening() -> Iterator[Listening]:
 
 
 async def facing(scene: Scene, thing: Object) -> None:
-    """The robot stands 1 m before the counter and looks at the thing."""
+    """The robot stands 1 m before the counter and looks at the object."""
     await MoveMotion(Pose([0.2, thing.pose.position.y, 0])).perform()
     await LookAtActionPerformable(thing.pose).perform()
 
 
-async def test_what_is_looked_at_is_seen(scene: Scene, listening: Listening) -> None:
+async def test_an_object_in_view_is_seen(scene: Scene, listening: Listening) -> None:
     await facing(scene, scene.milk)
     with collected_tree() as tree:
         found = await DetectActionPerformable(scene.milk).perform()
@@ -84,7 +84,7 @@ async def test_what_is_looked_at_is_seen(scene: Scene, listening: Listening) -> 
     assert motion.result == found
 
 
-async def test_what_is_believed_somewhere_is_found_where_it_is(scene: Scene) -> None:
+async def test_a_believed_object_is_searched_at_its_believed_pose(scene: Scene) -> None:
     await facing(scene, scene.milk)
     believed = BelieveObject("some milk", ObjectType.MILK, Pose([1.3, 0.8, 0.9]))
     found = await DetectAction(believed).resolve().perform()
@@ -94,7 +94,7 @@ async def test_what_is_believed_somewhere_is_found_where_it_is(scene: Scene) -> 
 
 
 def angles(scene: Scene, point: Sequence[float]) -> tuple[float, float]:
-    """How far the point is to the right of the camera's axis and below it, rad, by Bullet's frame of the camera."""
+    """Return the angles of the point to the right of the camera's axis and below it, in rad, by Bullet's frame."""
     camera = bullet_frame(scene.robot, "wide_stereo_optical_frame")
     x, y, z, _ = np.linalg.inv(camera) @ [*point, 1.0]
     return math.atan2(x, z), math.atan2(y, z)
@@ -139,19 +139,19 @@ async def test_nothing_is_seen_behind_the_camera(scene: Scene) -> None:
 
 
 class Board(NamedTuple):
-    """It stands 10 cm before the milk, up to `height` m above its bottom, and reaches from the left to `right`."""
+    """A board 10 cm before the milk, up to `height` m above its bottom, which reaches from the left to `right`."""
 
     height: float
     right: float
     share: float
-    """Of the milk that it hides."""
+    """The share of the milk that the board hides."""
 
 
 @pytest.mark.parametrize("board", [Board(0.05, 0.0, 0.13), Board(0.06, -0.2, 0.3), Board(0.3, -0.2, 1.0)])
-async def test_what_is_hidden_by_more_than_a_fifth_is_not_seen(
+async def test_an_object_that_is_hidden_by_more_than_a_fifth_is_not_seen(
     scene: Scene, listening: Listening, board: Board
 ) -> None:
-    """The eye is as high as the milk's middle and 1 m away: the board hides about the share that it covers."""
+    """The camera is as high as the milk's middle and 1 m away: the board hides about the share that it covers."""
     scene.world.remove(scene.kitchen)
     scene.world.remove(scene.cereal)
     eye = bullet_frame(scene.robot, "wide_stereo_optical_frame")[:3, 3].tolist()
@@ -177,9 +177,9 @@ async def test_what_is_hidden_by_more_than_a_fifth_is_not_seen(
     assert next(iter(tree)).status is TaskStatus.FAILED
 
 
-async def test_the_best_seen_comes_first_and_the_recorder_is_told_of_all(scene: Scene, listening: Listening) -> None:
+async def test_the_most_visible_object_comes_first_and_all_are_recorded(scene: Scene, listening: Listening) -> None:
     await facing(scene, scene.milk)
-    # a second milk close behind the first one's edge, a third elsewhere
+    # A second milk close behind the first one's edge, a third elsewhere.
     half = Object("half hidden", ObjectType.MILK, pose=Pose([1.5, 1.03, 0.9]))
     away = Object("away", ObjectType.MILK, pose=Pose([-1.4, 1, 1.0]))
     clear = Object("clear", ObjectType.MILK, pose=Pose([1.5, 1.25, 0.9]))
@@ -192,7 +192,7 @@ async def test_the_best_seen_comes_first_and_the_recorder_is_told_of_all(scene: 
     assert away not in {each.thing for each in seen}
 
 
-async def test_the_robot_does_not_hide_what_it_looks_at_nor_does_what_it_carries(scene: Scene) -> None:
+async def test_the_robot_hides_neither_its_target_nor_what_it_carries(scene: Scene) -> None:
     scene.world.remove(scene.kitchen)
     await MoveMotion(Pose([0.6, 0.9, 0])).perform()
     await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
@@ -211,7 +211,7 @@ async def test_the_robot_does_not_see_itself(scene: Scene) -> None:
         await DetectingMotion(ObjectType.ROBOT).perform()
 
 
-async def test_what_is_not_in_the_world_is_not_found_and_that_is_told(scene: Scene, listening: Listening) -> None:
+async def test_a_search_without_a_result_is_a_failure_and_is_recorded(scene: Scene, listening: Listening) -> None:
     with pytest.raises(PerceptionObjectNotFound, match="no SPOON is seen; there is none in the world") as camera:
         await DetectingMotion(ObjectType.SPOON).perform()
     with pytest.raises(PerceptionObjectNotFound, match="there is no SPOON in the world") as state:
@@ -223,7 +223,9 @@ async def test_what_is_not_in_the_world_is_not_found_and_that_is_told(scene: Sce
     ]
 
 
-async def test_the_world_itself_tells_the_first_of_a_type_seen_or_not(scene: Scene, listening: Listening) -> None:
+async def test_world_state_detection_returns_the_first_of_a_type_seen_or_not(
+    scene: Scene, listening: Listening
+) -> None:
     second = Object("second", ObjectType.MILK, pose=Pose([1.3, 1.2, 0.9]))
     scene.milk.set_pose(Pose([-3, 0, 0.2]))
     with collected_tree() as tree:
@@ -245,7 +247,7 @@ async def test_perceiving_moves_nothing_and_needs_no_memory(scene: Scene) -> Non
 
 
 class Seeing(SimulatedModules):
-    """A robot of one's own whose camera tells what it is made to."""
+    """A user's robot whose camera reports what the test chooses."""
 
     def __init__(self, *seen: Seen) -> None:
         super().__init__(Limits.SOFT)
@@ -255,7 +257,7 @@ class Seeing(SimulatedModules):
         return self._seen
 
 
-async def test_what_a_robot_of_ones_own_perceives_is_told_too(scene: Scene, listening: Listening) -> None:
+async def test_percepts_of_a_users_robot_are_recorded_too(scene: Scene, listening: Listening) -> None:
     seen = (Seen(scene.cereal, 0.9), Seen(scene.milk, 0.4))
     with ChosenRobot("mine", Seeing(*seen)):
         assert (await DetectingMotion(ObjectType.MILK).perform()).world_object is scene.cereal
@@ -264,7 +266,7 @@ async def test_what_a_robot_of_ones_own_perceives_is_told_too(scene: Scene, list
     assert [each[2] for each in listening.detections] == [seen, ()]
 
 
-async def test_a_robot_without_a_method_for_a_motion_cannot_do_it(scene: Scene, listening: Listening) -> None:
+async def test_a_robot_without_a_method_for_a_motion_cannot_perform_it(scene: Scene, listening: Listening) -> None:
     with ChosenRobot("old", Noting()):
         for motion in (DetectingMotion(ObjectType.MILK), WorldStateDetectingMotion(ObjectType.MILK)):
             name = type(motion).__name__
@@ -274,7 +276,7 @@ async def test_a_robot_without_a_method_for_a_motion_cannot_do_it(scene: Scene, 
     assert listening.detections == []
 
 
-def test_what_is_looked_for_is_a_type(scene: Scene) -> None:
+def test_a_search_needs_an_object_type(scene: Scene) -> None:
     with pytest.raises(ResolutionError, match="object_type: expected ObjectType, got str 'MILK'"):
         DetectingMotion("MILK")  # type: ignore[arg-type]  # the fault this test is about
     assert PR2.camera_view_rad == (0.99483, 0.75049)

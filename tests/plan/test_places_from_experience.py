@@ -1,4 +1,4 @@
-"""Past stands carried over to where the object is now: what fits is offered, best first, and told; the rest is not."""
+"""Past base poses carried over to an object's current pose: usable ones become candidates, the best first."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def past(
 
 
 class Known:
-    """An experience of a few things."""
+    """An experience with a few successes."""
 
     def __init__(self, *known: PastSuccess) -> None:
         self.known = known
@@ -50,18 +50,18 @@ def remembered(scene: Scene, known: Known, *, arm: Arms | None = None) -> Databa
     return DatabaseCostmapLocation(scene.milk, scene.robot, arm, experience=known)
 
 
-async def test_a_stand_is_carried_over_to_an_object_that_moved_and_turned(scene: Scene) -> None:
+async def test_a_past_pose_is_carried_over_to_an_object_that_moved_and_rotated(scene: Scene) -> None:
     scene.world.remove(scene.kitchen)
     scene.milk.set_pose(Pose([2.0, 3.0, 0.9], yaw_quaternion(math.pi / 2)))
     place = await remembered(scene, Known(past(ASIDE))).resolve()
     assert place is not None
-    # 0.6 m behind it and 0.4 m to its right, where it looks along map's y
+    # 0.6 m behind it and 0.4 m to its right, where its x points along map's y
     assert place.pose.position == pytest.approx((2.0 + 0.4, 3.0 - 0.6, 0.0))
     assert place.pose.yaw == pytest.approx(math.pi / 2 + 0.5)
     assert (place.reachable_arms, place.grasp, place.torso_height) == ((Arms.LEFT,), Grasp.FRONT, 0.3)
 
 
-async def test_from_what_is_offered_it_can_be_picked_up_as_it_says(scene: Scene) -> None:
+async def test_from_a_candidate_it_can_be_picked_up_as_suggested(scene: Scene) -> None:
     stands = [Pose([x / 10, y / 10, -0.9], yaw_quaternion(-y / 8)) for x in range(-9, -4) for y in range(-3, 4)]
     known = Known(
         *(
@@ -86,10 +86,10 @@ async def test_from_what_is_offered_it_can_be_picked_up_as_it_says(scene: Scene)
         scene.world.restore_state(before)
 
 
-async def test_a_stand_where_something_is_now_is_not_offered(scene: Scene) -> None:
+async def test_an_occupied_past_pose_is_no_candidate(scene: Scene) -> None:
     stand = BEFORE_IT
     assert await remembered(scene, Known(past(stand))).resolve() is not None
-    # The stand is at (0.6, 1.0): 0.25 m clear of the crate, then 0.35 m.
+    # The base is at (0.6, 1.0): 0.25 m clear of the crate, then 0.35 m.
     crate = Object("crate", ObjectType.GENERIC_OBJECT, box_urdf("crate", x=(-0.1, 0.1), y=(-0.1, 0.1), z=(0, 0.5)),
                    Pose([0.25, 1.0, 0]))  # fmt: skip
     assert await remembered(scene, Known(past(stand))).resolve() is None
@@ -97,7 +97,7 @@ async def test_a_stand_where_something_is_now_is_not_offered(scene: Scene) -> No
     assert await remembered(scene, Known(past(stand))).resolve() is not None
 
 
-async def test_where_the_robot_is_now_and_what_it_carries_is_free(scene: Scene) -> None:
+async def test_the_robot_and_its_load_do_not_occupy_a_past_pose(scene: Scene) -> None:
     await NavigateActionPerformable(Pose([0.6, 1.0, 0])).perform()
     scene.cereal.set_pose(Pose([0.7, 1.0, 1.0]))
     scene.robot.attach(scene.cereal, "r_gripper_tool_frame")
@@ -106,7 +106,7 @@ async def test_where_the_robot_is_now_and_what_it_carries_is_free(scene: Scene) 
         assert await location.resolve() is not None
 
 
-async def test_a_stand_from_which_it_is_out_of_reach_now_is_offered_only_if_nobody_is_to_reach(scene: Scene) -> None:
+async def test_an_unreachable_past_pose_is_a_candidate_only_if_no_reach_is_requested(scene: Scene) -> None:
     known = Known(past(torso=0.3), past(torso=0.0, grasp=Grasp.TOP), past(torso=0.9))
     places = [place.torso_height async for place in remembered(scene, known)]
     assert places == [0.3]
@@ -116,7 +116,7 @@ async def test_a_stand_from_which_it_is_out_of_reach_now_is_offered_only_if_nobo
     assert await remembered(scene, known).resolve() is None
 
 
-async def test_what_was_learned_of_standing_things_is_not_carried_over_to_one_that_lies(scene: Scene) -> None:
+async def test_experience_with_upright_objects_is_not_carried_over_to_a_lying_one(scene: Scene) -> None:
     scene.milk.set_pose(Pose([1.3, 1, 0.9], [math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4)]))
     location = DatabaseCostmapLocation(scene.milk, experience=Known(past()))
     assert await location.resolve() is None
@@ -128,14 +128,14 @@ async def test_what_was_learned_of_standing_things_is_not_carried_over_to_one_th
     assert place.pose.yaw == pytest.approx(0)
 
 
-async def test_the_arm_that_is_wanted_is_asked_for(scene: Scene) -> None:
+async def test_the_requested_arm_is_queried(scene: Scene) -> None:
     known = Known(past())
     await remembered(scene, known, arm=Arms.RIGHT).resolve()
     await remembered(scene, known).resolve()
     assert known.asked == [(ObjectType.MILK, Arms.RIGHT), (ObjectType.MILK, None)]
 
 
-async def test_the_experience_of_the_context_is_asked_and_without_one_the_caller_is_told(scene: Scene) -> None:
+async def test_the_experience_of_the_context_is_queried_and_without_one_an_error_is_raised(scene: Scene) -> None:
     location = DatabaseCostmapLocation(scene.milk, scene.robot)
     with pytest.raises(
         CallerError, match=r"queried from a memory, and none is open: resolve inside `async with Memory.open\(url\)`"
@@ -151,7 +151,7 @@ async def test_the_experience_of_the_context_is_asked_and_without_one_the_caller
         experience.reset(token)
 
 
-async def test_a_question_that_makes_no_sense_is_told(scene: Scene) -> None:
+async def test_an_invalid_request_is_refused(scene: Scene) -> None:
     with pytest.raises(CallerError, match="pass an object as target, not a place"):
         DatabaseCostmapLocation(Pose())  # type: ignore[arg-type]  # the fault this test is about
     with pytest.raises(CallerError, match="uses one arm: reachable_arm must be LEFT, RIGHT, or None"):
@@ -161,7 +161,7 @@ async def test_a_question_that_makes_no_sense_is_told(scene: Scene) -> None:
         await remembered(scene, Known(past())).resolve()
 
 
-# --- what a recorder hears ------------------------------------------------------------------------------------------
+# --- notifications of a recorder --------------------------------------------------------------------------------------
 
 GOOD, HIDDEN, OTHER = past(), past(Pose([0.3, 0.0, -0.9])), past(Pose([-0.75, 0.0, -0.9]), torso=0.2)
 
@@ -170,7 +170,7 @@ def candidate(place: Location) -> Candidate:
     return Candidate(place.pose, place.reachable_arms, place.grasp, place.torso_height)
 
 
-async def test_what_was_offered_and_taken_is_told_with_grasp_and_torso_height(scene: Scene) -> None:
+async def test_candidates_and_choice_are_recorded_with_grasp_and_torso_height(scene: Scene) -> None:
     with Recording().listening() as recording:
         place = await remembered(scene, Known(HIDDEN, GOOD, OTHER)).resolve()
     assert place is not None
@@ -178,7 +178,7 @@ async def test_what_was_offered_and_taken_is_told_with_grasp_and_torso_height(sc
     assert recording.places == [("DatabaseCostmapLocation", (candidate(place),), 0, 2, None)]
 
 
-async def test_that_nothing_was_known_or_fitted_is_told_too(scene: Scene) -> None:
+async def test_a_search_without_usable_experience_is_recorded_too(scene: Scene) -> None:
     with Recording().listening() as recording:
         assert await remembered(scene, Known()).resolve() is None
         assert await remembered(scene, Known(HIDDEN)).resolve() is None
@@ -192,7 +192,7 @@ async def test_that_nothing_was_known_or_fitted_is_told_too(scene: Scene) -> Non
     ]
 
 
-async def test_a_loop_over_places_is_told_once_when_it_is_left(scene: Scene) -> None:
+async def test_a_loop_over_candidates_is_recorded_once_at_its_end(scene: Scene) -> None:
     location = remembered(scene, Known(HIDDEN, GOOD, OTHER))
     with Recording().listening() as recording:
         places = [place async for place in location]

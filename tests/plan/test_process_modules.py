@@ -1,4 +1,4 @@
-"""Who carries motions out: chosen by `with`, for one context."""
+"""The robot that performs motions: chosen by `with`, for one context."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ THERE = Pose([0.6, 0.4, 0])
 
 
 class Noting:
-    """Process modules that write down what they are asked."""
+    """Process modules that note their requests."""
 
     def __init__(self) -> None:
         self.asked: list[str] = []
@@ -71,7 +71,7 @@ class Noting:
         self.asked.append("move_joints")
 
 
-async def test_a_motion_outside_of_any_choice_says_what_to_write() -> None:
+async def test_a_motion_without_a_chosen_robot_names_the_remedy() -> None:
     with collected_tree() as tree, pytest.raises(NoRobotChosen, match="with simulated_robot:") as caught:
         await NavigateActionPerformable(THERE).perform()
     assert isinstance(caught.value, CallerError)
@@ -80,7 +80,7 @@ async def test_a_motion_outside_of_any_choice_says_what_to_write() -> None:
     assert [node.status for node in tree] == [TaskStatus.ERROR, TaskStatus.ERROR]
 
 
-async def test_without_a_world_or_a_robot_the_caller_is_told() -> None:
+async def test_without_a_world_or_a_robot_an_error_is_raised() -> None:
     with simulated_robot:
         with pytest.raises(NoWorld, match=r"the plan.*with BulletWorld"):
             await MoveMotion(THERE).perform()
@@ -106,7 +106,7 @@ async def test_within_hard_limits_an_arm_reaches_what_soft_limits_forbid(scene: 
         await stretched.perform()
 
 
-async def test_places_are_looked_for_within_the_limits_of_the_chosen_robot(scene: Scene) -> None:
+async def test_locations_are_resolved_within_the_limits_of_the_chosen_robot(scene: Scene) -> None:
     """From above at 0.6 m with the torso down: not within soft limits."""
     from_above = Pose([0, 3, 0.6], [0, 1, 0, 1])
     location = CostmapLocation(from_above, reachable_for=scene.robot)
@@ -121,7 +121,7 @@ async def test_places_are_looked_for_within_the_limits_of_the_chosen_robot(scene
                 await MoveTCPMotion(from_above, arm).perform()
 
 
-async def test_a_choice_nests_and_ends_with_its_block_also_by_an_exception(scene: Scene) -> None:
+async def test_choices_nest_and_end_with_their_block_even_by_an_exception(scene: Scene) -> None:
     outer, inner = Noting(), Noting()
     with ChosenRobot("outer", outer):
         with pytest.raises(PlanFailure), ChosenRobot("inner", inner):
@@ -133,7 +133,7 @@ async def test_a_choice_nests_and_ends_with_its_block_also_by_an_exception(scene
     assert scene.robot.pose == THERE
 
 
-async def test_a_robot_written_before_a_motion_existed_cannot_do_it_and_says_so(scene: Scene) -> None:
+async def test_a_robot_written_before_a_motion_existed_refuses_it_with_that_reason(scene: Scene) -> None:
     part, noting = ObjectPart("fridge_door_handle", scene.kitchen), Noting()
     motions = {
         "open": OpeningMotion(part, Arms.LEFT),
@@ -169,7 +169,7 @@ async def test_a_choice_belongs_to_its_context() -> None:
         await MoveMotion(THERE).perform()
 
 
-async def test_a_hand_that_minds_collisions_fails_where_its_arm_would_be_in_something_and_stays_where_it_was(
+async def test_a_hand_that_checks_collisions_fails_where_its_arm_would_collide_and_stays_in_place(
     scene: Scene,
 ) -> None:
     goal = Pose([1.25, 0.4, 0.86])  # over the worktop by less than half a forearm
@@ -183,5 +183,5 @@ async def test_a_hand_that_minds_collisions_fails_where_its_arm_would_be_in_some
     assert thing == "kitchen"
     assert part in scene.robot.links
     assert scene.robot.joint_positions() == before
-    await MoveTCPMotion(goal, Arms.LEFT).perform()  # the others do not look
+    await MoveTCPMotion(goal, Arms.LEFT).perform()  # the others do not check
     assert scene.robot.joint_positions() != before

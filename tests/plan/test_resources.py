@@ -1,4 +1,4 @@
-"""What each built-in designator says it needs of the robot."""
+"""The parts of the robot that each built-in designator requires."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def needs(designator: Designator) -> set[Resource]:
     return set(designator.resources())
 
 
-def test_what_moves_one_part_needs_that_part() -> None:
+def test_a_motion_of_one_part_requires_that_part() -> None:
     assert needs(MoveMotion(THERE)) == needs(NavigateActionPerformable(THERE)) == {BASE}
     assert needs(LookingMotion(THERE)) == {HEAD}
     assert needs(MoveGripperMotion(GripperState.OPEN, Arms.RIGHT)) == {RIGHT}
@@ -60,7 +60,7 @@ def test_what_moves_one_part_needs_that_part() -> None:
     assert needs(FaceAtPerformable(THERE)) == {BASE, HEAD}
 
 
-def test_what_reaches_for_a_place_in_the_map_needs_the_robot_to_stand_still(scene: Scene) -> None:
+def test_a_reach_for_a_pose_in_the_map_requires_the_robot_to_stand_still(scene: Scene) -> None:
     handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
     assert needs(MoveTCPMotion(THERE, Arms.LEFT)) == {LEFT, BASE, TORSO}
     assert needs(PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.FRONT)) == {RIGHT, BASE, TORSO}
@@ -72,24 +72,24 @@ def test_what_reaches_for_a_place_in_the_map_needs_the_robot_to_stand_still(scen
     assert needs(DetectActionPerformable(scene.milk)) == {HEAD}
 
 
-def test_joints_by_name_need_the_parts_they_belong_to(scene: Scene) -> None:
+def test_joints_by_name_require_the_parts_they_belong_to(scene: Scene) -> None:
     names = ["torso_lift_joint", "head_pan_joint", "r_elbow_flex_joint", "l_gripper_l_finger_joint", "no_such_joint"]
     assert needs(MoveJointsMotion(names, [0.0] * 5)) == {TORSO, HEAD, RIGHT, LEFT}
     assert needs(MoveJointsMotion(["no_such_joint"], [0.0])) == set()
 
 
-def test_joints_of_no_robot_need_nothing() -> None:
+def test_unknown_joints_require_nothing() -> None:
     assert needs(MoveJointsMotion(["torso_lift_joint"], [0.0])) == set()
 
 
-def test_an_action_of_ones_own_needs_nothing_unless_it_says_so() -> None:
+def test_a_users_action_requires_nothing_by_default() -> None:
     class Thinking(ActionAbstract):
         async def perform(self) -> None: ...
 
     assert needs(Thinking()) == set()
 
 
-def test_a_field_in_the_place_of_the_method_is_refused_when_the_class_is_made() -> None:
+def test_a_field_with_the_name_of_the_method_is_refused_when_the_class_is_made() -> None:
     with pytest.raises(ResourcesNotAMethod, match=r"Cooking\.resources must be a method that returns a frozenset"):
 
         @dataclass

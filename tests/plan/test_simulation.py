@@ -1,4 +1,4 @@
-"""A plan that is thought through shows what would come of it, and nothing of it happens."""
+"""A simulated plan shows its effects, and changes nothing in the real world."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from pycrorm_async.world.errors import WorldClosed
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
-from tests.world.fakes import Witness
+from tests.world.fakes import ChangeLog
 
 THERE = Pose([0.6, 0.4, 0])
 AT_THE_CEREAL = Pose([0.6, 0.9, 0], yaw_quaternion(-0.27))
@@ -46,7 +46,7 @@ AT_THE_CEREAL = Pose([0.6, 0.9, 0], yaw_quaternion(-0.27))
 
 @dataclass
 class ThinkActionPerformable(ActionAbstract):
-    """Thinks that it drives there, and says what it saw come of it."""
+    """Simulate driving there, and return the state of the simulated world."""
 
     target: Pose
 
@@ -58,9 +58,9 @@ class ThinkActionPerformable(ActionAbstract):
             return robot.pose, [str(node) for node in tree]
 
 
-async def test_what_is_thought_through_happens_in_a_copy_and_nowhere_else(scene: Scene) -> None:
-    witness = Witness()
-    scene.world.observe(witness)
+async def test_a_simulation_happens_in_a_copy_and_nowhere_else(scene: Scene) -> None:
+    change_log = ChangeLog()
+    scene.world.observe(change_log)
     before = scene.world.save_state()
     with SimulatedTaskTree() as tree:
         copy = current_world.get()
@@ -71,7 +71,7 @@ async def test_what_is_thought_through_happens_in_a_copy_and_nowhere_else(scene:
         assert copy.object("pr2").pose == THERE
         assert copy.object("pr2").joint_position("torso_lift_joint") == 0.3
     assert scene.world.save_state() == before
-    assert witness.told == []
+    assert change_log.notes == []
     assert current_world.get() is scene.world
     assert not copy.entered
     assert [(type(node.designator).__name__, node.status, tree.depth(node)) for node in tree] == [
@@ -82,8 +82,8 @@ async def test_what_is_thought_through_happens_in_a_copy_and_nowhere_else(scene:
     ]
 
 
-async def test_what_was_found_in_a_thought_comes_true_to_the_last_bit(scene: Scene) -> None:
-    """The same plan, thought through and then done: both worlds end in the same state."""
+async def test_the_result_of_a_simulation_comes_true_to_the_last_bit(scene: Scene) -> None:
+    """The same plan, simulated and then performed: both worlds end in the same state."""
     target = Pose([1.3, 1.0, 0.95])
 
     async def plan() -> None:
@@ -103,7 +103,7 @@ async def test_what_was_found_in_a_thought_comes_true_to_the_last_bit(scene: Sce
     assert scene.cereal.pose.distance(target) < 0.01
 
 
-async def test_designators_mean_the_copy_inside_and_the_real_object_outside(scene: Scene) -> None:
+async def test_designators_refer_to_the_copy_inside_and_to_the_real_object_outside(scene: Scene) -> None:
     milk = ObjectDesignatorDescription(names=["milk"]).resolve()
     part = ObjectPart("torso_lift_link", scene.robot)
     real_part = part.pose
@@ -125,7 +125,7 @@ async def test_designators_mean_the_copy_inside_and_the_real_object_outside(scen
     assert in_world(inside) is in_world(there) is scene.milk
 
 
-async def test_an_object_given_itself_is_that_of_the_copy_too(scene: Scene) -> None:
+async def test_a_world_object_as_an_argument_refers_to_the_copy_too(scene: Scene) -> None:
     """MoveAndPickUp faces it, picks it up and holds it: all in the copy, though the plan names the real object."""
     with SimulatedTaskTree() as tree:
         copy = current_world.get()
@@ -140,7 +140,7 @@ async def test_an_object_given_itself_is_that_of_the_copy_too(scene: Scene) -> N
     assert scene.robot.pose == Pose()
 
 
-async def test_what_is_held_is_held_in_the_copy(scene: Scene) -> None:
+async def test_a_held_object_is_held_in_the_copy(scene: Scene) -> None:
     await MoveTorsoActionPerformable(0.3).perform()
     await NavigateActionPerformable(AT_THE_CEREAL).perform()
     await PickUpActionPerformable(scene.cereal, Arms.RIGHT, Grasp.FRONT).perform()
@@ -155,8 +155,8 @@ async def test_what_is_held_is_held_in_the_copy(scene: Scene) -> None:
     assert scene.cereal.pose == held_at
 
 
-async def test_places_are_looked_for_in_the_copy_and_are_plain_poses(scene: Scene) -> None:
-    """With the milk moved in thought, the place to stand is beside where it would be."""
+async def test_locations_are_resolved_in_the_copy_to_plain_poses(scene: Scene) -> None:
+    """With the milk moved in the simulation, the base poses are beside its simulated pose."""
     with SimulatedTaskTree():
         in_world(scene.milk).set_pose(Pose([1.3, -0.5, 0.9]))
         await MoveTorsoActionPerformable(0.3).perform()
@@ -172,7 +172,7 @@ async def test_an_object_is_not_located_relative_to_itself_in_a_copy_either(scen
         assert [each.name for each in located] == ["cereal"]
 
 
-async def test_what_is_only_in_the_copy_is_not_in_the_world_outside(scene: Scene) -> None:
+async def test_an_object_that_is_only_in_the_copy_is_not_in_the_real_world(scene: Scene) -> None:
     with SimulatedTaskTree():
         spoon = designator_of(Object("spoon", ObjectType.SPOON, pose=Pose([1, 1, 1])))
         assert in_world(spoon).pose == spoon.pose == Pose([1, 1, 1])
@@ -183,11 +183,11 @@ async def test_what_is_only_in_the_copy_is_not_in_the_world_outside(scene: Scene
         in_world(spoon)
     with pytest.raises(PerceptionObjectNotInWorld):
         await PickUpActionPerformable(spoon, Arms.LEFT, Grasp.FRONT).perform()
-    assert spoon.pose == Pose([1, 1, 1])  # what was last known
+    assert spoon.pose == Pose([1, 1, 1])  # the last known pose
     assert in_world(scene.milk) is scene.milk
 
 
-async def test_what_was_removed_before_or_meanwhile_is_not_in_the_world(scene: Scene) -> None:
+async def test_an_object_removed_before_or_during_a_simulation_is_not_in_the_world(scene: Scene) -> None:
     milk, cereal = designator_of(scene.milk), designator_of(scene.cereal)
     scene.milk.remove()
     with SimulatedTaskTree():
@@ -200,7 +200,7 @@ async def test_what_was_removed_before_or_meanwhile_is_not_in_the_world(scene: S
         in_world(inside)
 
 
-async def test_an_object_of_another_world_is_left_alone(scene: Scene) -> None:
+async def test_an_object_of_another_world_is_not_touched(scene: Scene) -> None:
     with BulletWorld():
         spoon = Object("milk", ObjectType.MILK, pose=Pose([9, 9, 9]))
         assert in_world(scene.milk) is scene.milk
@@ -208,7 +208,7 @@ async def test_an_object_of_another_world_is_left_alone(scene: Scene) -> None:
         assert designator_of(spoon).pose == Pose([9, 9, 9])
 
 
-async def test_a_thought_without_a_world_is_only_a_tree_of_its_own() -> None:
+async def test_a_simulation_without_a_world_is_only_a_tree_of_its_own() -> None:
     @dataclass
     class NothingActionPerformable(ActionAbstract):
         async def perform(self) -> None:
@@ -219,7 +219,7 @@ async def test_a_thought_without_a_world_is_only_a_tree_of_its_own() -> None:
     assert (len(around), len(tree)) == (0, 1)
 
 
-async def test_a_thought_has_its_own_root_and_the_tree_around_goes_on_without_it(scene: Scene) -> None:
+async def test_a_simulation_has_its_own_root_and_the_tree_around_continues_without_it(scene: Scene) -> None:
     with collected_tree() as around:
         pose, inner = await ThinkActionPerformable(THERE).perform()
         await NavigateActionPerformable(Pose([0.1, 0, 0])).perform()
@@ -231,9 +231,7 @@ async def test_a_thought_has_its_own_root_and_the_tree_around_goes_on_without_it
 
 
 @pytest.mark.parametrize("raised", [IKError(Pose(), Arms.LEFT, "tool", "no"), ValueError("sour"), KeyboardInterrupt()])
-async def test_whatever_leaves_a_thought_goes_through_and_the_world_is_as_before(
-    scene: Scene, raised: BaseException
-) -> None:
+async def test_an_exception_leaves_a_simulation_and_the_world_is_as_before(scene: Scene, raised: BaseException) -> None:
     before = scene.world.save_state()
     with pytest.raises(type(raised)) as caught, SimulatedTaskTree() as tree:
         await NavigateActionPerformable(THERE).perform()
@@ -244,7 +242,7 @@ async def test_whatever_leaves_a_thought_goes_through_and_the_world_is_as_before
     assert len(tree) == 2
 
 
-async def test_a_thought_that_is_cancelled_leaves_the_world_as_before(scene: Scene) -> None:
+async def test_a_cancelled_simulation_leaves_the_world_as_before(scene: Scene) -> None:
     began = asyncio.Event()
 
     async def dreaming() -> None:
@@ -263,13 +261,13 @@ async def test_a_thought_that_is_cancelled_leaves_the_world_as_before(scene: Sce
 
 
 class Suspended:
-    """An await that nobody ends."""
+    """An await that never ends."""
 
     def __await__(self) -> Generator[None, None, None]:
         yield
 
 
-async def test_a_thought_that_nobody_awaits_any_more_is_closed_without_touching_its_surroundings(scene: Scene) -> None:
+async def test_an_abandoned_simulation_is_closed_without_changing_its_surroundings(scene: Scene) -> None:
     copies: list[BulletWorld | None] = []
 
     async def dreaming() -> None:
@@ -287,10 +285,10 @@ async def test_a_thought_that_nobody_awaits_any_more_is_closed_without_touching_
         dream.close()
     assert not copy.entered
     assert (current_world.get(), current_node.get(), current_simulation.get()) == (scene.world, None, None)
-    assert listening.told == ["think None", "thought GeneratorExit"]
+    assert listening.notes == ["think None", "thought GeneratorExit"]
 
 
-async def test_thoughts_nest(scene: Scene) -> None:
+async def test_simulations_nest(scene: Scene) -> None:
     with SimulatedTaskTree() as outer:
         await NavigateActionPerformable(THERE).perform()
         with SimulatedTaskTree() as inner:
@@ -305,7 +303,7 @@ async def test_thoughts_nest(scene: Scene) -> None:
     assert scene.robot.pose == Pose()
 
 
-async def test_what_was_resolved_in_one_thought_is_meant_in_the_next(scene: Scene) -> None:
+async def test_a_designator_resolved_in_one_simulation_refers_to_the_copy_in_the_next(scene: Scene) -> None:
     with SimulatedTaskTree():
         found = ObjectDesignatorDescription(names=["milk"]).resolve()
         in_world(found).set_pose(Pose([9, 9, 9]))
@@ -314,7 +312,7 @@ async def test_what_was_resolved_in_one_thought_is_meant_in_the_next(scene: Scen
         assert in_world(found).world is current_world.get()
 
 
-async def test_two_tasks_think_at_once_and_a_third_acts(scene: Scene) -> None:
+async def test_two_tasks_simulate_concurrently_while_a_third_acts(scene: Scene) -> None:
     ready = asyncio.Barrier(3)
 
     async def dreaming(x: float) -> tuple[Pose, int]:
@@ -333,7 +331,7 @@ async def test_two_tasks_think_at_once_and_a_third_acts(scene: Scene) -> None:
     assert scene.robot.pose == THERE
 
 
-async def test_a_task_begun_in_a_thought_thinks_too_and_finds_the_copy_closed_afterwards(scene: Scene) -> None:
+async def test_a_task_begun_in_a_simulation_uses_the_copy_and_then_finds_it_closed(scene: Scene) -> None:
     closing = asyncio.Event()
 
     async def late() -> None:
@@ -350,14 +348,14 @@ async def test_a_task_begun_in_a_thought_thinks_too_and_finds_the_copy_closed_af
     assert scene.robot.pose == Pose()
 
 
-async def test_the_recorder_is_told_when_a_thought_begins_and_ends(scene: Scene) -> None:
+async def test_the_recorder_is_notified_when_a_simulation_begins_and_ends(scene: Scene) -> None:
     listening = Recording()
     with listening.listening():
         with SimulatedTaskTree(description="what if"):
             await NavigateActionPerformable(THERE).perform()
         with pytest.raises(ValueError, match="sour"), SimulatedTaskTree():
             raise ValueError("sour")
-    assert listening.told == [
+    assert listening.notes == [
         "think what if",
         "start NavigateActionPerformable",
         "start MoveMotion",
@@ -369,7 +367,7 @@ async def test_the_recorder_is_told_when_a_thought_begins_and_ends(scene: Scene)
     ]
 
 
-async def test_a_robot_chosen_inside_a_thought_is_not_chosen_outside() -> None:
+async def test_a_robot_chosen_inside_a_simulation_is_not_chosen_outside() -> None:
     with BulletWorld() as world:
         robot = Object("pr2", ObjectType.ROBOT)
         with SimulatedTaskTree(), simulated_robot:
@@ -379,7 +377,7 @@ async def test_a_robot_chosen_inside_a_thought_is_not_chosen_outside() -> None:
         assert (robot.pose, world.robot) == (Pose(), robot)
 
 
-def test_a_thought_is_entered_once_and_described_in_words() -> None:
+def test_a_simulation_is_entered_once_and_described_in_words() -> None:
     thought = SimulatedTaskTree()
     with thought:
         pass
@@ -389,7 +387,7 @@ def test_a_thought_is_entered_once_and_described_in_words() -> None:
         SimulatedTaskTree(description=3)  # type: ignore[arg-type]
 
 
-def test_a_thought_in_a_world_that_was_left_is_refused_and_changes_nothing() -> None:
+def test_a_simulation_of_a_world_that_was_left_is_refused_and_changes_nothing() -> None:
     with BulletWorld() as world:
         pass
     token = current_world.set(world)
@@ -401,7 +399,7 @@ def test_a_thought_in_a_world_that_was_left_is_refused_and_changes_nothing() -> 
         current_world.reset(token)
 
 
-def test_a_frozen_copy_taken_in_a_thought_keeps_the_pose_of_the_thought() -> None:
+def test_a_frozen_copy_taken_in_a_simulation_keeps_the_simulated_pose() -> None:
     with BulletWorld():
         milk: ObjectDesignator = designator_of(Object("milk", ObjectType.MILK))
         with SimulatedTaskTree():

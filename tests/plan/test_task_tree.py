@@ -1,4 +1,4 @@
-"""The tree that is collected: its order, its drawing, its place beside a recorder."""
+"""The collected task tree: its order, its drawing, and its use beside a recorder."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ async def test_an_empty_tree_is_drawn_as_nothing() -> None:
     assert (str(tree), len(tree), list(tree)) == ("", 0, [])
 
 
-async def test_a_node_that_runs_is_drawn_without_a_duration() -> None:
+async def test_a_running_node_is_drawn_without_a_duration() -> None:
     class Looking(ActionAbstract):
         async def perform(self) -> None:
             seen.append(str(tree))
@@ -74,7 +74,7 @@ async def test_a_node_that_runs_is_drawn_without_a_duration() -> None:
     assert seen == ["Looking RUNNING"]
 
 
-async def test_what_runs_inside_a_node_that_is_not_collected_is_a_root() -> None:
+async def test_a_child_of_a_node_that_is_not_collected_is_a_root() -> None:
     token = current_node.set(TaskTreeNode(None, "root", None, 0))
     try:
         with collected_tree() as tree:
@@ -97,7 +97,7 @@ async def test_trees_and_recorders_do_not_disturb_each_other() -> None:
         "Step SUCCEEDED",
     ]
     assert drawn(inner) == ["Plan SUCCEEDED", "└── Step SUCCEEDED"]
-    assert [each.split()[0] for each in recording.told] == [
+    assert [each.split()[0] for each in recording.notes] == [
         "start",
         "end",
         "start",

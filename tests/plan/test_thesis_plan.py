@@ -51,7 +51,7 @@ ParkArmsActionPerformable
 
 
 async def thesis_plan() -> Pose:
-    """As it is printed there, awaited; returns where the cereal was to be put."""
+    """The plan as it is printed there, awaited; returns the target of the cereal."""
     cereal_desig = ObjectDesignatorDescription(names=["cereal"])
     robot_desig = ObjectDesignatorDescription(names=["pr2"]).resolve()
     kitchen_desig = ObjectDesignatorDescription(names=["kitchen"])
@@ -90,12 +90,12 @@ async def test_the_thesis_plan_puts_the_cereal_on_the_island(scene: Scene) -> No
     assert {node.status for node in tree} == {TaskStatus.SUCCEEDED}
 
 
-async def test_a_recorder_hears_all_of_the_thesis_plan(scene: Scene) -> None:
+async def test_a_recorder_is_notified_of_the_whole_thesis_plan(scene: Scene) -> None:
     with Recording().listening() as recording:
         await thesis_plan()
     assert len(recording.ended) == len(TREE.splitlines()) == 22
     assert recording.open == []
-    assert [each for each in recording.told if each.startswith("place")] == [
+    assert [each for each in recording.notes if each.startswith("place")] == [
         "place CostmapLocation",
         "place SemanticCostmapLocation",
         "place CostmapLocation",
@@ -104,13 +104,13 @@ async def test_a_recorder_hears_all_of_the_thesis_plan(scene: Scene) -> None:
 
 
 class Alternating(Recording):
-    """Lets other tasks run before every node."""
+    """Let other tasks run before every node."""
 
     def admit(self) -> Awaitable[None]:
         return asyncio.sleep(0)
 
 
-async def test_three_plans_in_three_worlds_at_once_do_not_mix() -> None:
+async def test_three_concurrent_plans_in_three_worlds_do_not_mix() -> None:
     async def alone() -> tuple[float, str]:
         with BulletWorld(mode=WorldMode.DIRECT), simulated_robot, collected_tree() as tree:
             Object("pr2", ObjectType.ROBOT)
@@ -125,11 +125,11 @@ async def test_three_plans_in_three_worlds_at_once_do_not_mix() -> None:
         for distance, tree in await asyncio.gather(alone(), alone(), alone()):
             assert distance < 0.01
             assert tree == TREE
-    assert recording.told[:3] == ["start ParkArmsActionPerformable"] * 3
+    assert recording.notes[:3] == ["start ParkArmsActionPerformable"] * 3
     assert [node.parent for node in recording.ended].count(None) == 3 * 8
 
 
-async def test_the_plan_is_the_same_twice(scene: Scene) -> None:
+async def test_two_runs_of_the_plan_are_the_same(scene: Scene) -> None:
     first = await thesis_plan()
     robot = scene.robot.pose
     scene.world.reset()

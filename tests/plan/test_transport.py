@@ -1,4 +1,4 @@
-"""An object is fetched and brought, by the actions and places one expects, or it is said why not."""
+"""An object is transported by the expected actions and locations, or the failure gives the reason."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ async def test_a_transported_object_is_at_its_target_and_the_arms_are_parked(sce
     assert scene.robot.pose == recording.places[1][1][0].pose
 
 
-async def test_what_the_arm_holds_already_is_only_brought(scene: Scene) -> None:
+async def test_an_object_in_the_hand_is_only_brought(scene: Scene) -> None:
     await MoveTorsoActionPerformable(0.3).perform()
     await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
     await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
@@ -71,7 +71,7 @@ async def test_what_the_arm_holds_already_is_only_brought(scene: Scene) -> None:
     assert "  PickUpActionPerformable" not in shape(tree)
 
 
-async def test_what_cannot_be_fetched_stays_where_it_is(scene: Scene) -> None:
+async def test_an_object_that_cannot_be_picked_up_stays_in_place(scene: Scene) -> None:
     scene.milk.set_pose(Pose([1.3, 1, 3.0]))
     with pytest.raises(ObjectUnfetchable, match="no place to stand and pick up milk") as caught:
         await TransportActionPerformable(scene.milk, Arms.LEFT, ISLAND).perform()
@@ -79,7 +79,7 @@ async def test_what_cannot_be_fetched_stays_where_it_is(scene: Scene) -> None:
     assert (scene.milk.pose, scene.robot.pose, scene.robot.attachments) == (Pose([1.3, 1, 3.0]), Pose(), {})
 
 
-async def test_what_cannot_be_delivered_stays_in_the_hand(scene: Scene) -> None:
+async def test_an_object_that_cannot_be_delivered_stays_in_the_hand(scene: Scene) -> None:
     await MoveTorsoActionPerformable(0.3).perform()
     with pytest.raises(ReachabilityFailure, match="no place to stand and reach"):
         await TransportActionPerformable(scene.milk, Arms.LEFT, Pose([0, -3, 3.0])).perform()

@@ -349,9 +349,7 @@ async def test_all_rows_of_an_episode_are_found_by_an_index(tmp_path: Path) -> N
             assert scans(file, select(row).where(mapped.process_metadata_id == 1)) == [], mapped
             asked_of += 1
         assert asked_of > 30
-        assert scans(
-            file, select(TaskTreeNode.id).where(TaskTreeNode.reason == "IKError")
-        )  # an index of the foreign key
+        assert scans(file, select(TaskTreeNode.id).where(TaskTreeNode.reason == "IKError"))  # `reason` has no index
         # and all that refers to one row: children of a node, an object's life, the node of a status
         parent, identity = TaskTreeNode.parent_id == 34, Object.identity_id == 32
         assert scans(file, select(TaskTreeNode.id).where(parent)) == []

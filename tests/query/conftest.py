@@ -10,7 +10,7 @@ from pycrorm_async.store.log import EventLog
 
 @pytest.fixture
 async def log(database_url: str) -> AsyncIterator[EventLog]:
-    """On each kind of database."""
+    """Open a log on each kind of database."""
     opened = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     yield opened
     await opened.close()

@@ -1,6 +1,6 @@
-"""The task tree and the world of an episode at any of its moments, on each kind of database.
+"""The task tree and the world of an episode at every moment, on each kind of database.
 
-What is to be told after each event is written beside it by hand.
+The expected state after each event is written beside the event by hand.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ PR2, MILK, OUTER, INNER, AGAIN = 3, 4, 5, 9, 18
 
 
 class Line(NamedTuple):
-    """An event, and what is so after it: every node's status in tree order, every object, the episode's status."""
+    """An event, and the state after it: every node's status in tree order, every object, the episode's status."""
 
     event: Happening
     tree: str
@@ -65,11 +65,11 @@ class Line(NamedTuple):
     status: str = "RUNNING"
 
 
-def thing(sequence: int) -> ObjectReference:
+def moved_object(sequence: int) -> ObjectReference:
     return ObjectReference(sequence, sequence)
 
 
-ROBOT = RobotValue(pose(), "ROBOT", 0.0, thing(PR2))
+ROBOT = RobotValue(pose(), "ROBOT", 0.0, moved_object(PR2))
 STORY = [
     Line(EpisodeStarted("a story", "me", "host", "1.0", "3.11"), "", ""),
     Line(NodeStarted("root"), "root RUNNING", ""),
@@ -95,17 +95,19 @@ STORY = [
         "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3",
     ),
     Line(
-        StateSampled(ObjectReference(PR2, 6), {"base.x": 9.0, "arm": 9.0}, OUTER),  # may be late: the setters are exact
+        StateSampled(
+            ObjectReference(PR2, 6), {"base.x": 9.0, "arm": 9.0}, OUTER
+        ),  # events may arrive late: the setters are exact
         "root RUNNING, NavigateAction RUNNING",
         "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3",
     ),
     Line(
-        NodeStarted("action", OUTER, name_of(PICK_UP), {"object_designator": thing(MILK), "arm": "LEFT"}, ROBOT),
+        NodeStarted("action", OUTER, name_of(PICK_UP), {"object_designator": moved_object(MILK), "arm": "LEFT"}, ROBOT),
         "root RUNNING, NavigateAction RUNNING, PickUpAction RUNNING",
         "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3",
     ),
     Line(
-        ObjectAttached(ObjectReference(PR2, 6), thing(MILK), "hand", INNER),
+        ObjectAttached(ObjectReference(PR2, 6), moved_object(MILK), "hand", INNER),
         "root RUNNING, NavigateAction RUNNING, PickUpAction RUNNING",
         "pr2 0.5 4 0 | 0.25 1.5; milk 1 2 3 < pr2 hand",
     ),
@@ -140,7 +142,7 @@ STORY = [
         "pr2 0.5 4 0 | 0.25 1.5",
     ),
     Line(
-        ObjectMoved(MILK, "milk", "MILK", pose(9, 9, 9)),  # told late, by another thread
+        ObjectMoved(MILK, "milk", "MILK", pose(9, 9, 9)),  # recorded late, by another thread
         "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
         "pr2 0.5 4 0 | 0.25 1.5",
     ),
@@ -150,7 +152,7 @@ STORY = [
         "pr2 0.5 4 0 | 0.25 1.5; milk 1 1 1",
     ),
     Line(
-        ObjectAttached(thing(AGAIN), ObjectReference(PR2, 6), None),
+        ObjectAttached(moved_object(AGAIN), ObjectReference(PR2, 6), None),
         "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
         "pr2 0.5 4 0 | 0.25 1.5 < milk; milk 1 1 1",
     ),
@@ -160,7 +162,7 @@ STORY = [
         "pr2 0.5 4 0 | 0.25 1.5 < milk; milk 1 1 1",
     ),
     Line(
-        ObjectDetected("camera", "MILK", (SeenValue("milk", "MILK", pose(8), thing(AGAIN), 1.0),), OUTER),
+        ObjectDetected("camera", "MILK", (SeenValue("milk", "MILK", pose(8), moved_object(AGAIN), 1.0),), OUTER),
         "root RUNNING, NavigateAction SUCCEEDED, PickUpAction FAILED IKError: too far, MoveMotion RUNNING",
         "pr2 0.5 4 0 | 0.25 1.5 < milk; milk 1 1 1",
     ),
@@ -182,7 +184,7 @@ def story(number: int = 1) -> Script:
 
 @pytest.fixture(scope="module")
 def recorded(module_database_url: str) -> DatabaseAddress:
-    """Episode 1 is the story."""
+    """A log in which episode 1 is the story."""
     address = DatabaseAddress.parse(module_database_url)
 
     async def record() -> None:
@@ -202,8 +204,8 @@ async def reading(recorded: DatabaseAddress) -> AsyncIterator[Reading]:
         yield opened
 
 
-def told(then: Moment) -> tuple[str, str, str]:
-    """The same in the words of the story."""
+def state_of(then: Moment) -> tuple[str, str, str]:
+    """Return the snapshot in the notation of the story."""
     return ", ".join(map(_node_words, then.tree)), "; ".join(map(_object_words, then.world.objects)), then.status
 
 
@@ -225,14 +227,14 @@ def at(sequence: int) -> datetime:
     return datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC) + timedelta(seconds=sequence)
 
 
-async def test_after_every_event_tree_and_world_are_as_the_story_says(reading: Reading) -> None:
+async def test_snapshots_equal_the_expected_tree_and_world_after_every_event(reading: Reading) -> None:
     for sequence, line in enumerate(STORY, 1):
         then = await reading.as_of(1, sequence=sequence)
         assert (then.sequence, then.time_s, then.at) == (sequence, sequence - 1.0, at(sequence))
-        assert told(then) == line[1:], sequence
+        assert state_of(then) == line[1:], sequence
 
 
-async def test_a_time_is_that_of_the_last_event_that_had_happened(reading: Reading) -> None:
+async def test_a_time_selects_the_last_event_before_it(reading: Reading) -> None:
     """Event n of a story happens n - 1 seconds after its first, and n seconds after 22:13:20."""
     for sequence in range(1, len(STORY) + 1):
         for time in (sequence - 1, float(sequence - 1), sequence - 1 + 0.999_999_999, at(sequence)):
@@ -244,13 +246,13 @@ async def test_a_time_is_that_of_the_last_event_that_had_happened(reading: Readi
     assert (await reading.as_of(1, sequence=np.int64(3))).sequence == 3  # type: ignore[arg-type]  # as a frame has it
 
 
-async def test_beyond_the_end_is_the_end(reading: Reading) -> None:
+async def test_a_moment_after_the_end_is_the_end(reading: Reading) -> None:
     end = await reading.as_of(1, sequence=len(STORY))
     for when in ({"sequence": 10**9}, {"time": 1e9}, {"time": datetime(2099, 1, 1, tzinfo=UTC)}):
         assert await reading.as_of(1, **when) == end
 
 
-async def test_at_the_end_the_tree_is_that_of_the_tables(reading: Reading) -> None:
+async def test_the_snapshot_at_the_end_has_the_tree_of_the_tables(reading: Reading) -> None:
     def summary(node: NodeSummary) -> dict[str, Any]:
         return {each.name: getattr(node, each.name) for each in fields(NodeSummary)}
 
@@ -258,7 +260,7 @@ async def test_at_the_end_the_tree_is_that_of_the_tables(reading: Reading) -> No
     assert [summary(each) for each in then.tree] == [summary(each) for each in await reading.tree(1)]
 
 
-async def test_a_node_says_what_it_was_then(reading: Reading) -> None:
+async def test_a_node_has_its_status_at_that_moment(reading: Reading) -> None:
     parameters = {"object_designator": {"object": MILK, "row": MILK, "name": "milk"}, "arm": "LEFT"}
     running = NodeThen(
         id=row(INNER), parent_id=row(OUTER), depth=2, dtype="PickUpAction", kind="action", parameters=parameters,
@@ -278,7 +280,7 @@ async def test_a_node_says_what_it_was_then(reading: Reading) -> None:
     assert [each.dtype for each in (await reading.as_of(1, sequence=14)).running] == [None, "MoveMotion"]
 
 
-async def test_the_world_says_what_was_in_it_and_where_its_robot_was(reading: Reading) -> None:
+async def test_a_world_has_its_objects_and_its_robots_pose_at_that_moment(reading: Reading) -> None:
     then = (await reading.as_of(1, sequence=11)).world
     assert then.attachments == (AttachmentThen("pr2", "milk", "hand"),)
     assert then.robot == RobotThen("pr2", Pose([0.5, 4, 0]), 0.25)
@@ -301,16 +303,16 @@ async def test_the_world_says_what_was_in_it_and_where_its_robot_was(reading: Re
         empty.object("milk")
 
 
-async def test_what_nobody_saw_the_end_of_has_none_and_what_is_gone_holds_nothing(log: EventLog) -> None:
-    """A world that is left is emptied object by object; a node that outlives its episode is LOST."""
+async def test_a_node_without_an_end_has_no_end_time_and_a_removed_object_holds_nothing(log: EventLog) -> None:
+    """Leaving a world removes object by object; a node that outlives its episode is LOST."""
     script = Script()
     for event in (
         EpisodeStarted("left", "me", "h", "1", "3.11"),
         NodeStarted("root"),
         ObjectAdded("pr2", "ROBOT", pose()),
         ObjectAdded("milk", "MILK", pose(1, 2, 3)),
-        ObjectAttached(thing(3), thing(4), "hand"),
-        ObjectRemoved(thing(3)),
+        ObjectAttached(moved_object(3), moved_object(4), "hand"),
+        ObjectRemoved(moved_object(3)),
         NodeEnded(2, "LOST"),
     ):
         script.put(event)
@@ -324,7 +326,7 @@ async def test_what_nobody_saw_the_end_of_has_none_and_what_is_gone_holds_nothin
         assert (await reading.tree(1))[0].duration_ns is None
 
 
-async def test_a_moment_can_be_printed(reading: Reading) -> None:
+async def test_a_snapshot_can_be_printed(reading: Reading) -> None:
     assert str(await reading.as_of(1, sequence=10)) == (
         "episode 1 at 9.000 s, event 10: RUNNING\n"
         "  root RUNNING\n"
@@ -335,10 +337,10 @@ async def test_a_moment_can_be_printed(reading: Reading) -> None:
     )
 
 
-# --- which episode ------------------------------------------------------------------------------------------------
+# --- naming an episode ------------------------------------------------------------------------------------------------
 
 
-async def test_an_episode_is_named_in_any_way(log: EventLog) -> None:
+async def test_an_episode_can_be_named_by_number_id_or_last(log: EventLog) -> None:
     thought = Script(3)
     thought.put(EpisodeStarted("a thought", "me", "h", "1", "3.11", simulated=True, thought_by=NodeReference(ID, 5)))
     thought.put(NodeStarted("root", simulated=True))
@@ -357,18 +359,18 @@ async def test_an_episode_is_named_in_any_way(log: EventLog) -> None:
                 await reading.as_of(unknown, sequence=2)
 
 
-async def test_what_the_tables_do_not_show_is_told_from_the_log(log: EventLog) -> None:
+async def test_unfolded_events_are_read_from_the_log(log: EventLog) -> None:
     await Projector(log).open()
     records = story().records
     await log.append([*declarations(*TYPES), *records[:6]])
     async with Reading.open_address(log.address) as reading:
         assert await reading.episodes() == []
-        assert told(await reading.as_of("last", time=1e9)) == STORY[5][1:]
+        assert state_of(await reading.as_of("last", time=1e9)) == STORY[5][1:]
         await log.append(records[6:15])
-        assert told(await reading.as_of("last", time=1e9)) == STORY[14][1:]
+        assert state_of(await reading.as_of("last", time=1e9)) == STORY[14][1:]
 
 
-async def test_an_episode_of_many_events_is_read_to_the_moment(log: EventLog) -> None:
+async def test_an_episode_of_many_events_is_read_up_to_the_moment(log: EventLog) -> None:
     script = Script()
     script.put(EpisodeStarted("long", "me", "h", "1", "3.11"))
     milk = script.put(ObjectAdded("milk", "MILK", pose(2)))
@@ -381,7 +383,7 @@ async def test_an_episode_of_many_events_is_read_to_the_moment(log: EventLog) ->
             assert then.world.object("milk").pose.position.x == sequence
 
 
-# --- what is no moment, and what cannot be told -------------------------------------------------------------------
+# --- invalid moments and unreadable events ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -402,7 +404,7 @@ async def test_an_episode_of_many_events_is_read_to_the_moment(log: EventLog) ->
         ({"sequence": True}, "sequence must be an integer, got True"),
     ],
 )
-async def test_what_is_no_moment_is_refused(reading: Reading, when: dict[str, Any], message: str) -> None:
+async def test_an_invalid_moment_is_refused(reading: Reading, when: dict[str, Any], message: str) -> None:
     with pytest.raises(CallerError, match=message):
         await reading.as_of(1, **when)
 
@@ -426,7 +428,7 @@ async def test_what_is_no_moment_is_refused(reading: Reading, when: dict[str, An
         ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event this version knows: use a newer"),
     ],
 )
-async def test_what_came_before_an_event_that_cannot_be_understood_is_told(
+async def test_a_snapshot_before_an_unreadable_event_is_given(
     log: EventLog, type_: str, payload: bytes | None, version: int, kind: type[Exception], message: str
 ) -> None:
     script = Script()
@@ -436,8 +438,8 @@ async def test_what_came_before_an_event_that_cannot_be_understood_is_told(
     script.put(NodeEnded(2, "SUCCEEDED"))
     await stored_and_folded(log, [*declarations(*TYPES), *script.records])
     async with Reading.open_address(log.address) as reading:
-        assert told(await reading.as_of(1, sequence=15)) == STORY[14][1:]
-        assert told(await reading.as_of(1, time=14.5)) == STORY[14][1:]
+        assert state_of(await reading.as_of(1, sequence=15)) == STORY[14][1:]
+        assert state_of(await reading.as_of(1, time=14.5)) == STORY[14][1:]
         for when in ({"sequence": 16}, {"time": 1e9}):
             with pytest.raises(kind, match=message):
                 await reading.as_of(1, **when)

@@ -1,4 +1,4 @@
-"""Declarations of several processes that do not fit together: who asks gets an answer all the same."""
+"""Contradicting declarations of several processes: every query still has an answer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.projections.event_script import SAYING, Script, declarations, declare
 from tests.projections.sql_queries import stored_and_folded
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 WAVE = declared("Wave", "wave", field("times", "integer", 2))
 WAVE_MOTION = declared("Wave", "wave", field("times", "integer", 2), kind="motion")
@@ -39,13 +39,13 @@ class ORMBow(Action):
 
 
 async def asked(reading: Reading, question: Any) -> list[tuple[str, str]]:
-    """Class and dtype of every designator in the answer."""
+    """Return class and dtype of every designator in the answer."""
     async with reading.session() as session:
         return [(type(each).__name__, each.dtype) for each in await session.scalars(question.order_by("id"))]
 
 
-async def told(log: EventLog, *types: DesignatorTypeDeclared) -> None:
-    """Every type is performed in an episode of its own, in this order; before them somebody says something."""
+async def perform_each(log: EventLog, *types: DesignatorTypeDeclared) -> None:
+    """Perform every type in an episode of its own, in this order, after one with a SayAction."""
     scripts = [Script(number) for number in range(1, len(types) + 2)]
     scripts[0].put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
     for script, each in zip(scripts[1:], types, strict=True):
@@ -79,10 +79,10 @@ async def told(log: EventLog, *types: DesignatorTypeDeclared) -> None:
         "another's table first",
     ],
 )
-async def test_the_refused_declaration_parks_its_episode_and_everything_else_is_answered(
+async def test_the_refused_declaration_parks_its_episode_and_every_query_has_an_answer(
     log: EventLog, first: DesignatorTypeDeclared, second: DesignatorTypeDeclared, parked: int, reason: str
 ) -> None:
-    await told(log, first, second)
+    await perform_each(log, first, second)
     assert [(each.number, each.parked) for each in await log.stopped()] == [(parked, f"event 1: {reason}")]
     kept = second if parked == 2 else first
     expected = [("SayingAction", "SayingAction"), ("Wave", "Wave")]
@@ -97,8 +97,8 @@ async def test_the_refused_declaration_parks_its_episode_and_everything_else_is_
             ]
 
 
-async def test_a_type_of_which_nothing_was_accepted_has_no_class(log: EventLog) -> None:
-    await told(log, WAVE_AS_POSE)
+async def test_a_type_without_an_accepted_declaration_has_no_class(log: EventLog) -> None:
+    await perform_each(log, WAVE_AS_POSE)
     async with Reading.open_address(log.address) as reading:
         assert await asked(reading, select(Designator)) == [("SayingAction", "SayingAction")]
         with pytest.raises(CallerError, match=r"this memory has no type 'Wave' \(its types: SayingAction\)"):
@@ -124,10 +124,10 @@ async def test_a_type_of_which_nothing_was_accepted_has_no_class(log: EventLog) 
         "a class where none belongs",
     ],
 )
-async def test_bases_and_classes_of_another_kind_do_not_count(
+async def test_bases_and_classes_of_another_kind_are_ignored(
     log: EventLog, types: tuple[DesignatorTypeDeclared, ...]
 ) -> None:
-    await told(log, *types)
+    await perform_each(log, *types)
     assert await log.stopped() == []
     everything = [("SayingAction", "action"), *((each.dtype, each.kind) for each in types)]
     async with Reading.open_address(log.address) as reading:

@@ -1,4 +1,4 @@
-"""What is asked of past pick-ups: which count, how good a way of doing it is, and which comes first."""
+"""Experience from past pick-ups: the ones that count, their success rates, and their order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations,
 from tests.projections.sql_queries import stored_and_folded
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 
 def tried(
@@ -36,7 +36,7 @@ def ways(found: list[PastSuccess]) -> list[tuple[Arms, float, float, float, int]
     return [(each.arm, *each.stand.position[:2], round(each.score, 9), each.times) for each in found]
 
 
-def test_a_way_is_as_good_as_the_share_of_what_went_well_near_it() -> None:
+def test_the_rate_of_a_pose_is_the_share_of_successes_near_it() -> None:
     attempts = [
         tried(-0.7, 0, succeeded=True),
         tried(-0.65, 0, succeeded=True),  # 0.05 m from the first
@@ -44,7 +44,7 @@ def test_a_way_is_as_good_as_the_share_of_what_went_well_near_it() -> None:
         tried(-0.7, 0, succeeded=False, arm=Arms.RIGHT),  # another arm
         tried(-0.7, 0, succeeded=False, z=-0.7),  # another height
         tried(-0.7, 0, succeeded=False, torso=0.1),  # another torso height
-        tried(-0.9, 0.2, succeeded=True),  # alone
+        tried(-0.9, 0.2, succeeded=True),  # no neighbour
         tried(-0.9, 0.5, succeeded=True),
         tried(-0.9, 0.5, succeeded=True),
         tried(-0.9, 0.5, succeeded=True),
@@ -58,12 +58,12 @@ def test_a_way_is_as_good_as_the_share_of_what_went_well_near_it() -> None:
     ]
 
 
-def test_equally_good_ways_come_as_often_as_they_went_well_then_the_first_given() -> None:
+def test_equal_rates_are_ordered_by_successes_and_then_by_position_in_the_list() -> None:
     attempts = [tried(x, 0, succeeded=True) for x in (-0.8, -0.75, -0.75, -0.7)]
     assert [(each.stand.position.x, each.times) for each in best_first(attempts)] == [(-0.75, 2), (-0.8, 1), (-0.7, 1)]
 
 
-def test_without_a_torso_the_place_alone_counts_and_nothing_tried_gives_nothing() -> None:
+def test_without_a_torso_height_the_pose_alone_counts_and_without_attempts_there_is_no_experience() -> None:
     attempts = [tried(-0.7, 0, succeeded=True, torso=None), tried(-0.7, 0.05, succeeded=False, torso=None)]
     (found,) = best_first(attempts)
     assert (found.torso_height, found.score) == (None, 0.5)
@@ -88,16 +88,16 @@ def added(script: Script, name: str, kind: str, at: tuple[float, float, float], 
     return script.put(ObjectAdded(name, kind, PoseValue(at, yaw_quaternion(heading), "map", T0_NS)))
 
 
-async def known(log: EventLog, *scripts: Script, arm: Arms | None = None) -> list[PastSuccess]:
+async def experience_of(log: EventLog, *scripts: Script, arm: Arms | None = None) -> list[PastSuccess]:
     await stored_and_folded(log, [*declarations(PICK_UP), *(each for script in scripts for each in script.records)])
     return list(await PickUpExperience(Reading(log)).successes(ObjectType.MILK, arm=arm))
 
 
-async def test_stands_are_as_the_object_saw_them_however_it_was_turned(log: EventLog) -> None:
+async def test_poses_are_relative_to_the_object_whatever_its_orientation(log: EventLog) -> None:
     script = Script()
     milk = added(script, "milk", "MILK", (1.0, 2.0, 0.9), heading=math.pi / 2)
     picked(script, milk, at=(1.0, 1.3), heading=math.pi / 2)
-    (found,) = await known(log, script)
+    (found,) = await experience_of(log, script)
     # 0.7 m behind it, where "behind" is against its own x, which points along map's y
     assert found.stand.position == pytest.approx((-0.7, 0.0, -0.9))
     assert found.stand.orientation == pytest.approx((0, 0, 0, 1))
@@ -105,7 +105,7 @@ async def test_stands_are_as_the_object_saw_them_however_it_was_turned(log: Even
     assert found.score == pytest.approx(2 / 3)
 
 
-async def test_other_types_other_arms_and_what_ended_neither_well_nor_badly_do_not_count(log: EventLog) -> None:
+async def test_other_types_other_arms_and_pick_ups_without_an_outcome_do_not_count(log: EventLog) -> None:
     script = Script()
     milk = added(script, "milk", "MILK", (1.0, 0.0, 0.9))
     bowl = added(script, "bowl", "BOWL", (1.0, 0.0, 0.9))
@@ -114,14 +114,14 @@ async def test_other_types_other_arms_and_what_ended_neither_well_nor_badly_do_n
     picked(script, bowl, at=(0.3, 0.0), status="FAILED")
     for status in ("CANCELLED", "INTERRUPTED", "ERROR", "LOST"):
         picked(script, milk, at=(0.3, 0.0), status=status)
-    found = await known(log, script)
+    found = await experience_of(log, script)
     assert [(each.arm, round(each.score, 6)) for each in found] == [(Arms.RIGHT, 0.666667), (Arms.LEFT, 0.666667)]
     asked = PickUpExperience(Reading(log))
     assert [each.arm for each in await asked.successes(ObjectType.MILK, arm=Arms.LEFT)] == [Arms.LEFT]
     assert await asked.successes(ObjectType.SPOON, arm=None) == []
 
 
-async def test_what_was_only_thought_through_does_not_count(log: EventLog) -> None:
+async def test_simulated_pick_ups_do_not_count(log: EventLog) -> None:
     thought = Script(1)
     thought.put(EpisodeStarted("thinking", "me", "host", "1.0", "3.11", simulated=True))
     milk = added(thought, "milk", "MILK", (1.0, 0.0, 0.9))
@@ -134,20 +134,20 @@ async def test_what_was_only_thought_through_does_not_count(log: EventLog) -> No
     done = Script(2)
     done.put(EpisodeStarted("doing", "me", "host", "1.0", "3.11"))
     picked(done, added(done, "milk", "MILK", (1.0, 0.0, 0.9)), at=(0.2, 0.0))
-    assert [each.stand.position.x for each in await known(log, thought, done)] == pytest.approx([-0.8])
+    assert [each.stand.position.x for each in await experience_of(log, thought, done)] == pytest.approx([-0.8])
 
 
-async def test_the_latest_are_looked_at_and_older_ones_are_not(log: EventLog) -> None:
+async def test_only_the_latest_pick_ups_are_read(log: EventLog) -> None:
     script = Script()
     milk = added(script, "milk", "MILK", (1.0, 0.0, 0.9))
     picked(script, milk, at=(0.4, 0.0))
     picked(script, milk, at=(0.2, 0.0))
     for _ in range(ATTEMPTS_MAX - 1):
         picked(script, milk, at=(0.0, 0.0), status="FAILED")
-    assert [each.stand.position.x for each in await known(log, script)] == pytest.approx([-0.8])
+    assert [each.stand.position.x for each in await experience_of(log, script)] == pytest.approx([-0.8])
 
 
-async def test_a_server_reads_the_latest_from_the_end_and_does_not_sort_them_out_of_all(server: Server) -> None:
+async def test_a_server_reads_the_latest_pick_ups_from_the_end_of_an_index(server: Server) -> None:
     log = await EventLog.open(DatabaseAddress.parse(server.new_database()), create=True)
     plans: list[str] = []
 
@@ -159,7 +159,7 @@ async def test_a_server_reads_the_latest_from_the_end_and_does_not_sort_them_out
     picked(script, added(script, "milk", "MILK", (1.0, 0.0, 0.9)), at=(0.4, 0.0))
     event.listen(log.engine.sync_engine, "before_cursor_execute", explained)
     try:
-        assert len(await known(log, script)) == 1
+        assert len(await experience_of(log, script)) == 1
     finally:
         await log.close()
     (plan,) = plans
@@ -167,7 +167,7 @@ async def test_a_server_reads_the_latest_from_the_end_and_does_not_sort_them_out
     assert "Sort" not in plan
 
 
-async def test_a_closed_memory_is_not_asked(log: EventLog) -> None:
+async def test_a_closed_memory_is_not_queried(log: EventLog) -> None:
     asked = PickUpExperience(Reading(log))
     asked.is_closed = True
     with pytest.raises(CallerError, match="the memory is closed, so its experience cannot be read"):

@@ -1,4 +1,4 @@
-"""A memory opened for asking: sessions, named questions, frames."""
+"""A memory opened for reading: sessions, named queries, data frames."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def episode(number: int) -> Script:
 
 @pytest.fixture(scope="module")
 def recorded(module_database_url: str) -> DatabaseAddress:
-    """Episode 1 still runs, episode 2 is over."""
+    """A log in which episode 1 still runs and episode 2 has ended."""
     address = DatabaseAddress.parse(module_database_url)
 
     async def record() -> None:
@@ -121,7 +121,7 @@ async def test_the_number_of_an_episode_is_known_by_its_id(reading: Reading) -> 
 
 
 @pytest.mark.slow
-async def test_a_task_tree_is_told_parents_first_with_depths_and_durations(reading: Reading) -> None:
+async def test_a_task_tree_lists_parents_first_with_depths_and_durations(reading: Reading) -> None:
     tree = await reading.tree(1)
     assert [(each.depth, each.id, each.parent_id, each.dtype, each.status, each.duration_ns) for each in tree] == [
         (0, row(2), None, None, "RUNNING", None),
@@ -139,7 +139,7 @@ async def test_a_task_tree_is_told_parents_first_with_depths_and_durations(readi
 
 
 @pytest.mark.slow
-async def test_a_session_knows_classes_for_every_type_in_the_memory(reading: Reading) -> None:
+async def test_a_session_has_classes_for_every_type_in_the_memory(reading: Reading) -> None:
     async with reading.session() as session:
         actions = (
             await session.scalars(select(Action).where(Action.process_metadata_id == 1).order_by(Action.id))
@@ -152,14 +152,14 @@ async def test_a_session_knows_classes_for_every_type_in_the_memory(reading: Rea
         reading.mapped("WavingAction")
 
 
-async def test_nothing_can_be_written_through_a_session(reading: Reading) -> None:
+async def test_a_session_cannot_write(reading: Reading) -> None:
     async with reading.session() as session:
         connection = await session.connection()
         with pytest.raises(DBAPIError, match=r"read-?only"):
             await connection.exec_driver_sql("DELETE FROM pose__1")
 
 
-async def test_a_memory_that_is_not_there_or_has_no_tables_is_unavailable(log: EventLog, tmp_path: object) -> None:
+async def test_a_memory_that_is_missing_or_has_no_tables_is_unavailable(log: EventLog, tmp_path: object) -> None:
     with pytest.raises(DatabaseUnavailable):
         async with Reading.open(f"sqlite:///{tmp_path}/nothing.db"):
             pass
@@ -171,7 +171,7 @@ async def test_a_memory_that_is_not_there_or_has_no_tables_is_unavailable(log: E
 # --- frames -------------------------------------------------------------------------------------------------------
 
 
-async def test_a_frame_of_the_view_has_its_columns_and_names_for_members(reading: Reading) -> None:
+async def test_a_frame_of_the_view_has_its_columns_and_names_of_enum_members(reading: Reading) -> None:
     frame = await reading.dataframe(select(PickUpWithContextView).order_by(PickUpWithContextView.id))
     assert list(frame.columns) == [
         "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
@@ -187,7 +187,7 @@ async def test_a_frame_of_the_view_has_its_columns_and_names_for_members(reading
     assert len(frame) == 2
 
 
-async def test_a_frame_takes_conditions_with_members_and_joins(reading: Reading) -> None:
+async def test_a_frame_accepts_conditions_with_enum_members_and_joins(reading: Reading) -> None:
     question = (
         select(PickUpAction.arm, Object.name, Pose.x, TaskTreeNode.status)
         .join(PickUpAction.object)
@@ -199,7 +199,7 @@ async def test_a_frame_takes_conditions_with_members_and_joins(reading: Reading)
     assert frame.to_dict("records") == [{"arm": "LEFT", "name": "milk", "x": 1.0, "status": "FAILED"}]
 
 
-async def test_a_frame_has_moments_in_utc(reading: Reading) -> None:
+async def test_a_frame_has_times_in_utc(reading: Reading) -> None:
     question = select(TaskTreeNode.start_time, TaskTreeNode.end_time).where(
         TaskTreeNode.process_metadata_id == 1, TaskTreeNode.kind == "action"
     )
@@ -223,9 +223,7 @@ async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Readin
     assert frame.id.tolist() == frame.id_1.tolist() == [row(3), row(3, number=2)]
 
 
-async def test_enums_are_the_same_text_in_a_frame_and_in_sql_by_hand(
-    reading: Reading, recorded: DatabaseAddress
-) -> None:
+async def test_enums_are_the_same_text_in_a_frame_and_in_plain_sql(reading: Reading, recorded: DatabaseAddress) -> None:
     columns = PickUpAction.arm, PickUpAction.grasp, Object.obj_type, PickUpAction.status
     question = select(*columns).join(PickUpAction.object).order_by(PickUpAction.id)
     frame = await reading.dataframe(question)
@@ -235,12 +233,12 @@ async def test_enums_are_the_same_text_in_a_frame_and_in_sql_by_hand(
         " JOIN object ON object.id = object_designator_id ORDER BY pick_up_action.id"
     )
     assert ask(str(recorded), by_hand) == [tuple(each) for each in frame.values]
-    if str(recorded).startswith("sqlite"):  # the only one with a driver that pandas can use here
+    if str(recorded).startswith("sqlite"):  # the only database with a driver that pandas can use here
         with contextlib.closing(sqlite3.connect(str(recorded).removeprefix("sqlite:///"))) as plain:
             assert pd.read_sql(by_hand, plain).equals(frame)
 
 
-async def test_a_frame_counts_groups_and_takes_aliases(reading: Reading) -> None:
+async def test_a_frame_counts_groups_and_accepts_aliases(reading: Reading) -> None:
     counted = select(TaskTreeNode.status, func.count().label("times")).group_by(TaskTreeNode.status)
     frame = await reading.dataframe(counted.order_by(TaskTreeNode.status))
     assert frame.to_dict("list") == {"status": ["FAILED", "RUNNING", "SUCCEEDED"], "times": [2, 2, 4]}
@@ -256,7 +254,7 @@ async def test_an_empty_answer_is_a_frame_with_columns(reading: Reading) -> None
     assert str(frame.dtypes["time"]) == "datetime64[us, UTC]"
 
 
-async def test_without_pandas_the_extra_is_named(reading: Reading, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_without_pandas_the_error_names_the_extra(reading: Reading, monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
     def without_pandas(name: str, *arguments: Any, **named: Any) -> Any:

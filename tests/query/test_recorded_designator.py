@@ -1,4 +1,4 @@
-"""A designator made from its row has the parameters it had, or says in one line which one it cannot have."""
+"""A designator made from its row has its recorded parameters, or one line names those that it cannot have."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class CookActionPerformable(ActionAbstract):
     _cache: str = "not recorded"
 
     async def perform(self) -> None:
-        """Cooked."""
+        """Succeed without doing anything."""
 
 
 class MixActionPerformable(ActionAbstract):
@@ -90,7 +90,7 @@ class MixActionPerformable(ActionAbstract):
         self.everything = (first, rest, speed, options)
 
     async def perform(self) -> None:
-        """Mixed."""
+        """Succeed without doing anything."""
 
 
 def cooking(scene: Lab) -> CookActionPerformable:
@@ -119,7 +119,7 @@ def cooking(scene: Lab) -> CookActionPerformable:
 
 
 @pytest.mark.parametrize("options", [(), (undefer(Designator.parameters),)])
-async def test_every_kind_of_parameter_comes_back(tmp_path: Path, options: tuple[Any, ...]) -> None:
+async def test_every_kind_of_parameter_is_restored(tmp_path: Path, options: tuple[Any, ...]) -> None:
     async with recorded(tmp_path):
         with lab() as scene:
             cooked = cooking(scene)
@@ -151,7 +151,7 @@ async def test_every_kind_of_parameter_comes_back(tmp_path: Path, options: tuple
     assert CEREAL_AT != (7, 7, 7)
 
 
-async def test_arguments_of_a_class_that_is_no_dataclass_come_back_and_may_be_replaced(tmp_path: Path) -> None:
+async def test_arguments_of_a_class_that_is_no_dataclass_are_restored_and_may_be_replaced(tmp_path: Path) -> None:
     async with recorded(tmp_path):
         for mixed in (
             MixActionPerformable("a", 1, 2, speed=0.5, sugar="much"),
@@ -167,7 +167,7 @@ async def test_arguments_of_a_class_that_is_no_dataclass_come_back_and_may_be_re
     assert str(refused.value) == "MixAction has no parameter 'velocity'; its parameters: first, rest, speed, options"
 
 
-async def test_a_motion_comes_back_with_its_joints(tmp_path: Path) -> None:
+async def test_a_motion_is_restored_with_its_joints(tmp_path: Path) -> None:
     targets = {"l_wrist_roll_joint": 0.5}
     async with recorded(tmp_path):
         with lab():
@@ -184,11 +184,11 @@ class StrangeActionPerformable(ActionAbstract):
     anything: Any = None
 
     async def perform(self) -> None:
-        """Odd."""
+        """Succeed without doing anything."""
 
 
 async def strange_row(folder: Path, *options: Any) -> Any:
-    """Of an action whose fields were recorded as missing."""
+    """Return the row of an action whose fields were recorded as missing."""
     async with Memory.open(url_of(folder)) as memory:
         async with memory.episode():
             await StrangeActionPerformable("odd", [float("nan")], float("inf"), object()).perform()
@@ -214,7 +214,7 @@ async def test_a_parameter_that_was_not_recorded_is_named_with_the_reason_and_ma
     assert performable_of(row, **passed) == StrangeActionPerformable("odd", [1.0], 1.0, 1.0)
 
 
-async def test_objects_and_places_that_the_present_world_lacks_are_named(tmp_path: Path) -> None:
+async def test_objects_and_places_that_the_current_world_lacks_are_named(tmp_path: Path) -> None:
     async with recorded(tmp_path):
         with lab() as scene:
             await cooking(scene).perform()
@@ -228,7 +228,7 @@ async def test_objects_and_places_that_the_present_world_lacks_are_named(tmp_pat
     assert str(refused.value) == "'milk' is not in the world; its objects are: pr2, cereal"
 
 
-async def test_a_class_that_is_not_imported_and_one_that_is_there_twice_are_named(tmp_path: Path) -> None:
+async def test_a_class_that_is_not_imported_and_one_that_is_defined_twice_are_named(tmp_path: Path) -> None:
     async with recorded(tmp_path):
         await NoteActionPerformable("once").perform()
         await (NoteActionPerformable("a") + NoteActionPerformable("b")).perform()
@@ -253,7 +253,7 @@ async def test_a_class_that_is_not_imported_and_one_that_is_there_twice_are_name
     row.dtype = "TwiceAction"
     with pytest.raises(NotPerformable) as refused:
         performable_of(row)
-    path = f"{__name__}.test_a_class_that_is_not_imported_and_one_that_is_there_twice_are_named.<locals>"
+    path = f"{__name__}.test_a_class_that_is_not_imported_and_one_that_is_defined_twice_are_named.<locals>"
     assert str(refused.value) == f"several classes have the dtype 'TwiceAction': {path}.Here, {path}.There"
 
 

@@ -1,4 +1,4 @@
-"""A world made from a snapshot has its objects as they were then, or says in one line why it cannot."""
+"""A world made from a snapshot has its objects in their state, or one line gives the reason why it cannot."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ AT = Pose([1, 2, 0.5], [0, 0, 0.6, 0.8])
 NARROW = box_urdf("milk", x=(0, 0.01), y=(0, 0.01), z=(0, 0.01))
 
 
-def then(
+def recorded_snapshot(
     name: str,
     object_type: str = "MILK",
     pose: Pose = AT,
@@ -37,9 +37,9 @@ def test_built_in_shapes_are_used_where_name_and_type_have_one() -> None:
     with BulletWorld():
         built_in = [Object("pr2", ObjectType.ROBOT), Object("milk", ObjectType.MILK)]
     moment = snapshot(
-        then("pr2", "ROBOT", joints={"torso_lift_joint": 0.2}),
-        then("milk", attached_to=("pr2", "l_gripper_tool_frame")),
-        then("kitchen", "ENVIRONMENT", Pose()),
+        recorded_snapshot("pr2", "ROBOT", joints={"torso_lift_joint": 0.2}),
+        recorded_snapshot("milk", attached_to=("pr2", "l_gripper_tool_frame")),
+        recorded_snapshot("kitchen", "ENVIRONMENT", Pose()),
     )
     with world_of(moment) as world:
         assert current_world.get() is world
@@ -52,27 +52,27 @@ def test_built_in_shapes_are_used_where_name_and_type_have_one() -> None:
 
 
 @pytest.mark.parametrize("name", ["unnamed & <bold>", "tiago"])
-def test_a_stand_in_takes_the_recorded_joints_links_and_attachments(name: str) -> None:
+def test_a_placeholder_has_the_recorded_joints_links_and_attachments(name: str) -> None:
     moment = snapshot(
-        then(name, "ROBOT", joints={"elbow": 12.5, "torso": -0.3}),
-        then("milk", attached_to=(name, "hand")),
-        then("bowl", "BOWL", attached_to=(name, None)),
-        then("cupboard", "GENERIC_OBJECT", joints={"door": 1.0}),
+        recorded_snapshot(name, "ROBOT", joints={"elbow": 12.5, "torso": -0.3}),
+        recorded_snapshot("milk", attached_to=(name, "hand")),
+        recorded_snapshot("bowl", "BOWL", attached_to=(name, None)),
+        recorded_snapshot("cupboard", "GENERIC_OBJECT", joints={"door": 1.0}),
     )
     with world_of(moment) as world:
         robot, milk, bowl, cupboard = world.objects
         assert robot.joint_positions() == {"elbow": 12.5, "torso": -0.3}
         assert cupboard.joint_positions() == {"door": 1.0}
         assert robot.attachments == {milk: "hand", bowl: None}
-        assert tuple(robot.bounding_box().size) == pytest.approx((0.124, 0.124, 0.1))  # turned by 73.74°
+        assert tuple(robot.bounding_box().size) == pytest.approx((0.124, 0.124, 0.1))  # rotated by 73.74°
         robot.set_pose(Pose([5, 5, 5], AT.orientation))
         assert milk.pose.position == bowl.pose.position == pytest.approx((5, 5, 5))
 
 
-def test_a_description_of_the_users_own_replaces_the_built_in_shape(tmp_path: Path) -> None:
+def test_a_users_description_replaces_the_built_in_shape(tmp_path: Path) -> None:
     (tmp_path / "milk.urdf").write_text(NARROW)
     for description in (NARROW, tmp_path / "milk.urdf"):
-        with world_of(snapshot(then("milk", pose=Pose())), descriptions={"milk": description}) as world:
+        with world_of(snapshot(recorded_snapshot("milk", pose=Pose())), descriptions={"milk": description}) as world:
             assert tuple(world.object("milk").bounding_box().size) == pytest.approx((0.01, 0.01, 0.01))
 
 
@@ -80,12 +80,12 @@ def test_a_description_of_the_users_own_replaces_the_built_in_shape(tmp_path: Pa
     ("moment", "error", "message"),
     [
         (
-            snapshot(then("milk", joints={"lid": 1.0})),
+            snapshot(recorded_snapshot("milk", joints={"lid": 1.0})),
             UnknownJoint,
             "'milk' has no movable joint 'lid'; its joints are: none",
         ),
         (
-            snapshot(then("milk"), then("bowl", "BOWL", attached_to=("milk", "lid"))),
+            snapshot(recorded_snapshot("milk"), recorded_snapshot("bowl", "BOWL", attached_to=("milk", "lid"))),
             UnknownLink,
             "'milk' has no link 'lid'; its links are: milk",
         ),
@@ -105,20 +105,20 @@ def test_a_description_that_does_not_fit_the_recorded_state_is_refused(
             _ = world.client
 
 
-def test_a_snapshot_that_no_world_can_show_is_refused_in_one_line() -> None:
+def test_an_impossible_snapshot_is_refused_in_one_line() -> None:
     with pytest.raises(DuplicateName, match="an object named 'milk'"):
-        world_of(snapshot(then("milk"), then("milk")))
+        world_of(snapshot(recorded_snapshot("milk"), recorded_snapshot("milk")))
     with pytest.raises(CallerError) as refused:
-        world_of(snapshot(then("drink", "LEMONADE")))
+        world_of(snapshot(recorded_snapshot("drink", "LEMONADE")))
     assert str(refused.value) == ("object 'drink' was recorded with the type 'LEMONADE', which ObjectType lacks here")
     with pytest.raises(CallerError) as refused:
-        world_of(snapshot(then("milk")), descriptions={"melk": NARROW})
+        world_of(snapshot(recorded_snapshot("milk")), descriptions={"melk": NARROW})
     assert str(refused.value) == "the snapshot has no object 'melk' to describe; its objects: milk"
 
 
-def test_an_empty_snapshot_gives_an_empty_world_and_a_world_can_be_connected() -> None:
+def test_an_empty_snapshot_makes_an_empty_world_and_a_world_can_be_connected() -> None:
     with world_of(snapshot()) as world:
         assert world.objects == ()
-    world = world_of(snapshot(then("milk")), mode=WorldMode.DIRECT).connect()
+    world = world_of(snapshot(recorded_snapshot("milk")), mode=WorldMode.DIRECT).connect()
     assert [each.name for each in world.objects] == ["milk"]
     world.close()

@@ -1,4 +1,4 @@
-"""What was only thought through is left out of every answer, unless it is asked for; on each kind of database."""
+"""Simulations are left out of every answer unless the query asks for them; on each kind of database."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ from tests.projections.event_script import (
 from tests.projections.sql_queries import ask, names
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 CAREFUL = declared(
     "CarefulPickUpAction", "careful_pick_up_action", *PICK_UP.fields, field("speed", "real", 5),
@@ -70,7 +70,7 @@ REACHED = UserView("reached", select(PickUpAction.arm, PoseRow.x).join(PickUpAct
 
 
 def everything(number: int, thinker: NodeReference | None = None) -> Script:
-    """An episode with a row in every table; a thought, if somebody thinks it."""
+    """Return an episode with a row in every table; a simulation if a node caused it."""
     script = Script(number)
     put, simulated = script.put, thinker is not None
     put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=simulated, thought_by=thinker))  # 1
@@ -114,8 +114,8 @@ async def remembered(log: EventLog, *scripts: Script) -> None:
     await projector.catch_up()
 
 
-async def shown(log: EventLog) -> dict[str, list[Any]]:
-    """Every view with its rows, read past every class of ours."""
+async def rows_by_view(log: EventLog) -> dict[str, list[Any]]:
+    """Return every view with its rows, read by plain SQL."""
     return {
         name: sorted(await ask(log, f'SELECT * FROM "{name}"'), key=repr)
         for name in await names(log, "view")
@@ -123,21 +123,21 @@ async def shown(log: EventLog) -> dict[str, list[Any]]:
     }
 
 
-async def test_every_view_shows_the_same_with_and_without_thoughts(log: EventLog) -> None:
+async def test_every_view_shows_the_same_rows_whether_or_not_simulations_were_recorded(log: EventLog) -> None:
     await remembered(log, everything(1))
-    before = await shown(log)
+    before = await rows_by_view(log)
     leaves = {each.table for each in TYPES}
     own = set(COLUMNS) - {"simulated_episode"} | {"designator", "action", "motion", "language", "robot_state"}
     own |= {"position", "quaternion", "designator_type", "PickUpWithContextView", "reached", *leaves}
     assert [name for name in own if not before[name]] == []
     await remembered(log, everything(2, THOUGHT), everything(3, NodeReference(episode_text(Script(2).episode), 2)))
-    assert await shown(log) == before
+    assert await rows_by_view(log) == before
 
 
-async def test_a_session_that_asks_for_thoughts_sees_them_in_every_view(log: EventLog) -> None:
+async def test_a_session_that_asks_for_simulations_sees_them_in_every_view(log: EventLog) -> None:
     """As many rows again as the real episode has, in each of the views."""
     await remembered(log, everything(1), everything(2, THOUGHT))
-    once = {name: len(rows) for name, rows in (await shown(log)).items()}
+    once = {name: len(rows) for name, rows in (await rows_by_view(log)).items()}
     async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
         connection = await session.connection()
         for name, count in once.items():
@@ -145,7 +145,7 @@ async def test_a_session_that_asks_for_thoughts_sees_them_in_every_view(log: Eve
             assert (name, answer.scalar_one()) == (name, count if name == "designator_type" else 2 * count)
 
 
-async def test_the_same_questions_see_thoughts_where_they_are_asked_for(log: EventLog) -> None:
+async def test_the_same_queries_return_simulations_on_request(log: EventLog) -> None:
     await remembered(log, everything(1), everything(2, THOUGHT))
     asked = select(TaskTreeNode.process_metadata_id, TaskTreeNode.simulated).distinct().order_by("process_metadata_id")
     async with Reading.open_address(log.address) as reading:
@@ -179,7 +179,7 @@ async def test_the_same_questions_see_thoughts_where_they_are_asked_for(log: Eve
         assert [list(frame.x) for frame in reached] == [[2.0, 2.0], [2.0] * 4]
 
 
-async def test_nobody_else_sees_what_one_session_asked_for(log: EventLog) -> None:
+async def test_other_sessions_do_not_see_the_simulations_that_one_session_asked_for(log: EventLog) -> None:
     await remembered(log, everything(1), everything(2, THOUGHT))
     count = select(func.count()).select_from(TaskTreeNode)
     async with Reading.open_address(log.address) as reading:
@@ -195,8 +195,8 @@ async def test_nobody_else_sees_what_one_session_asked_for(log: EventLog) -> Non
             assert await again.scalar(count) == 12
 
 
-async def test_what_came_since_is_seen_with_thoughts_too(log: EventLog) -> None:
-    """Also of a type that was declared since, and in the same session."""
+async def test_later_simulations_are_visible_too(log: EventLog) -> None:
+    """Including those of a type that was declared since, in the same session."""
     new = declared("WaveAction", "wave_action", field("times", "integer", 2))
     await remembered(log, everything(1))
     async with Reading.open_address(log.address) as reading:
@@ -219,7 +219,7 @@ async def test_what_came_since_is_seen_with_thoughts_too(log: EventLog) -> None:
             assert (await session.scalars(select(wave))).all() == []
 
 
-async def test_a_session_with_thoughts_writes_nothing(log: EventLog) -> None:
+async def test_a_session_with_simulations_cannot_write(log: EventLog) -> None:
     await remembered(log, everything(1))
     before = await names(log, "table", "view")
     async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
@@ -228,7 +228,7 @@ async def test_a_session_with_thoughts_writes_nothing(log: EventLog) -> None:
     assert await names(log, "table", "view") == before
 
 
-async def test_the_overview_leaves_thoughts_out_unless_they_are_asked_for(log: EventLog) -> None:
+async def test_the_overview_leaves_simulations_out_unless_asked(log: EventLog) -> None:
     deeper = NodeReference(episode_text(Script(2).episode), 2)
     elsewhere = NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
     await remembered(log, everything(1), everything(2, THOUGHT), everything(3, deeper), everything(4, elsewhere))
@@ -246,7 +246,7 @@ async def test_the_overview_leaves_thoughts_out_unless_they_are_asked_for(log: E
     assert {(each.nodes, each.failed) for each in all_of_them} == {(6, 1)}
 
 
-async def test_an_episode_is_found_though_it_was_only_thought_and_the_last_one_really_happened(log: EventLog) -> None:
+async def test_a_simulated_episode_is_found_by_name_and_the_last_episode_is_a_real_one(log: EventLog) -> None:
     await remembered(log, everything(1), everything(2, THOUGHT))
     async with Reading.open_address(log.address) as reading:
         assert (await reading.episode("2")).simulated
@@ -256,7 +256,7 @@ async def test_an_episode_is_found_though_it_was_only_thought_and_the_last_one_r
             await reading.episode("3")
 
 
-async def test_a_tree_names_the_thoughts_of_its_nodes_and_that_of_a_thought_is_shown(log: EventLog) -> None:
+async def test_a_tree_names_the_simulations_of_its_nodes_and_a_simulations_own_tree_is_printed(log: EventLog) -> None:
     root = NodeReference(episode_text(REAL), 2)
     await remembered(log, everything(1), everything(2, THOUGHT), everything(3, THOUGHT), everything(4, root))
     async with Reading.open_address(log.address) as reading:
@@ -274,7 +274,7 @@ async def test_a_tree_names_the_thoughts_of_its_nodes_and_that_of_a_thought_is_s
     assert thought[4].failure_message == "too far"
 
 
-async def test_a_memory_of_thoughts_alone_has_no_last_episode(log: EventLog) -> None:
+async def test_a_memory_of_simulations_alone_has_no_last_episode(log: EventLog) -> None:
     await remembered(log, everything(1, THOUGHT))
     async with Reading.open_address(log.address) as reading:
         assert await reading.episodes() == []

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from pycrorm_async.world import BulletWorld
-from tests.world.fakes import Witness
+from tests.world.fakes import ChangeLog
 
 
 @pytest.fixture
@@ -15,8 +15,8 @@ def world() -> Iterator[BulletWorld]:
 
 
 @pytest.fixture
-def witness(world: BulletWorld) -> Witness:
-    """Told of all that happens in `world`."""
-    observer = Witness()
+def change_log(world: BulletWorld) -> ChangeLog:
+    """Return an observer that notes every change of `world`."""
+    observer = ChangeLog()
     world.observe(observer)
     return observer

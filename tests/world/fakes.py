@@ -1,4 +1,4 @@
-"""What the tests of the world share: an observer that notes all it is told, a crane, and matrices of our own."""
+"""Fakes and models for the tests of the world: an observer that notes changes, a crane, and independent matrices."""
 
 from __future__ import annotations
 
@@ -14,33 +14,33 @@ from pycrorm_async.world import Object, Pose
 Matrix = NDArray[np.float64]
 
 
-class Witness:
-    """An observer: `told` is the list of all that it was told, with the poses as they were at that moment."""
+class ChangeLog:
+    """An observer: `notes` lists every change with the pose at that moment."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[Any, ...]] = []
+        self.notes: list[tuple[Any, ...]] = []
 
     def object_added(self, added: Object) -> None:
-        self.told.append(("added", added.name, added.pose))
+        self.notes.append(("added", added.name, added.pose))
 
     def object_removed(self, removed: Object) -> None:
-        self.told.append(("removed", removed.name, removed.pose))
+        self.notes.append(("removed", removed.name, removed.pose))
 
     def object_moved(self, moved: Object) -> None:
-        self.told.append(("moved", moved.name, moved.pose))
+        self.notes.append(("moved", moved.name, moved.pose))
 
     def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
-        self.told.append(("joints", moved.name, dict(positions)))
+        self.notes.append(("joints", moved.name, dict(positions)))
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        self.told.append(("attached", parent.name, child.name, link))
+        self.notes.append(("attached", parent.name, child.name, link))
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        self.told.append(("detached", parent.name, child.name, link))
+        self.notes.append(("detached", parent.name, child.name, link))
 
     def names(self) -> list[tuple[Any, ...]]:
-        """What happened to whom, without the poses."""
-        return [entry[:2] for entry in self.told]
+        """Return the kind of each change and its object, without the poses."""
+        return [entry[:2] for entry in self.notes]
 
 
 _INERTIAL = (
@@ -63,7 +63,7 @@ CRANE = f"""<?xml version="1.0"?>
 
 
 def matrix(pose: Pose) -> Matrix:
-    """The 4 by 4 matrix of a pose, by way of its axis and angle."""
+    """Return the 4 by 4 matrix of a pose, by way of its axis and angle."""
     x, y, z, w = pose.orientation
     length = math.sqrt(x * x + y * y + z * z)
     axis = (x / length, y / length, z / length) if length else (0.0, 0.0, 1.0)
@@ -77,7 +77,7 @@ def shifted(x: float, y: float, z: float) -> Matrix:
 
 
 def turned(axis: Sequence[float], angle: float) -> Matrix:
-    """Rodrigues' formula."""
+    """Return the rotation by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     result = np.eye(4)
@@ -89,7 +89,7 @@ X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def crane_links(base: Pose, *, turning: float, lifting: float, reaching: float) -> dict[str, Matrix]:
-    """Where the crane's links are, from the numbers in its description."""
+    """Return the frames of the crane's links, from the numbers in its description."""
     foot = matrix(base)
     mast = foot @ shifted(0.1, 0, 0.5) @ turned(Z, turning)
     boom = mast @ shifted(0, 0.2, 0.3) @ turned(Z, 0.7) @ turned(Y, lifting)

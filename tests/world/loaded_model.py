@@ -1,4 +1,4 @@
-"""A model as Bullet itself sees it, without our world in between: the oracle for frames and forward kinematics."""
+"""A model loaded directly into Bullet, without the package's world: the oracle for frames and forward kinematics."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class LoadedModel:
 
 
 def random_arm(rng: random.Random, arm: Arms, limits: Limits) -> dict[str, float]:
-    """Joint angles drawn evenly from inside the limits."""
+    """Return joint angles drawn uniformly within the limits."""
     bounds = PR2.arms[arm].limits(limits)
     return {
         name: rng.uniform(max(bounds[name].lower, -3.14), min(bounds[name].upper, 3.14))
@@ -65,13 +65,13 @@ def random_arm(rng: random.Random, arm: Arms, limits: Limits) -> dict[str, float
     }
 
 
-def random_stand(rng: random.Random) -> tuple[Pose, float]:
-    """A base pose, not only upright, and a torso height."""
+def random_base_pose(rng: random.Random) -> tuple[Pose, float]:
+    """Return a base pose, not only upright, and a torso height."""
     turn = [rng.gauss(0, 1) for _ in range(4)]
     return Pose([rng.uniform(-3, 3) for _ in range(3)], turn), rng.uniform(0.0, 0.33)
 
 
 def angle_between(a: Quaternion, b: Quaternion) -> float:
-    """Rad; exact also for small angles."""
+    """Return the angle in rad; it is exact also for small angles."""
     x, y, z, _ = product((-a.x, -a.y, -a.z, a.w), b)
     return 2 * math.hypot(x, y, z)

@@ -1,4 +1,4 @@
-"""Inverse kinematics: exact where it answers, right where it refuses, the same every time."""
+"""Inverse kinematics: exact solutions, correct refusals, and the same answer every time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pycrorm_async.world.models.pr2 import pr2_urdf
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated, yaw_quaternion
 from pycrorm_async.world.robots.kinematics import Unreachable, forward, solve, solve_from
 from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS, PR2, Limits
-from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_stand
+from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
 
 ARMS = (Arms.LEFT, Arms.RIGHT)
 EXACT = 1e-6
@@ -33,7 +33,7 @@ def reached(arm: Arms, joints: dict[str, float], *, base: Pose, torso_height: fl
 
 
 def least_margin(arm: Arms, joints: dict[str, float], limits: Limits) -> float:
-    """Rad between the joint nearest to a limit and that limit; negative if one is outside."""
+    """Return the angle in rad between the joint nearest to a limit and that limit; negative if a joint is outside."""
     bounds = PR2.arms[arm].limits(limits)
     return min(min(joints[name] - lower, upper - joints[name]) for name, (lower, upper) in bounds.items())
 
@@ -50,11 +50,13 @@ def model(tmp_path: Path) -> Iterator[LoadedModel]:
 @pytest.mark.slow
 @pytest.mark.parametrize("limits", Limits)
 @pytest.mark.parametrize("arm", ARMS)
-def test_whatever_a_posture_within_limits_reaches_is_solved_exactly_within_limits(arm: Arms, limits: Limits) -> None:
+def test_a_target_that_a_posture_within_limits_reaches_is_solved_exactly_within_limits(
+    arm: Arms, limits: Limits
+) -> None:
     rng = random.Random(31)
     for _ in range(3000):
         joints = random_arm(rng, arm, limits)
-        base, torso_height = random_stand(rng)
+        base, torso_height = random_base_pose(rng)
         target = reached(arm, joints, base=base, torso_height=torso_height)
         answer = solve_from(PR2, arm, target, base=base, torso_height=torso_height, limits=limits)
         there = reached(arm, answer, base=base, torso_height=torso_height)
@@ -66,11 +68,11 @@ def test_whatever_a_posture_within_limits_reaches_is_solved_exactly_within_limit
 
 @pytest.mark.parametrize("limits", Limits)
 @pytest.mark.parametrize("arm", ARMS)
-def test_answers_lead_there_in_bullet_too(model: LoadedModel, arm: Arms, limits: Limits) -> None:
+def test_solutions_reach_their_target_in_bullet_too(model: LoadedModel, arm: Arms, limits: Limits) -> None:
     rng = random.Random(32)
     tool = PR2.arms[arm].tool_frame
     for _ in range(300):
-        base, torso_height = random_stand(rng)
+        base, torso_height = random_base_pose(rng)
         torso = {PR2.torso_joint: torso_height}
         model.put(base=base, joints=random_arm(rng, arm, limits) | torso)
         target = model.link_pose(tool)
@@ -81,7 +83,7 @@ def test_answers_lead_there_in_bullet_too(model: LoadedModel, arm: Arms, limits:
 
 
 @pytest.mark.parametrize("limits", Limits)
-def test_the_answer_stays_as_far_from_the_limits_as_any_other_posture(limits: Limits) -> None:
+def test_a_solution_stays_as_far_from_the_limits_as_any_other_posture(limits: Limits) -> None:
     rng = random.Random(33)
     for _ in range(1000):
         joints = random_arm(rng, Arms.LEFT, limits)
@@ -91,7 +93,7 @@ def test_the_answer_stays_as_far_from_the_limits_as_any_other_posture(limits: Li
         assert least_margin(Arms.LEFT, answer, limits) > least_margin(Arms.LEFT, joints, limits) - one_step
 
 
-def test_the_stretched_arm_is_within_hard_limits_and_out_of_soft_ones() -> None:
+def test_the_stretched_arm_is_within_hard_limits_and_outside_soft_ones() -> None:
     for arm in ARMS:
         stretched = dict.fromkeys(PR2.arms[arm].joints, 0.0)
         target = reached(arm, stretched, base=Pose(), torso_height=0.0)
@@ -115,24 +117,24 @@ def test_the_arms_are_mirror_images() -> None:
         assert list(right.values()) == pytest.approx(expected, abs=1e-6)
 
 
-def test_what_matters_is_the_target_as_the_torso_sees_it() -> None:
+def test_only_the_target_relative_to_the_torso_matters() -> None:
     rng = random.Random(35)
     plain = solve_from(PR2, Arms.LEFT, AHEAD, base=Pose(), torso_height=0.0)
     for _ in range(50):
-        base, torso_height = random_stand(rng)
+        base, torso_height = random_base_pose(rng)
         lifted = base @ Pose([AHEAD.position.x, AHEAD.position.y, AHEAD.position.z + torso_height])
         answer = solve_from(PR2, Arms.LEFT, lifted, base=base, torso_height=torso_height)
         assert list(answer.values()) == pytest.approx(list(plain.values()), abs=1e-6)
 
 
-def test_a_torso_outside_its_soft_range_is_taken_as_it_is() -> None:
+def test_a_torso_outside_its_soft_range_is_accepted_as_it_is() -> None:
     for torso_height in (0.0, 0.33):
         answer = solve_from(PR2, Arms.LEFT, AHEAD, base=Pose(), torso_height=torso_height)
         there = reached(Arms.LEFT, answer, base=Pose(), torso_height=torso_height)
         assert there.distance(AHEAD) < EXACT
 
 
-def test_the_hand_is_turned_as_asked_or_the_target_refused() -> None:
+def test_the_hand_has_the_requested_orientation_or_the_target_is_refused() -> None:
     turns = [yaw_quaternion(angle) for angle in (0.0, 0.4, -0.7)]
     for turn in turns:
         target = Pose(AHEAD.position, turn)
@@ -146,7 +148,7 @@ def test_the_hand_is_turned_as_asked_or_the_target_refused() -> None:
 
 @pytest.mark.parametrize("limits", Limits)
 @pytest.mark.parametrize("arm", ARMS)
-def test_three_metres_away_is_refused_as_too_far(arm: Arms, limits: Limits) -> None:
+def test_a_target_three_metres_away_is_refused_as_too_far(arm: Arms, limits: Limits) -> None:
     target = Pose([3.0, 0.0, 0.9])
     with pytest.raises(Unreachable, match="too far: from shoulder to wrist") as refused:
         solve_from(PR2, arm, target, base=Pose(), torso_height=0.0, limits=limits)
@@ -164,7 +166,7 @@ def test_a_wrist_inside_its_own_shoulder_is_refused_as_too_near(grasp: Grasp, li
         solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0, limits=limits)
 
 
-def test_a_refusal_says_which_limit_stands_against_it() -> None:
+def test_a_refusal_names_the_limit_that_prevents_it() -> None:
     def reason(target: Pose) -> str:
         with pytest.raises(Unreachable) as refused:
             solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0)
@@ -179,7 +181,7 @@ def test_a_refusal_says_which_limit_stands_against_it() -> None:
     assert "outside its soft limits" in reason(from_above)
 
 
-def test_unreachable_is_an_outcome_and_nobodys_fault() -> None:
+def test_an_unreachable_target_is_an_outcome_and_no_fault_of_the_package() -> None:
     assert not issubclass(Unreachable, PycrormError)
 
 
@@ -192,7 +194,7 @@ def test_unreachable_is_an_outcome_and_nobodys_fault() -> None:
         (Arms.LEFT, Pose([0, math.inf, 0]), "not finite"),
     ],
 )
-def test_a_question_that_makes_no_sense_is_the_callers_error(arm: Arms, target: Pose, says: str) -> None:
+def test_an_invalid_request_is_the_callers_error(arm: Arms, target: Pose, says: str) -> None:
     with pytest.raises(CallerError, match=says):
         solve_from(PR2, arm, target, base=Pose(), torso_height=0.0)
 
@@ -215,7 +217,7 @@ for _ in range(400):
 """
 
 
-def test_the_same_question_has_the_same_answer_to_the_bit_here_again_and_in_another_process() -> None:
+def test_the_same_request_has_the_same_answer_to_the_bit_here_again_and_in_another_process() -> None:
     def here() -> str:
         names: dict[str, hashlib._Hash] = {}
         exec(FINGERPRINT, names)
@@ -230,7 +232,7 @@ def test_the_same_question_has_the_same_answer_to_the_bit_here_again_and_in_anot
 # --- the robot of a world -------------------------------------------------------------------------------------------
 
 
-def test_a_robot_in_a_world_is_asked_where_it_stands_and_is_not_moved() -> None:
+def test_a_solution_uses_the_robots_pose_in_the_world_and_does_not_move_it() -> None:
     with BulletWorld():
         robot = Object("pr2", ObjectType.ROBOT, pose=Pose([1.0, -0.5, 0.0], yaw_quaternion(0.7)))
         robot.set_joint_position("torso_lift_joint", 0.25)
@@ -243,7 +245,7 @@ def test_a_robot_in_a_world_is_asked_where_it_stands_and_is_not_moved() -> None:
         assert robot.link_pose("r_gripper_tool_frame").distance(target) < EXACT
 
 
-def test_hard_limits_are_those_of_the_loaded_model_where_it_stops_earlier() -> None:
+def test_hard_limits_are_those_of_the_loaded_model_if_they_are_narrower() -> None:
     target = Pose([0.55, 0.3, 0.75], GRASP_ORIENTATIONS[Grasp.TOP])
     stiff = pr2_urdf().replace('lower="-2.18"', 'lower="-1.0"')
     with BulletWorld():
@@ -263,11 +265,13 @@ def test_a_robot_without_a_description_is_the_callers_error() -> None:
             solve(cereal, Arms.LEFT, AHEAD)
 
 
-# --- the thesis' default policy -------------------------------------------------------------------------------------
+# --- the default policy of the thesis ---------------------------------------------------------------------------------
 
 
 def default_pick_up(rng: random.Random) -> tuple[Arms, Grasp, Pose, list[Pose]]:
-    """A random stand around milk at (1.3, 1, 0.9) that faces it, arm, grasp, and the three poses of a pick up."""
+    """Return a random base pose around milk at (1.3, 1, 0.9) that faces it, arm, grasp, and the three poses of a
+    pick-up.
+    """
     arm, grasp = rng.choice(ARMS), rng.choice(list(Grasp))
     x = y = 0.0
     while max(abs(x), abs(y)) < 0.2 or max(abs(x), abs(y)) > 2:
@@ -282,7 +286,7 @@ def default_pick_up(rng: random.Random) -> tuple[Arms, Grasp, Pose, list[Pose]]:
 
 
 def picked_up(limits: Limits, *, attempts: int) -> tuple[float, dict[Grasp, float]]:
-    """Share of attempts that succeed, in percent: of all, and of those with each grasp."""
+    """Return the percentage of attempts that succeed: of all, and of those with each grasp."""
     rng = random.Random(69)
     tried: Counter[Grasp] = Counter()
     done: Counter[Grasp] = Counter()
@@ -299,7 +303,7 @@ def picked_up(limits: Limits, *, attempts: int) -> tuple[float, dict[Grasp, floa
 
 
 @pytest.mark.slow
-def test_hard_limits_double_the_default_policys_success_and_allow_grasps_from_above() -> None:
+def test_hard_limits_double_the_success_of_the_default_policy_and_allow_grasps_from_above() -> None:
     soft, soft_by_grasp = picked_up(Limits.SOFT, attempts=2000)
     hard, hard_by_grasp = picked_up(Limits.HARD, attempts=2000)
     assert 1.7 < hard / soft < 2.2
@@ -307,7 +311,7 @@ def test_hard_limits_double_the_default_policys_success_and_allow_grasps_from_ab
     assert hard_by_grasp[Grasp.TOP] > 26
 
 
-def test_with_another_torso_height_the_answer_is_that_of_the_raised_torso_and_nothing_moves() -> None:
+def test_another_torso_height_has_the_solution_of_that_torso_and_nothing_moves() -> None:
     with BulletWorld():
         robot = Object("pr2", ObjectType.ROBOT)
         asked = solve(robot, Arms.LEFT, AHEAD, torso_height=0.25)

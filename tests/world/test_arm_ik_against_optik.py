@@ -1,4 +1,4 @@
-"""What is refused as unreachable, asked of a solver that somebody else wrote: optik, numerically, from anywhere."""
+"""Compare refusals as unreachable with an independent numerical solver, optik, started from random postures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ MILK = Pose((1.3, 1.0, 0.9))
 
 @pytest.fixture(scope="module")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> dict[Arms, optik.Robot]:
-    """The arms of the model, from the torso to the tool frame, within soft limits; rolls within a turn."""
+    """Return the arms of the model, from the torso to the tool frame, within soft limits; rolls within one turn."""
     model = ET.fromstring(pr2_urdf())
     soft = {joint: bounds for arm in PR2.arms.values() for joint, bounds in arm.soft_limits.items()}
     for joint in model.iter("joint"):
@@ -49,7 +49,7 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> dict[Arms, optik.Robot]:
 
 
 def goals_of(choice: PickUpChoice) -> tuple[PickUpPoses, Pose]:
-    """The three goals of the hand, and where the base stands for them, as the standard experiment has it."""
+    """Return the three goals of the hand and the base pose for them, as in the standard experiment."""
     x, y = MILK.position.x + choice.relative_x, MILK.position.y + choice.relative_y
     base = Pose((x, y, 0.0), yaw_quaternion(math.atan2(MILK.position.y - y, MILK.position.x - x)))
     return pick_up_poses(MILK, choice.grasp, base), base
@@ -68,7 +68,7 @@ def reached_by_optik(robot: optik.Robot, goal: Pose, base: Pose, rng: np.random.
     return robot.ik(config, target.tolist(), rng.uniform(*robot.joint_limits()).tolist()) is not None
 
 
-def test_hardly_a_rollout_fails_at_what_another_solver_reaches(robots: dict[Arms, optik.Robot]) -> None:
+def test_few_rollouts_fail_at_a_target_that_another_solver_reaches(robots: dict[Arms, optik.Robot]) -> None:
     rng = np.random.default_rng(1)
     falsely, refused, agreed = 0, 0, 0
     for index in range(ROLLOUTS):
@@ -83,5 +83,5 @@ def test_hardly_a_rollout_fails_at_what_another_solver_reaches(robots: dict[Arms
                 break
             agreed += reached_by_optik(robots[choice.arm], goal, base, rng)
     assert refused > 300
-    assert agreed > 150  # the other one does find what there is
+    assert agreed > 150  # the other solver finds the existing solutions
     assert falsely <= 0.005 * ROLLOUTS

@@ -1,4 +1,4 @@
-"""A world is entered once, is the current one inside, tells its observers, and goes back to how it was."""
+"""A world is entered once, is the current one inside, notifies its observers, and can be restored."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from pycrorm_async.world.errors import (
     WorldUnavailable,
 )
 from pycrorm_async.world.state import WorldState
-from tests.world.fakes import CRANE, Witness
+from tests.world.fakes import CRANE, ChangeLog
 
 # --- entering and leaving -------------------------------------------------------------------------------------
 
 
 class Watching:
     def __init__(self, refusal: Exception | None = None) -> None:
-        self.told: list[tuple[str, BulletWorld, bool]] = []
+        self.notes: list[tuple[str, BulletWorld, bool]] = []
         self.refusal = refusal
 
     def world_entered(self, world: BulletWorld) -> None:
-        self.told.append(("entered", world, current_world.get() is world))
+        self.notes.append(("entered", world, current_world.get() is world))
         if self.refusal is not None:
             raise self.refusal
 
     def world_left(self, world: BulletWorld) -> None:
-        self.told.append(("left", world, world.entered))
+        self.notes.append(("left", world, world.entered))
 
 
-def test_inside_it_is_the_current_world_and_after_it_the_former_one_is() -> None:
+def test_a_world_is_the_current_one_inside_and_its_predecessor_is_afterwards() -> None:
     assert current_world.get() is None
     with BulletWorld() as outer:
         assert current_world.get() is outer
@@ -55,7 +55,7 @@ def test_inside_it_is_the_current_world_and_after_it_the_former_one_is() -> None
     assert current_world.get() is None
 
 
-def test_it_can_be_left_from_another_context_than_it_was_entered_in() -> None:
+def test_a_world_can_be_left_from_another_context_than_it_was_entered_in() -> None:
     world = BulletWorld()
     inside = contextvars.copy_context()
     inside.run(world.__enter__)
@@ -67,7 +67,7 @@ def test_it_can_be_left_from_another_context_than_it_was_entered_in() -> None:
         inside.run(Object, "bowl", ObjectType.BOWL)
 
 
-def test_the_watcher_of_the_context_learns_of_entering_and_leaving() -> None:
+def test_the_watcher_of_the_context_is_notified_of_entering_and_leaving() -> None:
     watching = Watching()
     token = watcher.set(watching)
     try:
@@ -75,10 +75,10 @@ def test_the_watcher_of_the_context_learns_of_entering_and_leaving() -> None:
             pass
     finally:
         watcher.reset(token)
-    assert watching.told == [("entered", world, True), ("left", world, True)]
+    assert watching.notes == [("entered", world, True), ("left", world, True)]
     with BulletWorld():
         pass
-    assert len(watching.told) == 2
+    assert len(watching.notes) == 2
 
 
 def test_a_watcher_can_refuse_the_entering() -> None:
@@ -92,7 +92,7 @@ def test_a_watcher_can_refuse_the_entering() -> None:
         watcher.reset(token)
     assert current_world.get() is None
     assert not world.entered
-    assert [entry[0] for entry in watching.told] == ["entered"]
+    assert [entry[0] for entry in watching.notes] == ["entered"]
 
 
 def test_a_world_that_was_left_can_be_read_and_not_changed() -> None:
@@ -126,7 +126,7 @@ def test_a_world_that_was_left_can_be_read_and_not_changed() -> None:
     assert crane.pose is there
 
 
-def test_a_world_must_be_entered_before_things_are_put_into_it() -> None:
+def test_a_world_must_be_entered_before_objects_are_added() -> None:
     with pytest.raises(WorldClosed, match="with BulletWorld"):
         Object("bowl", ObjectType.BOWL, world=BulletWorld())
 
@@ -138,30 +138,30 @@ def test_a_window_without_a_display_is_refused(monkeypatch: pytest.MonkeyPatch) 
     assert current_world.get() is None
 
 
-def test_what_the_world_refuses_is_the_callers_to_change() -> None:
+def test_refusals_of_a_world_are_the_callers_errors() -> None:
     assert issubclass(WorldError, CallerError)
     assert issubclass(WorldClosed, WorldError)
 
 
-# --- several at once ------------------------------------------------------------------------------------------
+# --- concurrent worlds ------------------------------------------------------------------------------------------------
 
 
 async def test_two_tasks_with_a_world_each_never_mix() -> None:
     async def act(number: int) -> list[tuple[Any, ...]]:
         with BulletWorld() as world:
-            witness = Witness()
-            world.observe(witness)
+            change_log = ChangeLog()
+            world.observe(change_log)
             thing = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
             for step in range(20):
                 await asyncio.sleep(0)
                 assert current_world.get() is world
                 thing.set_pose(Pose([number, step, 0]))
                 await asyncio.sleep(0)
-                # also in Bullet itself nothing of the other's is seen
+                # Bullet itself does not see the other world's objects either.
                 assert thing.link_pose("mast").position == pytest.approx((number + 0.1, step, 0.5), abs=1e-9)
                 assert world.ray_test([(number, step, 5)], [(number, step, 0.1)]) == [thing]
                 assert world.ray_test([(1 - number, step, 5)], [(1 - number, step, 0.1)]) == [None]
-            return [entry for entry in witness.told if entry[0] == "moved"]
+            return [entry for entry in change_log.notes if entry[0] == "moved"]
 
     first, second = await asyncio.gather(act(0), act(1))
     assert first == [("moved", "crane", Pose([0, step, 0])) for step in range(20)]
@@ -182,10 +182,10 @@ def test_threads_have_worlds_of_their_own() -> None:
     assert found == [pytest.approx((number + 0.1, 99.0, 0.5), abs=1e-9) for number in range(8)]
 
 
-# --- what is in it --------------------------------------------------------------------------------------------
+# --- objects and observers --------------------------------------------------------------------------------------------
 
 
-def test_objects_are_found_by_name_and_in_order(world: BulletWorld, witness: Witness) -> None:
+def test_objects_are_listed_by_name_and_in_order(world: BulletWorld, change_log: ChangeLog) -> None:
     bowl, robot = Object("bowl", ObjectType.BOWL), Object("mover", ObjectType.ROBOT, CRANE)
     assert world.objects == (bowl, robot)
     assert world.object("bowl") is bowl
@@ -195,18 +195,18 @@ def test_objects_are_found_by_name_and_in_order(world: BulletWorld, witness: Wit
     assert world.description == "BulletWorld (DIRECT): bowl (BOWL), mover (ROBOT)"
     world.remove(robot)
     assert world.robot is None
-    assert [entry[:2] for entry in witness.told] == [("added", "bowl"), ("added", "mover"), ("removed", "mover")]
+    assert [entry[:2] for entry in change_log.notes] == [("added", "bowl"), ("added", "mover"), ("removed", "mover")]
 
 
-def test_an_observer_is_told_once_and_not_after_it_left(world: BulletWorld, witness: Witness) -> None:
-    world.observe(witness)
+def test_an_observer_is_notified_once_and_not_after_it_was_removed(world: BulletWorld, change_log: ChangeLog) -> None:
+    world.observe(change_log)
     Object("bowl", ObjectType.BOWL)
-    world.unobserve(witness)
+    world.unobserve(change_log)
     Object("spoon", ObjectType.SPOON)
-    assert witness.names() == [("added", "bowl")]
+    assert change_log.names() == [("added", "bowl")]
 
 
-# --- going back -----------------------------------------------------------------------------------------------
+# --- restoring --------------------------------------------------------------------------------------------------------
 
 HERE, THERE = Pose([0.5, 0.5, 0.5]), Pose([1, 2, 0.5], [0, 0, 1, 1])
 
@@ -219,25 +219,27 @@ def scene() -> tuple[Object, Object, Object]:
     )
 
 
-def test_reset_brings_back_the_beginning_and_tells_only_what_changed(world: BulletWorld, witness: Witness) -> None:
+def test_reset_restores_the_beginning_and_reports_only_changes(world: BulletWorld, change_log: ChangeLog) -> None:
     crane, cup, bowl = scene()
     crane.attach(cup, "hook")
     crane.set_joint_positions({"turning": 0.5, "lifting": 0.0})
-    witness.told.clear()
+    change_log.notes.clear()
     world.reset()
-    assert witness.told == [
+    assert change_log.notes == [
         ("detached", "crane", "cup", "hook"),
         ("joints", "crane", {"turning": 0.0}),
         ("moved", "cup", HERE),
     ]
     assert (crane.pose, cup.pose, bowl.pose) == (Pose(), HERE, HERE)
     assert crane.link_pose("hook") == pytest.approx(crane.link_pose("hook"))
-    witness.told.clear()
+    change_log.notes.clear()
     world.reset()
-    assert witness.told == []
+    assert change_log.notes == []
 
 
-def test_a_restored_state_is_the_saved_one_and_tells_only_what_differed(world: BulletWorld, witness: Witness) -> None:
+def test_a_restored_state_equals_the_saved_one_and_only_differences_are_reported(
+    world: BulletWorld, change_log: ChangeLog
+) -> None:
     crane, cup, bowl = scene()
     crane.attach(cup, "hook")
     crane.set_joint_positions({"turning": 0.5, "reaching": 0.3})
@@ -248,9 +250,9 @@ def test_a_restored_state_is_the_saved_one_and_tells_only_what_differed(world: B
     crane.attach(bowl)
     crane.set_joint_positions({"turning": 0.9, "lifting": 0.4})
     crane.set_pose(THERE)
-    witness.told.clear()
+    change_log.notes.clear()
     world.restore_state(state)
-    assert witness.told == [
+    assert change_log.notes == [
         ("detached", "crane", "bowl", None),
         ("joints", "crane", {"turning": 0.5, "lifting": 0.0}),
         ("moved", "crane", Pose()),
@@ -263,9 +265,9 @@ def test_a_restored_state_is_the_saved_one_and_tells_only_what_differed(world: B
     crane.set_joint_position("turning", 0.5)
     assert cup.pose.position == pytest.approx(held_at.position, abs=1e-9)
     world.restore_state(state)
-    witness.told.clear()
+    change_log.notes.clear()
     world.restore_state(state)
-    assert witness.told == []
+    assert change_log.notes == []
 
 
 def test_a_saved_state_is_a_value_that_later_motions_do_not_change(world: BulletWorld) -> None:
@@ -280,7 +282,7 @@ def test_a_saved_state_is_a_value_that_later_motions_do_not_change(world: Bullet
     assert state == world.save_state()
 
 
-def test_what_was_added_since_stays_and_is_let_go(world: BulletWorld) -> None:
+def test_an_object_added_after_the_saved_state_stays_and_its_attachment_ends(world: BulletWorld) -> None:
     crane, _, _ = scene()
     state = world.save_state()
     spoon = Object("spoon", ObjectType.SPOON, pose=THERE)
@@ -291,7 +293,7 @@ def test_what_was_added_since_stays_and_is_let_go(world: BulletWorld) -> None:
     assert (spoon.pose, spoon.attached_to) == (carried_to, None)
 
 
-def test_a_state_with_an_object_that_is_gone_is_refused_and_nothing_moves(world: BulletWorld) -> None:
+def test_a_state_with_a_removed_object_is_refused_and_nothing_moves(world: BulletWorld) -> None:
     crane, cup, _ = scene()
     state = world.save_state()
     crane.set_pose(THERE)
@@ -301,7 +303,7 @@ def test_a_state_with_an_object_that_is_gone_is_refused_and_nothing_moves(world:
     assert crane.pose is THERE
 
 
-def test_a_state_is_not_put_upon_another_object_of_the_same_name(world: BulletWorld) -> None:
+def test_a_state_is_not_applied_to_another_object_of_the_same_name(world: BulletWorld) -> None:
     crane, cup, _ = scene()
     state = world.save_state()
     crane.remove()
@@ -312,8 +314,8 @@ def test_a_state_is_not_put_upon_another_object_of_the_same_name(world: BulletWo
     assert cup.pose is THERE
 
 
-def test_a_state_made_by_hand_that_is_not_finite_is_refused_and_nothing_moves(
-    world: BulletWorld, witness: Witness
+def test_a_crafted_state_that_is_not_finite_is_refused_and_nothing_moves(
+    world: BulletWorld, change_log: ChangeLog
 ) -> None:
     crane, _, _ = scene()
     crane.set_pose(THERE)
@@ -322,24 +324,24 @@ def test_a_state_made_by_hand_that_is_not_finite_is_refused_and_nothing_moves(
     nowhere = dataclasses.replace(cup_now, pose=Pose([0, math.nan, 0]))
     turned = dataclasses.replace(crane_now, joints={"turning": math.inf})
     elsewhere = dataclasses.replace(crane_now, pose=Pose())
-    witness.told.clear()
+    change_log.notes.clear()
     with pytest.raises(PoseRefused, match="'cup'"):
         world.restore_state(WorldState({"crane": elsewhere, "cup": nowhere}))
     with pytest.raises(JointLimitExceeded, match="'crane': turning cannot be set to inf"):
         world.restore_state(WorldState({"cup": dataclasses.replace(cup_now, pose=THERE), "crane": turned}))
-    assert witness.told == []
+    assert change_log.notes == []
     assert world.save_state().objects["crane"] == crane_now
 
 
-# --- looking --------------------------------------------------------------------------------------------------
+# --- rays -------------------------------------------------------------------------------------------------------------
 
 
 def cube(name: str, position: tuple[float, float, float]) -> Object:
-    """10 cm along each edge."""
+    """Return a cube with edges of 10 cm."""
     return Object(name, ObjectType.GENERIC_OBJECT, pose=Pose(position))
 
 
-def test_a_ray_meets_the_first_object_in_its_way(world: BulletWorld) -> None:
+def test_a_ray_hits_the_first_object_in_its_way(world: BulletWorld) -> None:
     near, far = cube("near", (1, 0, 1)), cube("far", (2, 0, 1))
     starts = [(0, 0, 1), (3, 0, 1), (0, 0.2, 1), (0, 0, 1), (0, 0, 1), (1.5, 0, 1)]
     ends = [(3, 0, 1), (0, 0, 1), (3, 0.2, 1), (0.9, 0, 1), (0, 0, -1), (1.5, 0, 2)]
@@ -348,7 +350,7 @@ def test_a_ray_meets_the_first_object_in_its_way(world: BulletWorld) -> None:
     assert world.ray_test(starts[:2], ends[:2], ignore=[near, far]) == [None, None]
 
 
-def test_rays_follow_what_moved(world: BulletWorld) -> None:
+def test_rays_follow_objects_that_moved(world: BulletWorld) -> None:
     thing = cube("thing", (1, 0, 1))
     thing.set_pose(Pose([1, 5, 1]))
     assert world.ray_test([(0, 0, 1), (0, 5, 1)], [(3, 0, 1), (3, 5, 1)]) == [None, thing]
@@ -361,18 +363,18 @@ def test_rays_follow_what_moved(world: BulletWorld) -> None:
     assert world.ray_test([(x, y, z + 1)], [(x, y, z - 0.09)]) == [crane]
 
 
-def test_more_rays_than_bullet_takes_at_once(world: BulletWorld) -> None:
+def test_more_rays_than_bullet_accepts_at_once_are_cast(world: BulletWorld) -> None:
     thing = cube("thing", (0, 0, 1))
     starts = [(0, 0, 2 + ray / 40_000) for ray in range(20_000)]
     assert world.ray_test(starts, [(0, 0, 0.5)] * 20_000) == [thing] * 20_000
 
 
-def test_as_many_starts_as_ends_make_rays(world: BulletWorld) -> None:
+def test_unequal_numbers_of_starts_and_ends_are_refused(world: BulletWorld) -> None:
     with pytest.raises(ValueError, match="2 starts and 1 ends"):
         world.ray_test([(0, 0, 1), (0, 0, 2)], [(1, 0, 1)])
 
 
-def test_visibility_is_the_share_that_nothing_hides(world: BulletWorld) -> None:
+def test_visibility_is_the_share_that_is_not_hidden(world: BulletWorld) -> None:
     thing, eye = cube("thing", (2, 0, 1)), (0.0, 0.0, 1.0)
     assert world.visible(thing, eye) == 1.0
     whole = Object("wall", ObjectType.GENERIC_OBJECT, wall(0.4), Pose([1, 0, 1]))
@@ -395,7 +397,7 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_what_nothing_hides_is_wholly_visible_from_everywhere(world: BulletWorld, shape: str) -> None:
+def test_an_object_without_obstacles_is_wholly_visible_from_everywhere(world: BulletWorld, shape: str) -> None:
     description = (
         '<robot name="a"><link name="l"><collision><origin xyz="0.1 0 0" rpy="0.3 0.2 0"/><geometry>'
         f"{SHAPES[shape]}</geometry></collision></link></robot>"

@@ -1,4 +1,4 @@
-"""Importing costs no Bullet, and Bullet never writes to the streams of the process that uses it."""
+"""Importing the package loads no Bullet, and Bullet never writes to the streams of its process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_importing_the_package_does_not_import_bullet_or_numpy() -> None:
     assert (done.stdout, done.stderr) == (b"False False\nFalse\n", b"")
 
 
-def test_every_public_name_is_there() -> None:
+def test_every_public_name_exists() -> None:
     done = run(
         "import pycrorm_async.world as world\n"
         "for name in world.__all__:\n"
@@ -34,7 +34,7 @@ def test_every_public_name_is_there() -> None:
 
 
 def test_nothing_of_bullet_reaches_stdout_or_stderr() -> None:
-    """Neither its greeting, nor its warnings about a link without inertia and a mesh it cannot read."""
+    """Neither its greeting nor its warnings about a link without inertia or an unreadable mesh are printed."""
     done = run(
         "import tempfile\n"
         "from pycrorm_async.world import *\n"
@@ -53,7 +53,7 @@ def test_nothing_of_bullet_reaches_stdout_or_stderr() -> None:
     assert (done.stdout, done.stderr, done.returncode) == (b"before\nrefused\nafter\n", b"", 0)
 
 
-def test_what_others_print_meanwhile_is_not_swallowed() -> None:
+def test_output_of_other_threads_meanwhile_is_not_swallowed() -> None:
     done = run(
         "import threading, os\n"
         "from pycrorm_async.world import *\n"
@@ -74,7 +74,7 @@ def test_what_others_print_meanwhile_is_not_swallowed() -> None:
 
 
 def test_the_streams_of_c_and_cpp_are_the_real_ones_afterwards() -> None:
-    """The C++ runtime comes in with Bullet: it must not keep the memory that stood for stdout meanwhile."""
+    """The C++ runtime is loaded with Bullet: it must not keep the memory that replaced stdout meanwhile."""
     done = run(
         "import ctypes\n"
         "from pycrorm_async.world import *\n"

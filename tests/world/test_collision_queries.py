@@ -1,4 +1,4 @@
-"""What an arm would be in with its joints elsewhere: by boxes put beside and into it, and nothing is moved or told."""
+"""Collision queries for an arm at other joint positions: boxes beside and inside it, and nothing moves."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.queries.collision_queries import collisions_at
-from tests.world.fakes import Witness
+from tests.world.fakes import ChangeLog
 
 BOX = """<robot name="box"><link name="box">
 <inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
@@ -19,7 +19,9 @@ ASIDE = {"l_shoulder_pan_joint": 1.5}
 
 @pytest.fixture
 def robot(world: BulletWorld) -> Object:
-    """With its arms stretched ahead, as after a reset; the left one in a line at y 0.188, 0.79 m up."""
+    """Return the robot with its arms stretched ahead, as after a reset; the left one in a line at y 0.188, 0.79 m
+    up.
+    """
     return Object("pr2", ObjectType.ROBOT, world=world)
 
 
@@ -31,7 +33,7 @@ def box_at(world: BulletWorld, x: float, y: float, z: float, name: str = "box") 
     return Object(name, ObjectType.GENERIC_OBJECT, BOX, Pose([x, y, z]), world=world)
 
 
-def test_an_arm_is_in_a_box_on_its_line_and_not_in_one_beside_it(world: BulletWorld, robot: Object) -> None:
+def test_an_arm_collides_with_a_box_on_its_line_and_not_with_one_beside_it(world: BulletWorld, robot: Object) -> None:
     along = robot.link_pose(FOREARM).position
     box = box_at(world, along.x + 0.1, along.y, along.z)
     met = collisions_at(robot, STRAIGHT, links=links(robot))
@@ -44,28 +46,32 @@ def test_an_arm_is_in_a_box_on_its_line_and_not_in_one_beside_it(world: BulletWo
     assert collisions_at(robot, STRAIGHT, links=[]) == []
 
 
-def test_what_is_carried_counts_as_the_arm_does(world: BulletWorld, robot: Object) -> None:
+def test_a_carried_object_counts_as_the_arm_does(world: BulletWorld, robot: Object) -> None:
     tool = robot.link_pose(TOOL).position
     held = box_at(world, tool.x + 0.05, tool.y, tool.z, "held")
     robot.attach(held, TOOL)
     wall = box_at(world, tool.x + 0.12, tool.y, tool.z, "wall")
     assert collisions_at(robot, STRAIGHT, links=[], carried=[held]) == [("held", wall)]
     assert collisions_at(robot, ASIDE, links=[], carried=[held]) == []
-    assert collisions_at(robot, STRAIGHT, links=links(robot)) == []  # it reaches as far as what it holds alone
+    assert (
+        collisions_at(robot, STRAIGHT, links=links(robot)) == []
+    )  # it reaches as far as an object that the hand alone holds
 
 
-def test_nothing_is_moved_and_nobody_is_told(world: BulletWorld, robot: Object, witness: Witness) -> None:
+def test_a_collision_query_moves_nothing_and_notifies_no_observer(
+    world: BulletWorld, robot: Object, change_log: ChangeLog
+) -> None:
     tool = robot.link_pose(TOOL)
     held = box_at(world, *tool.position, "held")
     robot.attach(held, TOOL)
     before = (robot.joint_positions(), held.pose, robot.link_pose(TOOL), held.bounding_box())
-    witness.told.clear()
+    change_log.notes.clear()
     collisions_at(robot, ASIDE, links=links(robot), carried=[held])
     assert (robot.joint_positions(), held.pose, robot.link_pose(TOOL), held.bounding_box()) == before
-    assert witness.told == []
+    assert change_log.notes == []
 
 
-def test_what_only_touches_is_no_collision(world: BulletWorld, robot: Object) -> None:
+def test_a_contact_is_no_collision(world: BulletWorld, robot: Object) -> None:
     tool = robot.link_pose(TOOL).position
     held = box_at(world, tool.x + 0.05, tool.y, tool.z, "held")
     robot.attach(held, TOOL)

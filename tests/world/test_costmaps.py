@@ -1,4 +1,4 @@
-"""Costmaps say of every cell what a reckoning by hand says, and give their best places in a fixed order."""
+"""Costmaps agree in every cell with an independent computation, and list their best places in a fixed order."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def block(name: str, size: tuple[float, float, float], at: tuple[float, float, f
 
 
 def middles(costmap: Costmap) -> list[tuple[int, int, float, float]]:
-    """Every cell with the x and y of its middle, one by one."""
+    """Return every cell with the x and y of its centre."""
     size, edge = len(costmap.map), costmap.resolution_m
     left = costmap.origin.position.x - size * edge / 2
     front = costmap.origin.position.y - size * edge / 2
     return [(i, j, left + (i + 0.5) * edge, front + (j + 0.5) * edge) for i in range(size) for j in range(size)]
 
 
-def test_cells_inside_a_grown_box_are_occupied_and_no_others(world: BulletWorld) -> None:
+def test_cells_inside_an_inflated_box_are_occupied_and_no_others(world: BulletWorld) -> None:
     block("table", (0.41, 0.83, 0.72), (0.5, 0.1, 0.36))
     block("post", (0.1, 0.1, 1.9), (-0.6, -0.7, 0.95), yaw=math.pi / 4)
     costmap = OccupancyCostmap(
@@ -54,7 +54,7 @@ def test_cells_inside_a_grown_box_are_occupied_and_no_others(world: BulletWorld)
     assert 0 < costmap.map.sum() < 100 * 100
 
 
-def test_boxes_to_stay_clear_of_count_as_if_they_were_there(world: BulletWorld) -> None:
+def test_additional_boxes_count_as_obstacles(world: BulletWorld) -> None:
     kerb = BoundingBox(Vector(0.2, -0.1, 0.0), Vector(0.5, 0.3, 0.4))
     lamp = BoundingBox(Vector(-0.5, -0.5, 2.1), Vector(0.0, 0.0, 2.4))
     costmap = OccupancyCostmap(
@@ -65,7 +65,7 @@ def test_boxes_to_stay_clear_of_count_as_if_they_were_there(world: BulletWorld) 
         assert costmap.map[i, j] == (0.0 if inside else 1.0), (x, y)
 
 
-def test_the_value_at_a_point_is_that_of_its_cell_and_nothing_is_known_outside(world: BulletWorld) -> None:
+def test_the_value_at_a_point_is_that_of_its_cell_and_outside_the_map_it_is_zero(world: BulletWorld) -> None:
     costmap = Costmap(np.array([[0.1, 0.2], [0.3, 0.4]]), Pose([1.0, -2.0, 0]), resolution_m=0.5)
     inside = {(0.51, -2.49): 0.1, (0.99, -1.51): 0.2, (1.01, -2.01): 0.3, (1.49, -1.99): 0.4}
     assert {point: costmap.value_at(*point) for point in inside} == inside
@@ -73,7 +73,7 @@ def test_the_value_at_a_point_is_that_of_its_cell_and_nothing_is_known_outside(w
         assert costmap.value_at(*point) == 0.0
 
 
-def test_the_links_of_a_thing_count_one_by_one(world: BulletWorld) -> None:
+def test_the_links_of_an_object_count_one_by_one(world: BulletWorld) -> None:
     legs = "".join(
         f'<link name="leg{n}"><collision><geometry><box size="0.1 0.1 0.6"/></geometry></collision></link>'
         f'<joint name="j{n}" type="fixed"><parent link="frame"/><child link="leg{n}"/><origin xyz="{x} 0 0.3"/></joint>'
@@ -85,7 +85,7 @@ def test_the_links_of_a_thing_count_one_by_one(world: BulletWorld) -> None:
         assert costmap.map[i, j] == (0.0 if abs(abs(x) - 0.8) <= 0.25 and abs(y) <= 0.25 else 1.0), (x, y)
 
 
-def test_what_hangs_high_lies_below_or_is_ignored_is_no_obstacle(world: BulletWorld) -> None:
+def test_objects_that_are_too_high_too_low_or_ignored_are_no_obstacles(world: BulletWorld) -> None:
     free = OccupancyCostmap(world, Pose()).map
     lamp = block("lamp", (0.5, 0.5, 0.5), (0, 0, 2.26))
     block("cellar", (0.5, 0.5, 0.5), (0, 0, -0.251))
@@ -100,7 +100,7 @@ def test_what_hangs_high_lies_below_or_is_ignored_is_no_obstacle(world: BulletWo
     assert OccupancyCostmap(world, Pose()).map.min() == 0.0
 
 
-def test_obstacles_outside_the_map_or_across_its_edge(world: BulletWorld) -> None:
+def test_obstacles_outside_the_map_or_across_its_edge_are_clipped(world: BulletWorld) -> None:
     block("far", (1, 1, 1), (10, 0, 0.5))
     block("near", (1, 1, 1), (-10, -10, 0.5))
     assert OccupancyCostmap(world, Pose()).map.min() == 1.0
@@ -111,7 +111,7 @@ def test_obstacles_outside_the_map_or_across_its_edge(world: BulletWorld) -> Non
     assert costmap.map.sum() == 200 * 200 - 25 * 25
 
 
-def test_the_gaussian_falls_off_with_the_distance_in_all_directions() -> None:
+def test_the_gaussian_decreases_with_the_distance_in_all_directions() -> None:
     costmap = GaussianCostmap(Pose([1, 2, 0]), sigma_cells=15, size_cells=201)
     assert costmap.map[100, 100] == 1.0
     for i, j in ((100, 115), (85, 100), (130, 60)):
@@ -119,7 +119,7 @@ def test_the_gaussian_falls_off_with_the_distance_in_all_directions() -> None:
         assert costmap.map[i, j] == pytest.approx(math.exp(-squared / (2 * 15 * 15)))
 
 
-def test_from_behind_a_wall_nothing_is_seen_and_over_it_what_is_high_enough(world: BulletWorld) -> None:
+def test_nothing_is_visible_from_behind_a_wall_and_only_high_objects_are_visible_over_it(world: BulletWorld) -> None:
     target = block("target", (0.1, 0.1, 0.1), (0, 0, 0.5))
     block("wall", (0.1, 10, 1.0), (0.5, 0, 0.5))
     costmap = VisibilityCostmap(world, target, min_height_m=0.6, max_height_m=1.8, size_cells=61, resolution_m=0.05)
@@ -128,7 +128,7 @@ def test_from_behind_a_wall_nothing_is_seen_and_over_it_what_is_high_enough(worl
     for i, j, x, _ in middles(costmap):
         if abs(x - 0.5) < 0.06:
             continue
-        # the way from (x, h) to (0, 0.5) is at 0.5 + (h - 0.5) * s / x when it is s in front of the target
+        # The ray from (x, h) to (0, 0.5) is at 0.5 + (h - 0.5) * s / x at the distance s in front of the target.
         seen = [not any(0.5 + (h - 0.5) * s / x < 1.0 for s in (0.45, 0.55)) if x > 0.5 else True for h in heights]
         assert costmap.map[i, j] == pytest.approx(sum(seen) / 5), x
         checked[0.0 if x > 0.5 else 1.0] += 1
@@ -136,7 +136,7 @@ def test_from_behind_a_wall_nothing_is_seen_and_over_it_what_is_high_enough(worl
     assert {0.0, 1.0} < set(np.round(costmap.map.ravel(), 6).tolist())
 
 
-def test_sight_agrees_with_rays_through_bullet(world: BulletWorld) -> None:
+def test_visibility_agrees_with_rays_through_bullet(world: BulletWorld) -> None:
     kitchen = Object("kitchen", ObjectType.ENVIRONMENT)
     kitchen.set_joint_position("kitchen_island_upper_drawer_joint", 0.2)
     milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1.0, 0.9]))
@@ -150,12 +150,12 @@ def test_sight_agrees_with_rays_through_bullet(world: BulletWorld) -> None:
     for height in (1.0, 1.1, 1.2, 1.3, 1.4):
         met = world.ray_test([(x, y, height) for *_, x, y in cells], [centre] * len(cells))
         agreed += sum(thing is milk for thing in met)
-    # a ray that begins inside a shape does not meet it, so the two may differ in the cells furniture stands on
+    # A ray that begins inside a shape does not hit it, so that the two may differ in the cells of furniture.
     assert agreed / 5 == pytest.approx(costmap.map.sum(), rel=0.04)
     assert 0.2 < costmap.map.mean() < 0.95
 
 
-def test_a_place_can_be_looked_at_before_anything_is_there(world: BulletWorld) -> None:
+def test_the_visibility_of_a_point_needs_no_object_there(world: BulletWorld) -> None:
     block("table", (1, 1, 0.5), (0, 0, 0.25))
     costmap = VisibilityCostmap(world, Pose([0, 0, 0.5]), min_height_m=1.0, max_height_m=1.5)
     assert costmap.map.min() == 1.0
@@ -164,7 +164,7 @@ def test_a_place_can_be_looked_at_before_anything_is_there(world: BulletWorld) -
     assert below.map.max() == 0.0
 
 
-def test_the_top_of_a_link_is_good_everywhere_and_the_air_beside_it_nowhere(world: BulletWorld) -> None:
+def test_the_top_of_a_link_has_the_value_one_everywhere_and_the_air_beside_it_zero(world: BulletWorld) -> None:
     shelf = block("shelf", (0.2, 0.5, 0.04), (1.0, 2.0, 0.9))
     costmap = SemanticCostmap(shelf, "shelf")
     assert costmap.map.shape == (25, 25)
@@ -178,7 +178,7 @@ def test_the_top_of_a_link_is_good_everywhere_and_the_air_beside_it_nowhere(worl
         SemanticCostmap(shelf, "drawer")
 
 
-def test_the_best_cells_come_by_value_then_nearest_to_the_origin_then_in_order() -> None:
+def test_the_best_cells_are_ordered_by_value_then_distance_to_the_origin_then_index() -> None:
     values = np.full((4, 4), 0.5)
     values[0, 0], values[3, 2], values[1, 1] = 0.9, 0.9, 0.0
     costmap = Costmap(values, Pose([10, 20, 3], yaw_quaternion(1.0)), resolution_m=1.0)
@@ -211,12 +211,12 @@ def test_maps_multiply_cell_by_cell() -> None:
         GaussianCostmap(Pose(), size_cells=10, resolution_m=0.03),
     ],
 )
-def test_maps_of_another_place_size_or_resolution_do_not_multiply(other: Costmap) -> None:
+def test_maps_of_another_place_size_or_resolution_are_not_multiplied(other: Costmap) -> None:
     with pytest.raises(CostmapMismatch):
         GaussianCostmap(Pose(), size_cells=10) * other
 
 
-def test_a_map_cannot_be_written_on() -> None:
+def test_a_map_is_read_only() -> None:
     with pytest.raises(ValueError, match="read-only"):
         GaussianCostmap(Pose()).map[0, 0] = 1.0
 

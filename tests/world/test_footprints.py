@@ -1,4 +1,6 @@
-"""The outline of a base against the outlines of obstacles: exact for turned boxes, and never free where Bullet hits."""
+"""The outline of a base against the outlines of obstacles: exact for rotated boxes, and never free where Bullet
+hits.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,7 @@ def test_objects_on_the_base_widen_its_footprint(world: BulletWorld) -> None:
     assert footprint_of(robot, ["base_link"]).x == pytest.approx((-0.325, 0.325))
 
 
-def test_a_turned_base_needs_the_room_of_its_corners(world: BulletWorld) -> None:
+def test_a_rotated_base_needs_the_space_of_its_corners(world: BulletWorld) -> None:
     box(world, "table", Pose())
     obstacles = Obstacles(world)
     for gap, turned, free in ((0.001, 0.0, True), (-0.001, 0.0, False), (0.1, math.pi / 4, False),
@@ -52,7 +54,7 @@ def test_a_turned_base_needs_the_room_of_its_corners(world: BulletWorld) -> None
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, math.pi / 4, -2.0])
-def test_a_turned_table_keeps_its_outline(world: BulletWorld, yaw: float) -> None:
+def test_a_rotated_table_keeps_its_outline(world: BulletWorld, yaw: float) -> None:
     table = box(world, "table", Pose([2.0, -1.0, 0.0], yaw_quaternion(yaw)))
     obstacles = Obstacles(world)
     beside = table.pose @ Pose([0.0, 0.4 + 0.3 + 0.001, 0.0])
@@ -71,7 +73,7 @@ def test_an_empty_world_and_shapes_above_every_robot_have_no_outlines(world: Bul
     assert Obstacles(world).overlapping(SQUARE, Pose()) is None
 
 
-def test_where_no_outline_is_overlapped_nothing_is_in_collision(world: BulletWorld) -> None:
+def test_without_an_overlap_of_outlines_there_is_no_collision(world: BulletWorld) -> None:
     import pybullet
 
     rng = random.Random(20261123)

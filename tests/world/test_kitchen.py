@@ -1,4 +1,4 @@
-"""The kitchen is where its drawing says, moves as furniture does, and what stands in it can be reached."""
+"""The kitchen agrees with its drawing, its doors and drawers move, and its objects can be reached."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def cereal_and_milk() -> tuple[Object, Object]:
 
 
 @pytest.mark.parametrize("seed", ["1", "2"])
-def test_it_is_the_same_text_in_every_process(seed: str) -> None:
+def test_the_description_is_the_same_text_in_every_process(seed: str) -> None:
     code = "from pycrorm_async.world.models.kitchen import kitchen_urdf; print(kitchen_urdf(), end='')"
     done = subprocess.run(
         [sys.executable, "-c", code],
@@ -52,7 +52,7 @@ def test_it_is_the_same_text_in_every_process(seed: str) -> None:
         ("kitchen_island_surface", (-1.80, 0.20, 0.860), (-1.10, 1.80, 0.900)),
     ],
 )
-def test_surfaces_are_where_the_drawing_says_with_their_frame_on_top(
+def test_surfaces_are_where_the_drawing_has_them_with_their_frame_on_top(
     kitchen: Object, surface: str, low: tuple[float, ...], high: tuple[float, ...]
 ) -> None:
     np.testing.assert_allclose(kitchen.bounding_box(surface), [low, high], atol=1e-9)
@@ -60,7 +60,7 @@ def test_surfaces_are_where_the_drawing_says_with_their_frame_on_top(
     np.testing.assert_allclose(kitchen.link_pose(surface).position, middle, atol=1e-9)
 
 
-def test_cereal_and_milk_of_the_thesis_stand_on_the_worktops(kitchen: Object) -> None:
+def test_cereal_and_milk_of_the_thesis_are_on_the_worktops(kitchen: Object) -> None:
     cereal, milk = cereal_and_milk()
     for thing, surface in ((cereal, "kitchen_counter_surface"), (milk, "sink_area_surface")):
         box, top = thing.bounding_box(), kitchen.bounding_box(surface)
@@ -69,7 +69,7 @@ def test_cereal_and_milk_of_the_thesis_stand_on_the_worktops(kitchen: Object) ->
         assert box.max[:2] < top.max[:2]
 
 
-def test_the_floor_is_free_where_the_robot_starts_and_where_the_thesis_sends_it(
+def test_the_floor_is_free_at_the_robots_start_and_at_the_targets_of_the_thesis(
     world: BulletWorld, kitchen: Object
 ) -> None:
     cereal_and_milk()
@@ -88,7 +88,7 @@ DRAWERS = (
 
 
 @pytest.mark.parametrize("drawer", DRAWERS)
-def test_a_drawer_slides_out_towards_who_stands_before_it(kitchen: Object, drawer: str) -> None:
+def test_a_drawer_slides_towards_the_base_pose_in_front_of_it(kitchen: Object, drawer: str) -> None:
     joint, handle = f"{drawer}_joint", f"{drawer}_handle"
     assert kitchen.joint_type(joint) is JointType.PRISMATIC
     assert kitchen.joint_limits(joint) == (0.0, 0.35)
@@ -105,7 +105,7 @@ def test_a_drawer_slides_out_towards_who_stands_before_it(kitchen: Object, drawe
             kitchen.set_joint_position(joint, beyond)
 
 
-def test_a_thing_in_an_open_drawer_is_seen_from_above_and_comes_along(world: BulletWorld, kitchen: Object) -> None:
+def test_an_object_in_an_open_drawer_is_visible_from_above_and_moves_along(world: BulletWorld, kitchen: Object) -> None:
     kitchen.set_joint_position("kitchen_counter_upper_drawer_joint", 0.35)
     inside = kitchen.link_pose("kitchen_counter_upper_drawer").position
     spoon = Object("spoon", ObjectType.SPOON, pose=Pose([inside.x + 0.15, inside.y, inside.z + 0.03]))
@@ -117,7 +117,7 @@ def test_a_thing_in_an_open_drawer_is_seen_from_above_and_comes_along(world: Bul
     assert world.visible(spoon, eye) == 0.0
 
 
-def test_the_fridge_door_swings_towards_the_room_about_its_right_edge(kitchen: Object) -> None:
+def test_the_fridge_door_rotates_into_the_room_about_its_right_edge(kitchen: Object) -> None:
     joint, handle = "fridge_door_joint", "fridge_door_handle"
     assert kitchen.joint_type(joint) is JointType.REVOLUTE
     assert kitchen.joint_limits(joint) == (0.0, 1.9)
@@ -127,7 +127,7 @@ def test_the_fridge_door_swings_towards_the_room_about_its_right_edge(kitchen: O
 
 
 def reachable_from(world: BulletWorld, robot: Object, targets: Iterable[Pose]) -> bool:
-    """Whether one arm reaches all the targets from one of the free places around the first one, facing it."""
+    """Return whether one arm reaches all the targets from one of the free places around the first one, facing it."""
     targets = list(targets)
     goal = targets[0].position
     for place in OccupancyCostmap(world, Pose([goal.x, goal.y, 0])).best(600)[::20]:
@@ -156,7 +156,7 @@ def test_cereal_and_milk_can_be_picked_up_from_free_floor(world: BulletWorld, ro
         assert reachable_from(world, robot, [Pose([x, y, z]), Pose([x - 0.07, y, z]), Pose([x, y, z + 0.03])])
 
 
-def test_a_thing_can_be_placed_on_the_island_from_free_floor(world: BulletWorld, robot: Object) -> None:
+def test_an_object_can_be_placed_on_the_island_from_free_floor(world: BulletWorld, robot: Object) -> None:
     facing_it = yaw_quaternion(math.pi)
     assert reachable_from(world, robot, [Pose([-1.30, 1.0, 1.0], facing_it), Pose([-1.30, 1.0, 1.05], facing_it)])
 

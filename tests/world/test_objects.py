@@ -1,4 +1,4 @@
-"""An object is where it was put, its links are where its description says, and what cannot be is refused."""
+"""Objects and their links have the poses of their description, and impossible changes are refused."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pycrorm_async.world.errors import (
     UnknownJoint,
     UnknownLink,
 )
-from tests.world.fakes import CRANE, Witness, crane_links, matrix
+from tests.world.fakes import CRANE, ChangeLog, crane_links, matrix
 
 LEANING = Pose([0.3, -1.2, 0.7], [0.2, -0.4, 0.1, 0.8])
 
@@ -29,7 +29,7 @@ def crane(pose: Pose | None = None) -> Object:
     return Object("crane", ObjectType.GENERIC_OBJECT, CRANE, pose)
 
 
-def test_the_pose_read_is_the_very_pose_set(world: BulletWorld) -> None:
+def test_the_pose_read_is_exactly_the_pose_set(world: BulletWorld) -> None:
     milk = Object("milk", ObjectType.MILK, pose=LEANING)
     assert milk.pose is LEANING
     there = Pose([1.3, 1.0, 0.9], [0, 0, 0.3, 0.7])
@@ -46,7 +46,7 @@ def test_without_a_pose_an_object_is_at_the_origin(world: BulletWorld) -> None:
 @pytest.mark.parametrize(
     ("turning", "lifting", "reaching"), [(0, 0, 0), (0.4, -0.5, 0.6), (-9.0, 1.2, 0.25), (2.5, 0.3, 0)]
 )
-def test_every_link_is_where_the_description_says(
+def test_every_link_is_where_the_description_has_it(
     world: BulletWorld, base: Pose, turning: float, lifting: float, reaching: float
 ) -> None:
     thing = crane(base)
@@ -58,13 +58,13 @@ def test_every_link_is_where_the_description_says(
 
 
 @pytest.mark.parametrize("base", [Pose(), LEANING])
-def test_where_a_link_would_be_at_other_joint_positions_moves_nothing_and_is_told_to_nobody(
+def test_a_link_pose_at_other_joint_positions_moves_nothing_and_notifies_no_observer(
     world: BulletWorld, base: Pose
 ) -> None:
     thing = crane(base)
     thing.set_joint_positions({"turning": 0.4, "lifting": -0.5, "reaching": 0.1})
-    witness = Witness()
-    world.observe(witness)
+    change_log = ChangeLog()
+    world.observe(change_log)
     before = {link: thing.link_pose(link) for link in thing.links}
     expected = crane_links(base, turning=2.5, lifting=-0.5, reaching=0.25)
     for link, where in expected.items():
@@ -72,7 +72,7 @@ def test_where_a_link_would_be_at_other_joint_positions_moves_nothing_and_is_tol
         np.testing.assert_allclose(matrix(there), where, atol=1e-9)
     assert {link: thing.link_pose(link) for link in thing.links} == before
     assert thing.joint_positions() == {"turning": 0.4, "lifting": -0.5, "reaching": 0.1}
-    assert witness.told == []
+    assert change_log.notes == []
     with pytest.raises(UnknownJoint):
         thing.link_pose_at("hook", {"rowing": 1.0})
 
@@ -104,31 +104,31 @@ def test_joints_and_links_have_the_names_kinds_and_limits_of_the_description(wor
     assert thing.joints_above("foot") == ()
 
 
-def test_one_motion_of_joints_is_told_once_with_all_of_them(world: BulletWorld, witness: Witness) -> None:
+def test_one_motion_of_joints_is_reported_once_with_all_of_them(world: BulletWorld, change_log: ChangeLog) -> None:
     thing = crane()
-    witness.told.clear()
+    change_log.notes.clear()
     thing.set_joint_positions({"turning": 1.5, "reaching": 0.1})
     thing.set_joint_position("reaching", 0.1)
-    assert witness.told == [
+    assert change_log.notes == [
         ("joints", "crane", {"turning": 1.5, "reaching": 0.1}),
         ("joints", "crane", {"reaching": 0.1}),
     ]
     assert thing.joint_positions() == {"turning": 1.5, "lifting": 0.0, "reaching": 0.1}
 
 
-def test_a_motion_of_no_joints_is_none(world: BulletWorld, witness: Witness) -> None:
+def test_a_motion_of_no_joints_is_ignored(world: BulletWorld, change_log: ChangeLog) -> None:
     thing = crane()
-    witness.told.clear()
+    change_log.notes.clear()
     thing.set_joint_positions({})
-    assert witness.told == []
+    assert change_log.notes == []
 
 
-def test_a_base_motion_is_told_once_even_to_where_it_was(world: BulletWorld, witness: Witness) -> None:
+def test_a_base_motion_is_reported_once_even_without_a_change(world: BulletWorld, change_log: ChangeLog) -> None:
     thing = crane()
-    witness.told.clear()
+    change_log.notes.clear()
     thing.set_pose(LEANING)
     thing.set_pose(LEANING)
-    assert witness.told == [("moved", "crane", LEANING)] * 2
+    assert change_log.notes == [("moved", "crane", LEANING)] * 2
 
 
 @pytest.mark.parametrize(
@@ -143,25 +143,25 @@ def test_a_base_motion_is_told_once_even_to_where_it_was(world: BulletWorld, wit
     ],
 )
 def test_a_joint_outside_its_limits_is_refused_and_nothing_moves(
-    world: BulletWorld, witness: Witness, joint: str, value: float, limits: tuple[float, float]
+    world: BulletWorld, change_log: ChangeLog, joint: str, value: float, limits: tuple[float, float]
 ) -> None:
     thing = crane()
-    witness.told.clear()
+    change_log.notes.clear()
     with pytest.raises(JointLimitExceeded) as refused:
         thing.set_joint_positions({"turning": 0.5, "lifting": 0.5, joint: value})
     assert (refused.value.object_name, refused.value.joint, refused.value.limits) == ("crane", joint, limits)
     assert refused.value.value == value or math.isnan(value)
     assert thing.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
-    assert witness.told == []
+    assert change_log.notes == []
 
 
-def test_a_joint_without_limits_is_refused_in_words_that_make_sense(world: BulletWorld) -> None:
+def test_a_joint_without_limits_is_refused_with_a_clear_message(world: BulletWorld) -> None:
     with pytest.raises(JointLimitExceeded) as refused:
         crane().set_joint_position("turning", math.inf)
     assert str(refused.value) == "'crane': turning cannot be set to inf; its limits are -1e+09 to 1e+09"
 
 
-def test_rounding_past_a_limit_is_let_through_and_never_clamped(world: BulletWorld) -> None:
+def test_rounding_past_a_limit_is_accepted_and_never_clamped(world: BulletWorld) -> None:
     thing = crane()
     thing.set_joint_position("lifting", 1.2 + 9e-7)
     assert thing.joint_position("lifting") == 1.2 + 9e-7
@@ -193,12 +193,12 @@ def test_unknown_names_are_refused_with_those_that_exist(world: BulletWorld) -> 
         (Pose([1, 2, 3], frame="pr2/base_link"), "'pr2/base_link'"),
     ],
 )
-def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(
-    world: BulletWorld, witness: Witness, pose: Pose, reason: str
+def test_an_invalid_pose_is_refused_and_nothing_moves(
+    world: BulletWorld, change_log: ChangeLog, pose: Pose, reason: str
 ) -> None:
     thing, milk = crane(LEANING), Object("milk", ObjectType.MILK)
     thing.attach(milk, "hook")
-    witness.told.clear()
+    change_log.notes.clear()
     with pytest.raises(PoseRefused, match=re.escape(reason)) as refused:
         thing.set_pose(pose)
     assert refused.value.object_name == "crane"
@@ -210,10 +210,10 @@ def test_a_pose_that_cannot_be_is_refused_and_nothing_moves(
     with pytest.raises(PoseRefused, match="'cup'"):
         Object("cup", ObjectType.JEROEN_CUP, pose=pose)
     assert [present.name for present in world.objects] == ["crane", "milk"]
-    assert witness.told == []
+    assert change_log.notes == []
 
 
-def test_what_is_carried_from_the_farthest_place_there_is_stays_finite(world: BulletWorld) -> None:
+def test_the_pose_of_an_object_carried_to_the_farthest_place_is_finite(world: BulletWorld) -> None:
     thing, milk = crane(), Object("milk", ObjectType.MILK, pose=Pose([-1e9, -1e9, -1e9]))
     thing.attach(milk, "hook")
     for place in (Pose([1e9, 1e9, 1e9], [0.2, -0.4, 0.1, 0.8]), Pose([-1e9, 0, 1e9], [0.2, 0.4, 0.1, -0.8])):
@@ -232,15 +232,15 @@ def test_what_is_carried_from_the_farthest_place_there_is_stays_finite(world: Bu
     ],
 )
 def test_an_object_has_a_name_and_a_type(
-    world: BulletWorld, witness: Witness, name: Any, object_type: Any, words: str
+    world: BulletWorld, change_log: ChangeLog, name: Any, object_type: Any, words: str
 ) -> None:
     with pytest.raises(ObjectRefused) as refused:
         Object(name, object_type)
     assert str(refused.value) == words
-    assert (world.objects, witness.told) == ((), [])
+    assert (world.objects, change_log.notes) == ((), [])
 
 
-def test_a_name_is_given_once_in_a_world(world: BulletWorld) -> None:
+def test_a_name_is_used_once_in_a_world(world: BulletWorld) -> None:
     crane()
     with pytest.raises(DuplicateName, match="'crane'"):
         Object("crane", ObjectType.MILK)
@@ -253,26 +253,26 @@ def test_an_object_needs_a_world() -> None:
         Object("milk", ObjectType.MILK)
 
 
-def test_reset_of_an_object_tells_only_what_it_changed(world: BulletWorld, witness: Witness) -> None:
+def test_reset_of_an_object_reports_only_its_changes(world: BulletWorld, change_log: ChangeLog) -> None:
     thing, cup = crane(LEANING), Object("cup", ObjectType.JEROEN_CUP, pose=Pose([1, 0, 0]))
     thing.attach(cup, "hook")
     thing.set_joint_positions({"turning": 0.4, "lifting": 0.0})
     kept = cup.pose
-    witness.told.clear()
+    change_log.notes.clear()
     thing.reset()
-    assert witness.told == [("detached", "crane", "cup", "hook"), ("joints", "crane", {"turning": 0.0})]
+    assert change_log.notes == [("detached", "crane", "cup", "hook"), ("joints", "crane", {"turning": 0.0})]
     assert thing.pose is LEANING
     assert cup.pose is kept
-    witness.told.clear()
+    change_log.notes.clear()
     thing.reset()
-    assert witness.told == []
+    assert change_log.notes == []
 
 
-def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, witness: Witness) -> None:
+def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, change_log: ChangeLog) -> None:
     thing = crane(LEANING)
     thing.set_joint_position("turning", 0.4)
     thing.remove()
-    assert witness.told[-1] == ("removed", "crane", LEANING)
+    assert change_log.notes[-1] == ("removed", "crane", LEANING)
     assert (thing.name, thing.pose, thing.joint_position("turning")) == ("crane", LEANING, 0.4)
     assert world.objects == ()
     for call in (
@@ -287,7 +287,7 @@ def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, witness:
             call()
 
 
-def test_a_colour_is_seen_on_every_link(world: BulletWorld) -> None:
+def test_a_colour_is_applied_to_every_link(world: BulletWorld) -> None:
     from pycrorm_async.world.bullet_loader import engine
 
     milk = Object("milk", ObjectType.MILK, color=(1.0, 0.0, 0.5, 1.0))

@@ -1,4 +1,4 @@
-"""What is attached moves rigidly with the link it hangs on, and is told of once for every motion that carries it."""
+"""An attached object moves rigidly with its link, and each motion is reported once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.errors import AttachmentRefused, ObjectNotInWorld, UnknownLink
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.world.fakes import CRANE, Witness, crane_links, matrix
+from tests.world.fakes import CRANE, ChangeLog, crane_links, matrix
 
 BASE = Pose([0.5, 1.0, 0.2], [0.1, 0.2, -0.3, 0.9])
 CUP_AT = Pose([1.1, 0.6, 0.9], [0.5, 0.1, 0.0, 0.8])
@@ -32,7 +32,7 @@ def spoon(world: BulletWorld) -> Object:
 
 
 def carried(before: np.ndarray, after: np.ndarray, pose: Pose) -> np.ndarray:
-    """Where something at `pose` is after its carrier went from one matrix to the other."""
+    """Return the pose of an object at `pose` after its carrier moved from one matrix to the other."""
     return np.asarray(after @ np.linalg.inv(before) @ matrix(pose))
 
 
@@ -47,7 +47,7 @@ def test_joints_and_base_carry_a_chain_rigidly(crane: Object, cup: Object, spoon
     np.testing.assert_allclose(matrix(spoon.pose), carried(before, after, SPOON_AT), atol=1e-9)
 
 
-def test_a_thousand_motions_do_not_let_it_slip(crane: Object, cup: Object) -> None:
+def test_a_thousand_motions_leave_the_attachment_exact(crane: Object, cup: Object) -> None:
     crane.attach(cup, "hook")
     for step in range(1000):
         crane.set_joint_position("turning", 0.01 * step)
@@ -55,31 +55,31 @@ def test_a_thousand_motions_do_not_let_it_slip(crane: Object, cup: Object) -> No
     np.testing.assert_allclose(matrix(cup.pose), matrix(CUP_AT), atol=1e-9)
 
 
-def test_one_motion_is_told_once_for_each_that_it_carries(
-    crane: Object, cup: Object, spoon: Object, witness: Witness
+def test_one_motion_is_reported_once_for_each_object_it_carries(
+    crane: Object, cup: Object, spoon: Object, change_log: ChangeLog
 ) -> None:
     crane.attach(cup, "hook")
     cup.attach(spoon)
-    witness.told.clear()
+    change_log.notes.clear()
     crane.set_joint_positions(JOINTS)
-    assert witness.told == [
+    assert change_log.notes == [
         ("joints", "crane", JOINTS),
         ("moved", "cup", cup.pose),
         ("moved", "spoon", spoon.pose),
     ]
-    witness.told.clear()
+    change_log.notes.clear()
     crane.set_pose(BASE)
-    assert witness.told == [("moved", "crane", BASE), ("moved", "cup", cup.pose), ("moved", "spoon", spoon.pose)]
-    witness.told.clear()
+    assert change_log.notes == [("moved", "crane", BASE), ("moved", "cup", cup.pose), ("moved", "spoon", spoon.pose)]
+    change_log.notes.clear()
     cup.set_pose(CUP_AT)
-    assert witness.told == [("moved", "cup", CUP_AT), ("moved", "spoon", spoon.pose)]
+    assert change_log.notes == [("moved", "cup", CUP_AT), ("moved", "spoon", spoon.pose)]
 
 
-def test_observers_are_told_when_the_whole_motion_is_done(world: BulletWorld, crane: Object, cup: Object) -> None:
+def test_observers_are_notified_when_the_whole_motion_is_done(world: BulletWorld, crane: Object, cup: Object) -> None:
     crane.attach(cup, "hook")
     seen: list[tuple[Pose, Pose]] = []
 
-    class Looking(Witness):
+    class Looking(ChangeLog):
         def object_moved(self, moved: Object) -> None:
             seen.append((crane.pose, cup.pose))
 
@@ -89,23 +89,23 @@ def test_observers_are_told_when_the_whole_motion_is_done(world: BulletWorld, cr
     assert cup.pose != CUP_AT
 
 
-def test_joints_that_do_not_move_the_link_carry_nothing(crane: Object, cup: Object, witness: Witness) -> None:
+def test_joints_that_do_not_move_the_link_carry_no_object(crane: Object, cup: Object, change_log: ChangeLog) -> None:
     crane.attach(cup, "flag")
-    witness.told.clear()
+    change_log.notes.clear()
     crane.set_joint_positions({"lifting": 0.5, "reaching": 0.2})
-    assert witness.names() == [("joints", "crane")]
+    assert change_log.names() == [("joints", "crane")]
     assert cup.pose is CUP_AT
     crane.set_joint_position("turning", 0.5)
-    assert witness.names() == [("joints", "crane"), ("joints", "crane"), ("moved", "cup")]
+    assert change_log.names() == [("joints", "crane"), ("joints", "crane"), ("moved", "cup")]
 
 
-def test_without_a_link_it_hangs_on_the_base(crane: Object, cup: Object, witness: Witness) -> None:
+def test_an_attachment_without_a_link_is_to_the_base(crane: Object, cup: Object, change_log: ChangeLog) -> None:
     crane.attach(cup)
     crane.set_joint_positions(JOINTS)
     assert cup.pose is CUP_AT
     crane.set_pose(BASE)
     np.testing.assert_allclose(matrix(cup.pose), matrix(BASE) @ matrix(CUP_AT), atol=1e-9)
-    assert ("attached", "crane", "cup", None) in witness.told
+    assert ("attached", "crane", "cup", None) in change_log.notes
 
 
 def test_an_attached_object_that_is_moved_stays_attached_at_its_new_place(crane: Object, cup: Object) -> None:
@@ -120,30 +120,30 @@ def test_an_attached_object_that_is_moved_stays_attached_at_its_new_place(crane:
 
 
 def test_attaching_moves_nothing_and_can_be_read_from_both_ends(
-    crane: Object, cup: Object, spoon: Object, witness: Witness
+    crane: Object, cup: Object, spoon: Object, change_log: ChangeLog
 ) -> None:
-    witness.told.clear()
+    change_log.notes.clear()
     crane.attach(cup, "hook")
     crane.attach(spoon)
     assert (cup.pose, spoon.pose) == (CUP_AT, SPOON_AT)
     assert crane.attachments == {cup: "hook", spoon: None}
     assert cup.attached_to is crane
     assert crane.attached_to is None
-    assert witness.told == [("attached", "crane", "cup", "hook"), ("attached", "crane", "spoon", None)]
+    assert change_log.notes == [("attached", "crane", "cup", "hook"), ("attached", "crane", "spoon", None)]
 
 
-def test_what_is_detached_stays_where_it_is(crane: Object, cup: Object, witness: Witness) -> None:
+def test_a_detached_object_stays_in_place(crane: Object, cup: Object, change_log: ChangeLog) -> None:
     crane.attach(cup, "hook")
     crane.set_joint_positions(JOINTS)
     held_at = cup.pose
     crane.detach(cup)
-    assert witness.told[-1] == ("detached", "crane", "cup", "hook")
+    assert change_log.notes[-1] == ("detached", "crane", "cup", "hook")
     crane.set_pose(BASE)
     assert cup.pose is held_at
     assert (crane.attachments, cup.attached_to) == ({}, None)
 
 
-def test_what_cannot_be_attached_or_detached_is_refused(crane: Object, cup: Object, spoon: Object) -> None:
+def test_an_impossible_attachment_or_detachment_is_refused(crane: Object, cup: Object, spoon: Object) -> None:
     crane.attach(cup, "hook")
     cup.attach(spoon)
     with pytest.raises(AttachmentRefused, match="only an Object can be attached to 'crane', got 'cup'"):
@@ -170,12 +170,12 @@ def test_objects_of_two_worlds_are_not_attached(crane: Object) -> None:
             crane.attach(bowl)
 
 
-def test_removing_detaches_both_ways_first(crane: Object, cup: Object, spoon: Object, witness: Witness) -> None:
+def test_removing_detaches_both_ways_first(crane: Object, cup: Object, spoon: Object, change_log: ChangeLog) -> None:
     crane.attach(cup, "hook")
     cup.attach(spoon)
-    witness.told.clear()
+    change_log.notes.clear()
     cup.remove()
-    assert witness.told == [
+    assert change_log.notes == [
         ("detached", "cup", "spoon", None),
         ("detached", "crane", "cup", "hook"),
         ("removed", "cup", CUP_AT),

@@ -1,4 +1,4 @@
-"""A bounding box is exactly the room a thing takes, at once after it moved."""
+"""A bounding box encloses its object exactly, immediately after every motion."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def one(shape: str, origin: str = "", pose: Pose | None = None) -> Object:
 
 
 def around(corners: list[tuple[float, float, float]], where: np.ndarray) -> np.ndarray:
-    """The box around these points of a link that is at `where`."""
+    """Return the box around these points of a link that is at `where`."""
     points = np.array([(where @ [*corner, 1])[:3] for corner in corners])
     return np.array([points.min(axis=0), points.max(axis=0)])
 
@@ -30,7 +30,7 @@ def corners(x: float, y: float, z: float) -> list[tuple[float, float, float]]:
     return [(i * x / 2, j * y / 2, k * z / 2) for i, j, k in itertools.product((-1, 1), repeat=3)]
 
 
-def test_a_box_turned_by_45_degrees_takes_its_diagonal(world: BulletWorld) -> None:
+def test_a_box_rotated_by_45_degrees_takes_its_diagonal(world: BulletWorld) -> None:
     thing = one('<box size="0.2 0.2 0.5"/>', pose=Pose([1, 2, 3], yaw_quaternion(math.pi / 4)))
     half = 0.1 * math.sqrt(2)
     np.testing.assert_allclose(
@@ -38,7 +38,7 @@ def test_a_box_turned_by_45_degrees_takes_its_diagonal(world: BulletWorld) -> No
     )
 
 
-def test_a_leaning_box_takes_the_room_of_its_corners(world: BulletWorld) -> None:
+def test_a_tilted_box_takes_the_space_of_its_corners(world: BulletWorld) -> None:
     pose = Pose([0.5, -0.2, 1.0], [0.3, 0.1, -0.5, 0.6])
     thing = one('<box size="0.2 0.4 0.6"/>', '<origin xyz="0.1 0 0.3" rpy="0 0 0.3"/>')
     thing.set_pose(pose)
@@ -46,12 +46,12 @@ def test_a_leaning_box_takes_the_room_of_its_corners(world: BulletWorld) -> None
     np.testing.assert_allclose(thing.bounding_box(), around(corners(0.2, 0.4, 0.6), where), atol=1e-9)
 
 
-def test_a_sphere_takes_its_radius_however_it_is_turned(world: BulletWorld) -> None:
+def test_a_sphere_takes_its_radius_whatever_its_orientation(world: BulletWorld) -> None:
     thing = one('<sphere radius="0.25"/>', pose=Pose([1, 0, 0], [0.3, 0.1, -0.5, 0.6]))
     np.testing.assert_allclose(thing.bounding_box(), [(0.75, -0.25, -0.25), (1.25, 0.25, 0.25)], atol=1e-9)
 
 
-def test_a_leaning_cylinder_takes_the_room_of_its_rims(world: BulletWorld) -> None:
+def test_a_tilted_cylinder_takes_the_space_of_its_rims(world: BulletWorld) -> None:
     thing = one('<cylinder radius="0.1" length="0.4"/>')
     thing.set_pose(Pose([0, 0, 1], [math.sin(0.3), 0, 0, math.cos(0.3)]))
     rims = [
@@ -86,7 +86,7 @@ def test_a_link_without_a_shape_has_a_box_of_size_zero_at_its_frame(world: Bulle
     assert thing.bounding_box("boom") == BoundingBox(at, at)
 
 
-def test_centre_and_size_of_a_box() -> None:
+def test_a_box_has_a_centre_and_a_size() -> None:
     box = BoundingBox(Vector(0.0, -1.0, 2.0), Vector(1.0, 1.0, 2.5))
     assert box.centre == Vector(0.5, 0.0, 2.25)
     assert box.size == Vector(1.0, 2.0, 0.5)
@@ -100,7 +100,7 @@ INERTIAL = (
 
 
 @pytest.mark.parametrize("inertial", ["", INERTIAL])
-def test_a_mesh_takes_the_room_of_its_corners(world: BulletWorld, tmp_path: Path, inertial: str) -> None:
+def test_a_mesh_takes_the_space_of_its_corners(world: BulletWorld, tmp_path: Path, inertial: str) -> None:
     mesh = tmp_path / "tetrahedron.obj"
     mesh.write_text(TETRAHEDRON)
     shape = (
@@ -117,7 +117,7 @@ def test_a_mesh_takes_the_room_of_its_corners(world: BulletWorld, tmp_path: Path
     np.testing.assert_allclose(thing.bounding_box(), expected, atol=1e-3)
 
 
-def test_a_mesh_bullet_gives_no_corners_of_is_at_least_covered(world: BulletWorld, tmp_path: Path) -> None:
+def test_a_mesh_whose_corners_bullet_does_not_return_is_at_least_covered(world: BulletWorld, tmp_path: Path) -> None:
     mesh = tmp_path / "tetrahedron.obj"
     mesh.write_text(TETRAHEDRON)
     shape = (

@@ -32,7 +32,7 @@ def with_mesh(reference: str) -> str:
     )
 
 
-def test_text_and_file_give_the_same_object(world: BulletWorld, tmp_path: Path) -> None:
+def test_text_and_file_make_the_same_object(world: BulletWorld, tmp_path: Path) -> None:
     file = tmp_path / "crane.urdf"
     file.write_text(CRANE)
     by_text = Object("a", ObjectType.GENERIC_OBJECT, CRANE)
@@ -51,7 +51,7 @@ def test_a_changed_file_is_read_again(world: BulletWorld, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("reference", ["package://parts/meshes/wedge.obj", "../meshes/wedge.obj"])
-def test_meshes_are_found_beside_the_file_and_in_packages_above_it(
+def test_meshes_are_searched_beside_the_file_and_in_packages_above_it(
     world: BulletWorld, tmp_path: Path, reference: str
 ) -> None:
     (tmp_path / "parts" / "meshes").mkdir(parents=True)
@@ -64,7 +64,7 @@ def test_meshes_are_found_beside_the_file_and_in_packages_above_it(
 
 
 def two_joints(first: str, second: str) -> str:
-    """Links r, l and m, and two fixed joints, given as name and parent and child."""
+    """Return links r, l and m, and two fixed joints, given as name and parent and child."""
     joints = "".join(
         f'<joint name="{name}" type="fixed"><parent link="{parent}"/><child link="{child}"/></joint>'
         for name, parent, child in (first.split(), second.split())
@@ -122,7 +122,7 @@ def test_the_built_in_robot_is_the_pr2(world: BulletWorld) -> None:
     assert robot.joint_limits("torso_lift_joint") == (0.0, 0.33)
 
 
-def test_the_mesh_model_of_the_extra_loads_and_fills_the_same_room(world: BulletWorld) -> None:
+def test_the_mesh_model_of_the_extra_loads_and_has_the_same_extents(world: BulletWorld) -> None:
     by_mesh = Object("pr2", ObjectType.ROBOT, pr2_mesh_urdf_path())
     by_shape = Object("built in", ObjectType.ROBOT, pr2_urdf())
     assert by_mesh.robot_description is PR2

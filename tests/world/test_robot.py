@@ -1,4 +1,4 @@
-"""The PR2's description and its two models say the same of its joints, frames, limits and measures."""
+"""The PR2's description agrees with its two models on joints, frames, limits and measures."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path, pr2_urdf
 from pycrorm_async.world.pose import Pose, product, rotated, yaw_quaternion
 from pycrorm_async.world.robots.kinematics import forward
 from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS, PR2, Limits, robot_description
-from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_stand
+from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
 
 BULLET_EXACT = 1e-6
-"""Metres and rad: Bullet hands link frames out in 32 bits."""
+"""The tolerance in metres and rad: Bullet returns link frames in single precision."""
 BULLET_MARGIN = 0.0011
-"""Metres by which Bullet's boxes are larger than the shapes."""
+"""The metres by which Bullet's boxes are larger than the shapes."""
 ARMS = (Arms.LEFT, Arms.RIGHT)
 
-# From the robot's public model, not from our description.
+# From the robot's public model, not from the package's description.
 LEFT_HARD_LIMITS = {
     "l_shoulder_pan_joint": (-0.7146, 2.2854),
     "l_shoulder_lift_joint": (-0.5236, 1.3963),
@@ -61,7 +61,7 @@ def model(tmp_path: Path) -> Iterator[LoadedModel]:
     loaded.close()
 
 
-def test_the_model_of_boxes_loads_without_a_word(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_model_of_boxes_loads_without_output(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "pr2.urdf"
     path.write_text(pr2_urdf(), encoding="utf-8")
     LoadedModel(path).close()
@@ -77,7 +77,7 @@ def test_the_model_has_the_pr2s_joints_and_hard_limits_and_no_others(model: Load
         assert lower > upper, "Bullet's way to say that a joint has no limits"
 
 
-def test_the_model_stands_on_the_floor_on_its_root_link(model: LoadedModel) -> None:
+def test_the_root_link_of_the_model_is_on_the_floor(model: LoadedModel) -> None:
     model.put(base=Pose(), joints={})
     assert model.root == "base_footprint"
     lowest = min(model.bounding_box(link)[0].z for link in model.links)
@@ -85,7 +85,7 @@ def test_the_model_stands_on_the_floor_on_its_root_link(model: LoadedModel) -> N
     assert model.link_pose("torso_lift_link").position == pytest.approx((-0.05, 0, 0.790675), abs=BULLET_EXACT)
 
 
-def test_stretched_arms_end_where_the_pr2s_link_lengths_add_up_to(model: LoadedModel) -> None:
+def test_stretched_arms_end_at_the_sum_of_the_pr2s_link_lengths(model: LoadedModel) -> None:
     model.put(base=Pose(), joints={})
     ahead = -0.05 + 0.1 + 0.4 + 0.321 + 0.18
     for link, side in (("l_gripper_tool_frame", 0.188), ("r_gripper_tool_frame", -0.188)):
@@ -111,7 +111,7 @@ def test_the_head_turns_left_with_pan_and_down_with_tilt(model: LoadedModel) -> 
     assert {PR2.head_pan_link, PR2.head_tilt_link} <= set(model.links)
 
 
-def test_fingers_part_when_opened(model: LoadedModel) -> None:
+def test_fingers_move_apart_when_opened(model: LoadedModel) -> None:
     for arm in ARMS:
         part = PR2.arms[arm]
         left, right = (name.removesuffix("_joint") + "_link" for name in part.gripper_joints[GripperState.OPEN])
@@ -123,11 +123,11 @@ def test_fingers_part_when_opened(model: LoadedModel) -> None:
 
 
 @pytest.mark.parametrize("arm", ARMS)
-def test_forward_kinematics_is_bullets(model: LoadedModel, arm: Arms) -> None:
+def test_forward_kinematics_equals_bullets(model: LoadedModel, arm: Arms) -> None:
     rng = random.Random(20)
     for _ in range(300):
         joints = random_arm(rng, arm, Limits.HARD)
-        base, torso_height = random_stand(rng)
+        base, torso_height = random_base_pose(rng)
         model.put(base=base, joints={**joints, PR2.torso_joint: torso_height})
         ours = forward(PR2, arm, joints, torso_height=torso_height, base=base)
         bullets = model.link_pose(PR2.arms[arm].tool_frame)
@@ -135,14 +135,14 @@ def test_forward_kinematics_is_bullets(model: LoadedModel, arm: Arms) -> None:
         assert angle_between(ours.orientation, bullets.orientation) < BULLET_EXACT
 
 
-def test_described_hard_limits_are_the_models(model: LoadedModel) -> None:
+def test_described_hard_limits_equal_the_models(model: LoadedModel) -> None:
     for arm in ARMS:
         for name, bounds in PR2.arms[arm].hard_limits.items():
             assert name in CONTINUOUS or model.limits[name] == bounds
     assert model.limits[PR2.torso_joint] == PR2.torso_limits
 
 
-def test_soft_limits_lie_inside_the_hard_ones_and_rolls_turn_freely() -> None:
+def test_soft_limits_are_inside_the_hard_ones_and_rolls_turn_freely() -> None:
     for arm in ARMS:
         part = PR2.arms[arm]
         assert tuple(part.soft_limits) == tuple(part.hard_limits) == part.joints
@@ -176,7 +176,7 @@ def test_parked_arms_are_within_the_hard_limits_and_folded(model: LoadedModel) -
 
 
 @pytest.mark.parametrize("heading", [0.0, math.pi / 2, 2.5])
-def test_grasps_come_from_their_side_of_the_object_whatever_its_heading(heading: float) -> None:
+def test_a_grasp_comes_from_its_side_of_the_object_whatever_its_heading(heading: float) -> None:
     turned = yaw_quaternion(heading)
     forth = (math.cos(heading), math.sin(heading), 0)
     leftwards = (-math.sin(heading), math.cos(heading), 0)
@@ -192,7 +192,7 @@ def test_only_the_pr2_is_described() -> None:
     assert robot_description("hsrb") is None
 
 
-def test_without_the_mesh_package_the_refusal_says_what_to_install() -> None:
+def test_without_the_mesh_package_the_error_names_the_extra_to_install() -> None:
     root = str(Path(pycrorm_async.__file__).parents[1])
     script = f"""
 import sys
@@ -209,7 +209,7 @@ except MissingExtra as missing:
     assert "pip install 'pycrorm-async[pr2]'" in done.stdout
 
 
-def test_the_mesh_model_has_every_joint_and_link_of_ours_in_the_same_place(model: LoadedModel) -> None:
+def test_the_mesh_model_has_every_joint_and_link_of_the_model_of_boxes_in_the_same_place(model: LoadedModel) -> None:
     mesh = LoadedModel(pr2_mesh_urdf_path())
     try:
         assert set(model.limits) <= set(mesh.limits)
@@ -218,7 +218,7 @@ def test_the_mesh_model_has_every_joint_and_link_of_ours_in_the_same_place(model
         assert differ == {"torso_lift_joint", "l_wrist_flex_joint", "r_wrist_flex_joint"}
         rng = random.Random(21)
         for _ in range(50):
-            base, torso_height = random_stand(rng)
+            base, torso_height = random_base_pose(rng)
             joints = {
                 **random_arm(rng, Arms.LEFT, Limits.SOFT),
                 **random_arm(rng, Arms.RIGHT, Limits.SOFT),

@@ -1,4 +1,4 @@
-"""What is looked through is as if it were not there: told by the same rays in a world where it is not."""
+"""Transparent objects do not affect visibility: the same rays hit the same in a world without them."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pycrorm_async.world.queries.visibility import met_towards
 from pycrorm_async.world.robots.kinematics import solve
 
 
-def test_a_hand_before_a_thing_is_looked_through_all_the_way(world: BulletWorld) -> None:
-    """The rays go a long way through the stretched arm and what it holds, and out of them into the counter."""
+def test_a_transparent_hand_in_front_of_an_object_does_not_hide_it(world: BulletWorld) -> None:
+    """The rays pass a long way through the stretched arm and its load, and then into the counter."""
     Object("kitchen", ObjectType.ENVIRONMENT)
     cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.56, 1.022, 0.8]))
     eye = (0.65, 0.9455, 1.2573)
@@ -25,7 +25,7 @@ def test_a_hand_before_a_thing_is_looked_through_all_the_way(world: BulletWorld)
     assert met_towards(world, cereal, eye, ignore=frozenset({robot, milk})) == alone
 
 
-def test_what_was_looked_through_is_met_again_afterwards(world: BulletWorld) -> None:
+def test_an_object_is_opaque_again_after_the_query(world: BulletWorld) -> None:
     robot = Object("pr2", ObjectType.ROBOT, pose=Pose([1, 0, 0]))
     ray = ([(0.0, 0.0, 0.2)], [(2.0, 0.0, 0.2)])
     assert world.ray_test(*ray) == [robot]

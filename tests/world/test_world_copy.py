@@ -1,4 +1,4 @@
-"""A copy of a world is exactly like it, quiet, and nothing that is done in one is done in the other."""
+"""A copy equals its world, notifies no observer, and shares no later change with it."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, current_w
 from pycrorm_async.world.errors import WorldClosed
 from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.world_copy import copied, counterpart, original, related
-from tests.world.fakes import CRANE, Witness, crane_links, matrix
+from tests.world.fakes import CRANE, ChangeLog, crane_links, matrix
 
 TURNED = {"turning": 2.5, "lifting": 0.8, "reaching": 0.3}
 
 
 class Doorman:
-    """A watcher: which worlds were entered and left."""
+    """A watcher that notes the worlds that were entered and left."""
 
     def __init__(self) -> None:
-        self.told: list[tuple[str, BulletWorld]] = []
+        self.notes: list[tuple[str, BulletWorld]] = []
 
     def world_entered(self, world: BulletWorld) -> None:
-        self.told.append(("entered", world))
+        self.notes.append(("entered", world))
 
     def world_left(self, world: BulletWorld) -> None:
-        self.told.append(("left", world))
+        self.notes.append(("left", world))
 
 
 @pytest.fixture
 def yard(world: BulletWorld) -> BulletWorld:
-    """A crane with a load on its hook and a label on the load; a milk that stands by itself."""
+    """Return a crane with a load on its hook and a label on the load, and a milk that is attached to nothing."""
     crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([1, 2, 0], yaw_quaternion(0.4)))
     load = Object("load", ObjectType.BOWL, pose=Pose([3, 3, 3]))
     label = Object("label", ObjectType.SPOON, pose=Pose([3, 3.1, 3]))
@@ -43,7 +43,7 @@ def yard(world: BulletWorld) -> BulletWorld:
     return world
 
 
-def test_everything_in_a_copy_is_as_it_is_in_the_world(yard: BulletWorld) -> None:
+def test_a_copy_has_everything_of_the_world(yard: BulletWorld) -> None:
     before = yard.save_state()
     with copied(yard) as copy:
         assert copy is not yard
@@ -65,10 +65,10 @@ def test_everything_in_a_copy_is_as_it_is_in_the_world(yard: BulletWorld) -> Non
     assert yard.save_state() == before
 
 
-def test_what_is_attached_in_a_copy_moves_there_as_geometry_says_and_not_in_the_world(yard: BulletWorld) -> None:
-    """Where the label must be: on the hook, by matrices from the crane's drawing."""
-    witness = Witness()
-    yard.observe(witness)
+def test_an_attached_object_in_a_copy_moves_by_geometry_and_not_in_the_world(yard: BulletWorld) -> None:
+    """The expected pose of the label: on the hook, by matrices from the crane's drawing."""
+    change_log = ChangeLog()
+    yard.observe(change_log)
     state = yard.save_state()
     with copied(yard) as copy:
         crane, label = copy.object("crane"), copy.object("label")
@@ -83,10 +83,10 @@ def test_what_is_attached_in_a_copy_moves_there_as_geometry_says_and_not_in_the_
         crane.detach_all()
     assert yard.save_state() == state
     assert [each.name for each in yard.objects] == ["crane", "load", "label", "milk"]
-    assert witness.told == []
+    assert change_log.notes == []
 
 
-def test_what_happens_in_the_world_does_not_happen_in_its_copy(yard: BulletWorld) -> None:
+def test_changes_of_the_world_do_not_affect_its_copy(yard: BulletWorld) -> None:
     with copied(yard) as copy:
         state = copy.save_state()
         yard.object("crane").set_joint_position("turning", 0.0)
@@ -94,17 +94,17 @@ def test_what_happens_in_the_world_does_not_happen_in_its_copy(yard: BulletWorld
         assert copy.save_state() == state
 
 
-def test_copying_is_quiet(yard: BulletWorld) -> None:
-    witness, doorman = Witness(), Doorman()
-    yard.observe(witness)
+def test_making_a_copy_notifies_no_observer(yard: BulletWorld) -> None:
+    change_log, doorman = ChangeLog(), Doorman()
+    yard.observe(change_log)
     token = watcher.set(doorman)
     try:
         with copied(yard) as copy:
             assert copy.observers == ()
     finally:
         watcher.reset(token)
-    assert (witness.told, doorman.told) == ([], [])
-    assert yard.observers == (witness,)
+    assert (change_log.notes, doorman.notes) == ([], [])
+    assert yard.observers == (change_log,)
 
 
 def test_a_copy_is_the_current_world_inside_and_closed_afterwards_however_it_is_left(yard: BulletWorld) -> None:
@@ -118,7 +118,7 @@ def test_a_copy_is_the_current_world_inside_and_closed_afterwards_however_it_is_
     assert yard.entered
 
 
-def test_a_copy_resets_to_where_its_objects_began(yard: BulletWorld) -> None:
+def test_a_copy_resets_to_the_initial_poses_of_its_objects(yard: BulletWorld) -> None:
     with copied(yard) as copy:
         copy.reset()
         crane = copy.object("crane")
@@ -127,7 +127,7 @@ def test_a_copy_resets_to_where_its_objects_began(yard: BulletWorld) -> None:
         assert list(copy.attachments) == []
 
 
-def test_counterparts_are_found_from_every_copy_in_every_other(yard: BulletWorld) -> None:
+def test_counterparts_are_resolved_from_every_copy_to_every_other(yard: BulletWorld) -> None:
     milk = yard.object("milk")
     with copied(yard) as first:
         with copied(first) as second:
@@ -141,7 +141,7 @@ def test_counterparts_are_found_from_every_copy_in_every_other(yard: BulletWorld
             assert counterpart(milk, yard) is milk
 
 
-def test_what_is_not_there_has_no_counterpart(yard: BulletWorld) -> None:
+def test_an_object_that_is_only_in_one_world_has_no_counterpart(yard: BulletWorld) -> None:
     removed, milk = yard.object("label"), yard.object("milk")
     removed.remove()
     with copied(yard) as copy:
