@@ -18,6 +18,7 @@ from sqlalchemy import (
     Double,
     ForeignKey,
     Text,
+    event,
     inspect,
     literal_column,
     or_,
@@ -26,7 +27,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import MissingGreenlet, StatementError
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.ext.hybrid import hybrid_property
-from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, mapped_column, relationship, synonym
+from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, Mapper, mapped_column, relationship, synonym
 from sqlalchemy.orm.exc import DetachedInstanceError
 
 from pycrorm_async.errors import CallerError
@@ -96,6 +97,23 @@ class RowOfEvent:
         # Literals, because PostgreSQL shifts by a 4-byte integer only and a parameter would be of 8 bytes.
         shifted = cls.id.bitwise_rshift(literal_column(str(SLOT_MAX.bit_length())))
         return shifted.bitwise_and(literal_column(str(SEQUENCE_MAX)))  # type: ignore[no-any-return]
+
+
+@event.listens_for(Base, "mapper_configured", propagate=True)
+def _read_members(mapper: Mapper[Any], class_: type[Base]) -> None:
+    """Let objects have enum members where a synchronous connection reads their columns as names."""
+    columns = ((each.key, each.columns[0].type) for each in mapper.column_attrs)
+    enums = [(key, kind) for key, kind in columns if isinstance(kind, EnumName)]
+
+    def read_members(row: Base, *_: Any) -> None:
+        values = vars(row)
+        for key, kind in enums:
+            if type(values.get(key)) is str:
+                values[key] = kind.member(values[key])
+
+    if enums:
+        event.listen(class_, "load", read_members)
+        event.listen(class_, "refresh", read_members)
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 | Python | column |
 |---|---|
 | aware `datetime` | integer, µs since 1970-01-01 00:00 UTC |
-| enum member | its name as text; a name that the enum lacks is read as `str` |
+| enum member | its name as text; a name that the enum lacks is read as `str`, see `EnumName` |
 | what JSON can hold; None is NULL | JSON text |
 """
 
@@ -41,7 +41,11 @@ class Moment(TypeDecorator[datetime]):
 
 
 class EnumName(TypeDecorator[Any]):
-    """A member of `enum`, stored by name. A query may compare the column with members and with names."""
+    """A member of `enum`, stored by name. A query may compare the column with members and with names.
+
+    A column that a synchronous connection selects is read as the name. `pandas.read_sql` uses such a connection, and
+    would turn the members of an `IntEnum` into their numbers. Objects have members on every connection (`orm.base`).
+    """
 
     impl = String
     cache_ok = True
@@ -54,8 +58,12 @@ class EnumName(TypeDecorator[Any]):
     def process_bind_param(self, value: Enum | str | None, dialect: Dialect) -> str | None:  # noqa: ARG002
         return value.name if isinstance(value, Enum) else value
 
-    def process_result_value(self, value: str | None, dialect: Dialect) -> Enum | str | None:  # noqa: ARG002
-        return None if value is None else self._members.get(value, value)
+    def process_result_value(self, value: str | None, dialect: Dialect) -> Enum | str | None:
+        return value if value is None or not dialect.is_async else self.member(value)
+
+    def member(self, name: str) -> Enum | str:
+        """Return the member of this name, or the name if the enum lacks it."""
+        return self._members.get(name, name)
 
 
 class JsonText(TypeDecorator[Any]):

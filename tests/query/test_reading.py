@@ -5,15 +5,15 @@ from __future__ import annotations
 import builtins
 import contextlib
 import sqlite3
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pandas as pd
 import pytest
-from sqlalchemy import func, select
+from sqlalchemy import Engine, create_engine, func, select
 from sqlalchemy.exc import DBAPIError
-from sqlalchemy.orm import aliased
+from sqlalchemy.orm import Session, aliased
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, MissingExtra, UnknownEpisode
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
@@ -24,7 +24,8 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.databases import ask, in_a_loop_of_its_own
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
@@ -236,6 +237,36 @@ async def test_enums_are_the_same_text_in_a_frame_and_in_plain_sql(reading: Read
     if str(recorded).startswith("sqlite"):  # the only database with a driver that pandas can use here
         with contextlib.closing(sqlite3.connect(str(recorded).removeprefix("sqlite:///"))) as plain:
             assert pd.read_sql(by_hand, plain).equals(frame)
+        with synchronous(recorded) as engine:
+            assert pd.read_sql(question, engine).equals(frame)
+            left = question.where(PickUpAction.arm == Arms.LEFT, PickUpAction.status == TaskStatus.FAILED)
+            assert pd.read_sql(left, engine).equals(frame)
+            assert len(pd.read_sql(question.where(PickUpAction.arm == Arms.RIGHT), engine)) == 0
+
+
+@contextlib.contextmanager
+def synchronous(address: DatabaseAddress) -> Iterator[Engine]:
+    engine = create_engine(str(address))
+    try:
+        yield engine
+    finally:
+        engine.dispose()
+
+
+async def test_objects_have_members_also_in_a_synchronous_session(recorded: DatabaseAddress) -> None:
+    if not str(recorded).startswith("sqlite"):
+        pytest.skip("no synchronous driver for PostgreSQL is installed")
+    with synchronous(recorded) as engine, Session(engine) as session:
+        (picked, _) = session.scalars(select(PickUpAction).order_by(PickUpAction.id))
+        assert (picked.arm, picked.grasp, picked.status) == (Arms.LEFT, Grasp.TOP, TaskStatus.FAILED)
+        assert picked.robot_state is not None
+        assert (picked.object.obj_type, picked.robot_state.type) == (ObjectType.MILK, ObjectType.ROBOT)
+        session.expire(picked)
+        assert (picked.arm, picked.status) == (Arms.LEFT, TaskStatus.FAILED)
+        session.expunge_all()
+        arms = {each.id: each.arm for each in session.scalars(select(Action)) if isinstance(each, PickUpAction)}
+        assert [*arms.values()] == [Arms.LEFT] * 2
+        assert {type(each.status) for each in session.scalars(select(TaskTreeNode))} == {TaskStatus}
 
 
 async def test_a_frame_counts_groups_and_accepts_aliases(reading: Reading) -> None:
