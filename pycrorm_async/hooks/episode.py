@@ -28,10 +28,9 @@ again in the follow-up. `NodeRecord.episode_id` is the id under which the node's
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Final, Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.codec import NotEncodable
@@ -42,6 +41,7 @@ from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.emitter import UNAWAITED_MAX, Emitter
 from pycrorm_async.hooks.episode_events import (
     EpisodeOpening,
+    current_task,
     end_statuses,
     episode_started,
     location_resolved,
@@ -67,7 +67,7 @@ from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.observers import current_world
 
-__all__ = ["Episode", "NodeRecord", "CONTINUED", "current_task"]
+__all__ = ["Episode", "NodeRecord", "CONTINUED"]
 
 CONTINUED: Final = "EpisodeContinued"
 """The failure type of nodes and episodes that ended because a follow-up episode continues them."""
@@ -391,11 +391,3 @@ class Episode:
         except NotEncodable as error:
             self._emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
             self._emitter.put(self.id, fit_node_end(event, self._emitter.settings.record_bytes_max))
-
-
-def current_task() -> asyncio.Task[Any] | None:
-    """Return the running asyncio task; None outside an event loop."""
-    try:
-        return asyncio.current_task()
-    except RuntimeError:
-        return None

@@ -6,7 +6,7 @@ import asyncio
 import getpass
 import platform
 from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.types import EpisodeStarted, LocationResolved, ObjectDetected
@@ -26,7 +26,7 @@ from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.world.enums import ObjectType
 
-__all__ = ["EpisodeOpening", "episode_started", "location_resolved", "object_detected", "end_statuses"]
+__all__ = ["EpisodeOpening", "episode_started", "location_resolved", "object_detected", "end_statuses", "current_task"]
 
 
 class EpisodeOpening(NamedTuple):
@@ -120,6 +120,14 @@ def end_statuses(failure: BaseException | None) -> tuple[EpisodeStatus, NodeStat
     if isinstance(failure, asyncio.CancelledError | KeyboardInterrupt):
         return "INTERRUPTED", "CANCELLED"
     return "ERROR", "ERROR"
+
+
+def current_task() -> asyncio.Task[Any] | None:
+    """Return the running asyncio task; None outside an event loop."""
+    try:
+        return asyncio.current_task()
+    except RuntimeError:
+        return None
 
 
 def _user() -> str:

@@ -35,8 +35,8 @@ from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.events.values import NodeReference
 from pycrorm_async.hooks.declaration import Declarations, DeclaredType
 from pycrorm_async.hooks.emitter import Emitter
-from pycrorm_async.hooks.episode import Episode, NodeRecord, current_task
-from pycrorm_async.hooks.episode_events import EpisodeOpening
+from pycrorm_async.hooks.episode import Episode, NodeRecord
+from pycrorm_async.hooks.episode_events import EpisodeOpening, current_task
 from pycrorm_async.hooks.provenance import Provenance
 from pycrorm_async.hooks.sampler import Sampler
 from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
