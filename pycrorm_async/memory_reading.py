@@ -53,10 +53,15 @@ class ReadableMemory(PartsHolder):
         return reading.mapped(designator)
 
     async def as_of(
-        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
+        self,
+        episode: AnyEpisode,
+        *,
+        time: float | datetime | None = None,
+        sequence: int | None = None,
+        meshes: bool = False,
     ) -> Moment:
         """Return the task tree and the world at any moment of an episode, up to the last flush; see `Reading.as_of`."""
-        return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence)
+        return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence, meshes=meshes)
 
     async def blob(self, name: str) -> Blob | None:
         """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""

@@ -13,9 +13,10 @@ from typing import Any, Final, Literal, get_args
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["FILE_MODES", "FileAccess", "Settings", "OnFull", "OnUnrecordable", "Writer"]
+__all__ = ["FILE_MODES", "FileAccess", "Settings", "OnFull", "OnUnrecordable", "RecordMeshes", "Writer"]
 
 OnFull = Literal["wait", "fail"]
+RecordMeshes = Literal["boxes", "files"]
 OnUnrecordable = Literal["record_missing", "refuse"]
 Writer = Literal["thread", "daemon"]
 FileAccess = Literal["owner", "group"]
@@ -29,6 +30,7 @@ _CHOICES = {
     "writer": get_args(Writer),
     "on_full": get_args(OnFull),
     "on_unrecordable": get_args(OnUnrecordable),
+    "record_meshes": get_args(RecordMeshes),
     "file_access": get_args(FileAccess),
 }
 
@@ -71,6 +73,8 @@ class Settings:
         on_full: a node that starts while the spool is full waits for space ("wait") or fails with `SpoolFull` ("fail").
         on_unrecordable: "record_missing" records a parameter that cannot be recorded as missing, with the reason,
             counts it and warns once; "refuse", for developing a plan, raises before `perform` runs.
+        record_meshes: a mesh of an object's description is recorded as its hash and the box around its link ("boxes"),
+            or also as a blob with the file's content ("files").
         file_access: a new spool (mode 0700) and a new SQLite database (0600) belong to their "owner" alone, or to the
             "group" of the folder that holds them (2770, 0660), whose processes share them.
     """
@@ -100,6 +104,7 @@ class Settings:
     sample_change_min: float = 0.0
     on_full: OnFull = "wait"
     on_unrecordable: OnUnrecordable = "record_missing"
+    record_meshes: RecordMeshes = "boxes"
     file_access: FileAccess = "owner"
 
     def changed(self) -> dict[str, Any]:

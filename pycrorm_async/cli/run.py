@@ -33,7 +33,7 @@ from pycrorm_async.hooks.values.texts import message_of
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.settings import OnFull, OnUnrecordable, Settings
+from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
 
 __all__ = ["run"]
 
@@ -83,6 +83,14 @@ def run(
             help="A node that starts while the spool is full waits for space, or fails.",
         ),
     ] = "wait",
+    record_meshes: Annotated[
+        str,
+        typer.Option(
+            metavar="|".join(get_args(RecordMeshes)),
+            autocompletion=lambda: list(get_args(RecordMeshes)),
+            help="Record the meshes of objects as boxes, or also the files.",
+        ),
+    ] = "boxes",
     show_traceback: Annotated[
         bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")
     ] = False,
@@ -99,6 +107,7 @@ def run(
         sample_interval_ms=_milliseconds("--sample-interval-ms", sample_interval_ms),
         on_unrecordable=_choice("--on-unrecordable", on_unrecordable, get_args(OnUnrecordable)),
         on_full=_choice("--on-full", on_full, get_args(OnFull)),
+        record_meshes=_choice("--record-meshes", record_meshes, get_args(RecordMeshes)),
     )
     loaded = load_plan(plan)
     memory = Memory.open(

@@ -11,11 +11,11 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 
-from pycrorm_async.events.types import EVENT_TYPES, DesignatorTypeDeclared, Happening
+from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared, DesignatorTypeDeclared, Happening
 from pycrorm_async.events.upcasters import UPCASTERS, Upcaster
 
 __all__ = [
@@ -25,10 +25,22 @@ __all__ = [
     "encode",
     "encoded_bytes",
     "decode",
+    "DECLARATION_TYPES",
+    "DESCRIPTIONS_FROM",
     "fingerprint",
+    "declaration_type",
     "declaration_of",
+    "description_of",
     "unwritable",
 ]
+
+
+_DESCRIPTION = "urdf-"
+DESCRIPTIONS_FROM: Final = "g"
+"""Divides the fingerprints of designator types, which are hexadecimal digits, from those of descriptions."""
+
+DECLARATION_TYPES: Final[Mapping[str, str]] = {"DesignatorTypeDeclared": "", "DescriptionDeclared": _DESCRIPTION}
+"""The event types that belong to a recorder and not to an episode, with the prefix of their fingerprints."""
 
 
 class NotEncodable(ValueError):
@@ -78,14 +90,23 @@ class Decoder:
             raise msgspec.DecodeError(str(error)) from None
 
     def declaration_of(self, payload: bytes) -> DesignatorTypeDeclared:
-        """Decode a declaration, whose payload carries its own version. Raises as `decode` does."""
+        """Decode a designator type, whose payload carries its own version. Raises as `decode` does."""
+        event = self._declaration("DesignatorTypeDeclared", payload)
+        assert isinstance(event, DesignatorTypeDeclared)
+        return event
+
+    def description_of(self, payload: bytes) -> DescriptionDeclared:
+        """Decode a description, whose payload carries its own version. Raises as `decode` does."""
+        event = self._declaration("DescriptionDeclared", payload)
+        assert isinstance(event, DescriptionDeclared)
+        return event
+
+    def _declaration(self, type_name: str, payload: bytes) -> Happening:
         try:
             version = msgspec.json.decode(payload, type=_Versioned).version
         except (UnicodeDecodeError, RecursionError) as error:
             raise msgspec.DecodeError(str(error)) from None
-        event = self.decode("DesignatorTypeDeclared", payload, version)
-        assert isinstance(event, DesignatorTypeDeclared)
-        return event
+        return self.decode(type_name, payload, version)
 
     def _upcast(self, type_name: str, payload: bytes, version: int, current: int) -> bytes:
         document = msgspec.json.decode(payload, type=dict[str, Any])
@@ -105,6 +126,7 @@ _encoder = msgspec.json.Encoder()
 _decoder = Decoder(EVENT_TYPES, UPCASTERS)
 decode = _decoder.decode
 declaration_of = _decoder.declaration_of
+description_of = _decoder.description_of
 
 
 def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
@@ -140,9 +162,17 @@ def encoded_bytes(value: Any) -> int:
         raise NotEncodable("", str(error)) from None
 
 
-def fingerprint(declaration: bytes) -> str:
-    """Compute the content address of a declaration: 128 bits of BLAKE2b over its payload, as 32 hexadecimal digits."""
-    return hashlib.blake2b(declaration, digest_size=16).hexdigest()
+def fingerprint(declaration: bytes, type_name: str = "DesignatorTypeDeclared") -> str:
+    """Compute the content address of a declaration: 128 bits of BLAKE2b over its payload, as 32 hexadecimal digits.
+
+    That of a description follows a prefix, so that the log can read the declarations of either type by their index.
+    """
+    return DECLARATION_TYPES[type_name] + hashlib.blake2b(declaration, digest_size=16).hexdigest()
+
+
+def declaration_type(fingerprint: str) -> str:
+    """Return the event type of the declaration that has this fingerprint."""
+    return "DescriptionDeclared" if fingerprint.startswith(_DESCRIPTION) else "DesignatorTypeDeclared"
 
 
 def unwritable(value: Any) -> str | None:

@@ -54,7 +54,7 @@ _RESERVED_TABLES = frozenset(
     " location_resolution location_candidate location_refusal detection state_sample simulated_episode designator_type"
     " observation observation_value episode_tag"
     " pick_up_with_context_view pickupwithcontextview root_failure"
-    " concept concept_ancestor object_concept spatial_relation".split()
+    " object_description concept concept_ancestor object_concept spatial_relation".split()
 )
 """The memory's own tables and views, including planned ones."""
 _RESERVED_BEGINNINGS = ("pycrorm_", "sqlite_", "pg_")

@@ -6,15 +6,19 @@ fields. The sequence of `ObjectAdded` identifies an object, that of `NodeStarted
 
 from __future__ import annotations
 
+import zlib
+from base64 import b64decode
 from typing import Any, ClassVar, Literal
 
 import msgspec
 
 from pycrorm_async.events.values import (
+    BoxValue,
     CandidateValue,
     EpisodeStatus,
     FailureValue,
     FieldDeclared,
+    MeshValue,
     NodeKind,
     NodeReference,
     NodeStatus,
@@ -30,6 +34,7 @@ __all__ = [
     "EpisodeStarted",
     "EpisodeEnded",
     "DesignatorTypeDeclared",
+    "DescriptionDeclared",
     "ObjectAdded",
     "ObjectRemoved",
     "ObjectMoved",
@@ -44,6 +49,10 @@ __all__ = [
     "Observed",
     "EVENT_TYPES",
 ]
+
+
+_URDF_BYTES_MAX = 2**28
+"""Bounds the bytes of a decompressed URDF; `record_bytes_max` bounds those of a compressed one."""
 
 
 class Happening(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -124,10 +133,41 @@ class DesignatorTypeDeclared(Happening, frozen=True):
     aliases: tuple[str, ...] = ()
 
 
+class DescriptionDeclared(Happening, frozen=True):
+    """The description that objects are made from; the hash of its bytes identifies it (`fingerprint`).
+
+    `zlib.decompress(base64.b64decode(payload["urdf"])).decode()` is the URDF as text.
+
+    Attributes:
+        urdf: the URDF, compressed with zlib, in base64. The name of a mesh file is `sha256:` and the hash of the file's
+            content, or `missing:` and the file's name; `MeshValue.reference` is the same text.
+        meshes: the mesh files, each once.
+        boxes: for each link with a mesh, the box around its collision shapes, in the link's frame.
+        missing: the reason if the description could not be recorded; `urdf` is empty then.
+    """
+
+    urdf: str = ""
+    meshes: tuple[MeshValue, ...] = ()
+    boxes: dict[str, BoxValue] = {}
+    missing: str | None = None
+
+    @property
+    def text(self) -> str:
+        """The URDF as text; empty if it is missing. Raises `ValueError` for content that no recorder wrote."""
+        try:
+            return zlib.decompressobj().decompress(b64decode(self.urdf), _URDF_BYTES_MAX).decode()
+        except zlib.error as error:
+            raise ValueError(f"the URDF cannot be decompressed: {error}") from error
+
+
 class ObjectAdded(Happening, frozen=True):
     """An object entered the world. The event's sequence identifies the object in this episode.
 
-    `joints` are in rad or m. `node` added the object; None if none did, or if it was in the world before the episode.
+    Attributes:
+        joints: in rad or m.
+        node: added the object; None if none did, or if it was in the world before the episode.
+        description: fingerprint of the `DescriptionDeclared`; None in events of older versions.
+        color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
     """
 
     name: str
@@ -135,6 +175,8 @@ class ObjectAdded(Happening, frozen=True):
     pose: PoseValue
     joints: dict[str, float] = {}
     node: int | None = None
+    description: str | None = None
+    color: tuple[float, float, float, float] | None = None
 
 
 class ObjectRemoved(Happening, frozen=True):
@@ -288,6 +330,7 @@ EVENT_TYPES: dict[str, type[Happening]] = {
         EpisodeStarted,
         EpisodeEnded,
         DesignatorTypeDeclared,
+        DescriptionDeclared,
         ObjectAdded,
         ObjectRemoved,
         ObjectMoved,

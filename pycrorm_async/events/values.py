@@ -17,6 +17,8 @@ __all__ = [
     "FailureValue",
     "MissingValue",
     "BlobReference",
+    "MeshValue",
+    "BoxValue",
     "CandidateValue",
     "RefusalValue",
     "SeenValue",
@@ -114,6 +116,36 @@ class BlobReference(_Value, frozen=True):
     size: int
     dtype: str | None = None
     shape: tuple[int, ...] | None = None
+
+
+class MeshValue(_Value, frozen=True):
+    """A mesh file of a description.
+
+    Attributes:
+        name: of the file, without its folder.
+        sha256: hash of its content, as hexadecimal digits; None if the file could not be read.
+        size: bytes of its content.
+        content: the blob with its content, with `record_meshes="files"`.
+        missing: the reason why the file, or its content with `record_meshes="files"`, is not recorded.
+    """
+
+    name: str
+    sha256: str | None = None
+    size: int | None = None
+    content: BlobReference | None = None
+    missing: str | None = None
+
+    @property
+    def reference(self) -> str:
+        """The mesh's file name in the recorded URDF."""
+        return f"missing:{self.name}" if self.sha256 is None else f"sha256:{self.sha256}"
+
+
+class BoxValue(_Value, frozen=True):
+    """A box along the axes of a link's frame: its lowest and its highest corner, m."""
+
+    min: tuple[float, float, float]
+    max: tuple[float, float, float]
 
 
 class CandidateValue(_Value, frozen=True):

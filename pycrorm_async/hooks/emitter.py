@@ -12,6 +12,7 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import Happening
 from pycrorm_async.events.values import BlobReference
+from pycrorm_async.hooks.descriptions import Descriptions
 from pycrorm_async.hooks.event_feed import EventFeed
 from pycrorm_async.hooks.event_sink import EventSink
 from pycrorm_async.hooks.values.missing_values import MissingValues
@@ -55,6 +56,7 @@ class Emitter:
         is_closed: whether the memory is closed, or belongs to the process that forked this one; hooks then do nothing.
         feed: the observers of this memory, to which recorded events are published.
         missing: counts the values that could not be recorded.
+        descriptions: declares the descriptions of objects.
         unawaited: for each designator type whose perform was called and never awaited, a sentence for the user.
     """
 
@@ -64,6 +66,7 @@ class Emitter:
         self.is_closed = False
         self.feed = EventFeed()
         self.missing = MissingValues()
+        self.descriptions = Descriptions(self, settings, self.missing)
         self.unawaited: tuple[str, ...] = ()
         self._headings: dict[tuple[EpisodeId, type[Happening]], Heading] = {}
         self._fault_count = 0

@@ -17,6 +17,7 @@ recorded; that replaces this recorder by one for the follow-up.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Mapping
 
@@ -123,9 +124,20 @@ class WorldRecorder:
                 pose_value(added.pose),
                 dict(added.joint_positions()),
                 self._causing_node(),
+                self._emitter.descriptions.declare(added),
+                self._color(added),
             ),
             row_of=added,
         )
+
+    def _color(self, added: Object) -> tuple[float, float, float, float] | None:
+        if added.color is None:
+            return None
+        red, green, blue, opacity = map(float, added.color)
+        if not all(map(math.isfinite, (red, green, blue, opacity))):
+            self._emitter.missing.note("ObjectAdded", "color", f"{added.color} is not finite")
+            return None
+        return red, green, blue, opacity
 
     def object_removed(self, removed: Object) -> None:
         reference = self._references.pop(removed, None)

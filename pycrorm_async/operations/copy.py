@@ -13,11 +13,12 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
+from operator import attrgetter
 
 import msgspec
 
 from pycrorm_async.errors import CallerError, DamageError, LogDamaged
-from pycrorm_async.events.codec import decode, fingerprint
+from pycrorm_async.events.codec import declaration_type, decode, fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
 from pycrorm_async.events.types import EVENT_TYPES
@@ -223,14 +224,16 @@ class _Copier:
 
     async def _declarations(self, events: Iterable[Sequence[StoredEvent]]) -> list[Record]:
         """Return the declarations that these events name and that were not sent yet, in the source's order."""
-        named = {_designator(each) for each in chain.from_iterable(events) if each.type == "NodeStarted"} - self._sent
-        named.discard(None)
-        if not named <= self._declared.keys():
-            # Read after the events, because each declaration is stored before its first use.
+        named = (_declaration(each) for each in chain.from_iterable(events) if each.type in _DECLARED_BY)
+        missing = {each for each in named if each is not None and each not in self._sent}
+        # Read after the events, because each declaration is stored before its first use.
+        described = [each for each in missing if declaration_type(each) == "DescriptionDeclared"]
+        descriptions = await self._source.descriptions(described)
+        if not missing - descriptions.keys() <= self._declared.keys():
             self._declared = {fingerprint(payload): payload for payload in await self._source.declarations()}
-        sent = {name: payload for name, payload in self._declared.items() if name in named}
+        sent = {name: payload for name, payload in self._declared.items() if name in missing} | descriptions
         self._sent |= sent.keys()
-        return [Record(0, None, 0, "DesignatorTypeDeclared", 1, 0, 0, payload) for payload in sent.values()]
+        return [Record(0, None, 0, declaration_type(name), 1, 0, 0, payload) for name, payload in sent.items()]
 
 
 def _refuse_unreadable(episode: str, event: StoredEvent) -> None:
@@ -245,13 +248,18 @@ def _refuse_unreadable(episode: str, event: StoredEvent) -> None:
         raise LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
 
 
-class _DesignatorOnly(msgspec.Struct):
+class _Declared(msgspec.Struct):
     designator: str | None = None
+    description: str | None = None
 
 
-def _designator(event: StoredEvent) -> str | None:
+_DECLARED_BY = {"NodeStarted": attrgetter("designator"), "ObjectAdded": attrgetter("description")}
+
+
+def _declaration(event: StoredEvent) -> str | None:
     """Return the declaration's fingerprint; None where another version stores it, whose node the fold parks."""
     try:
-        return msgspec.json.decode(event.payload, type=_DesignatorOnly).designator
+        fingerprint_: str | None = _DECLARED_BY[event.type](msgspec.json.decode(event.payload, type=_Declared))
     except msgspec.ValidationError:
         return None
+    return fingerprint_

@@ -55,6 +55,7 @@ from pycrorm_async.orm.objects import (
     LocatedObject,
     Object,
     ObjectConcept,
+    ObjectDescription,
     ObjectPart,
     ObjectRemoval,
 )
@@ -73,6 +74,7 @@ __all__ = [
     "ConceptAncestor",
     "ObjectConcept",
     "Object",
+    "ObjectDescription",
     "ObjectPart",
     "BelieveObject",
     "LocatedObject",

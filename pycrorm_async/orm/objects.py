@@ -1,4 +1,4 @@
-"""Map objects at each moment of their history, and their removals, attachments and joint changes.
+"""Map objects at each moment of their history, their descriptions, removals, attachments and joint changes.
 
 A row of `object` is an object at one moment: one row when it was added and one each time it moved. An action refers to
 the row that was current when it started, so `PickUpAction.object.pose` is the pose at execution. All rows of one object
@@ -8,11 +8,15 @@ share `identity_id`.
 from __future__ import annotations
 
 from datetime import datetime
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ColumnElement, ForeignKey, select
+from sqlalchemy import ColumnElement, ForeignKey, FromClause, select
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
+from pycrorm_async.events.codec import description_of
+from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.events.values import BoxValue, MeshValue
 from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, is_concept, on_request
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
@@ -22,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ObjectConcept",
+    "ObjectDescription",
     "Object",
     "ObjectPart",
     "BelieveObject",
@@ -44,12 +49,55 @@ class ObjectConcept(Base):
     concept: Mapped[str]
 
 
+class ObjectDescription(Base):
+    """A description that objects were made from.
+
+    Attributes:
+        payload: the `DescriptionDeclared`, as JSON text.
+    """
+
+    __tablename__ = "object_description"
+
+    fingerprint: Mapped[str] = mapped_column(primary_key=True)
+    payload: Mapped[str]
+
+    @cached_property
+    def declared(self) -> DescriptionDeclared:
+        """The event. Raises `ValueError` for one that this version cannot read."""
+        return description_of(self.payload.encode())
+
+    @property
+    def urdf(self) -> str:
+        """The URDF; the name of a mesh file is `sha256:` and the hash of its content. Empty if `missing` says why."""
+        return self.declared.text
+
+    @property
+    def meshes(self) -> tuple[MeshValue, ...]:
+        """The mesh files: name, hash, size."""
+        return self.declared.meshes
+
+    @property
+    def boxes(self) -> dict[str, BoxValue]:
+        """For each link with a mesh, the box around its collision shapes, in the link's frame (m)."""
+        return self.declared.boxes
+
+    @property
+    def missing(self) -> str | None:
+        """The reason if the description could not be recorded."""
+        return self.declared.missing
+
+
 class Object(RowOfEvent, Base):
     """An object of the world at a moment.
 
     Attributes:
         identity_id: its first row, from when it was added; None for an object outside the world.
         joints: positions (rad or m) when it was added; None in later rows.
+        color: red, green, blue, opacity, 0 to 1, when it was added; None in later rows, and if its description alone
+            says it.
+        description_fingerprint: fingerprint of its description when it was added; None in later rows.
+        description: its description, in every row; None in episodes of older versions. Not loaded by default: use
+            `selectinload(Object.description)` or `await row.awaitable_attrs.description`.
         node_id: the node that moved or added it; None if no node did.
         node: that node. Not loaded by default, because that would take four times as long as the objects: use
             `selectinload(Object.node)` or `await row.awaitable_attrs.node`.
@@ -67,8 +115,18 @@ class Object(RowOfEvent, Base):
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
     joints: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
+    description_fingerprint: Mapped[str | None] = mapped_column(ForeignKey("object_description.fingerprint"))
+    color: Mapped[list[float] | None] = mapped_column(JsonText())
 
     pose: Mapped[Pose | None] = relationship(viewonly=True, lazy="selectin")
+    _description: Mapped[ObjectDescription | None] = relationship(
+        secondary=lambda: _ADDED,
+        primaryjoin=lambda: Object.identity_id == _ADDED.c.id,
+        secondaryjoin=lambda: _ADDED.c.description_fingerprint == ObjectDescription.fingerprint,
+        viewonly=True,
+        lazy="select",
+        uselist=False,
+    )
     _node: Mapped[TaskTreeNode | None] = relationship(foreign_keys=node_id, viewonly=True, lazy="select")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
@@ -84,6 +142,11 @@ class Object(RowOfEvent, Base):
         return cls.obj_type.in_(types)
 
     node: Mapped[TaskTreeNode | None] = synonym("_node", descriptor=on_request("node"))
+    description: Mapped[ObjectDescription | None] = synonym("_description", descriptor=on_request("description"))
+
+
+_ADDED: FromClause = Object.__table__.alias("added")
+"""The rows of objects from when they were added, which name the descriptions."""
 
 
 class ObjectPart(Object):

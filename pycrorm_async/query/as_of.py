@@ -6,7 +6,7 @@ are not folded yet, and for parked episodes. It reads no further than one page b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, PycrormError, UnknownEpisode
-from pycrorm_async.events.codec import fingerprint
-from pycrorm_async.events.types import EVENT_TYPES
+from pycrorm_async.events.codec import description_of, fingerprint
+from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.snapshot import Moment
@@ -40,7 +40,12 @@ _Within: TypeAlias = Callable[[StoredEvent, StoredEvent], bool]
 
 
 async def as_of(
-    log: EventLog, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
+    log: EventLog,
+    episode: AnyEpisode,
+    *,
+    time: float | datetime | None = None,
+    sequence: int | None = None,
+    meshes: bool = False,
 ) -> Moment:
     """Return the episode's state at a moment; see `Reading.as_of`."""
     limit, within = _limit(time, sequence)
@@ -53,9 +58,26 @@ async def as_of(
             break
     if fold.first is None:
         raise CallerError(f"{limit} is before episode {row.number} began")
-    return fold.moment(
-        {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in await log.declarations()}
-    )
+    dtypes = {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in await log.declarations()}
+    payloads = await log.descriptions(fold.descriptions)
+    descriptions = {name: _description(payload) for name, payload in payloads.items()}
+    return fold.moment(dtypes, descriptions, await _meshes(log, descriptions.values()) if meshes else {})
+
+
+async def _meshes(log: EventLog, descriptions: Iterable[DescriptionDeclared]) -> dict[str, bytes]:
+    """Read the mesh files that are recorded; one that is missing or damaged in the log is left out."""
+    recorded = {mesh.content.hash for each in descriptions for mesh in each.meshes if mesh.content is not None}
+    with log.translated():
+        contents = {name: await log.blobs.read_blob(name) for name in recorded}
+    return {name: content for name, content in contents.items() if content is not None}
+
+
+def _description(payload: bytes) -> DescriptionDeclared:
+    """Decode a description; one that this version cannot read is missing, with the reason."""
+    try:
+        return description_of(payload)
+    except ValueError as error:
+        return DescriptionDeclared(missing=f"it cannot be read: {error}")
 
 
 class _DtypeOnly(msgspec.Struct):

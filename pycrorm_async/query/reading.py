@@ -158,7 +158,12 @@ class Reading:
                 return await named_queries.task_tree(connection, number)
 
     async def as_of(
-        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
+        self,
+        episode: AnyEpisode,
+        *,
+        time: float | datetime | None = None,
+        sequence: int | None = None,
+        meshes: bool = False,
     ) -> Moment:
         """Return the task tree and the world of an episode at any moment, read from the log, also while it runs.
 
@@ -168,13 +173,14 @@ class Reading:
             time: seconds since the episode's start by the monotonic clock; or an aware datetime by the wall clock,
                 which includes the events before the first later one.
             sequence: of the last event to include.
+            meshes: read the mesh files of the objects too, which `Settings(record_meshes="files")` records.
 
         A moment beyond the last event in the log gives the state after that event. Raises `UnknownEpisode`;
         `CallerError` for a moment before the start, or without exactly one of `time` and `sequence`; `LogDamaged` or
         `DatabaseForeign` for an event that cannot be read.
         """
         await self._ready()
-        return await as_of(self._log, episode, time=time, sequence=sequence)
+        return await as_of(self._log, episode, time=time, sequence=sequence, meshes=meshes)
 
     async def blob(self, name: str) -> Blob | None:
         """Return the blob with this SHA-256, as hexadecimal digits; None if it is not stored."""

@@ -16,6 +16,7 @@ from datetime import datetime
 from typing import Any, NamedTuple
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.state import ObjectState, WorldState
@@ -46,6 +47,8 @@ class ObjectThen:
         pose: of its root link's frame, in "map".
         joints: rad or m, by name.
         attached_to: name and link of the object that it moves with; the link is None for the root link.
+        description_fingerprint: of its description in `WorldThen.descriptions`; None in episodes of older versions.
+        color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
     """
 
     id: int
@@ -55,6 +58,8 @@ class ObjectThen:
     pose: Pose
     joints: Mapping[str, float]
     attached_to: tuple[str, str | None] | None
+    description_fingerprint: str | None = None
+    color: tuple[float, float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -76,10 +81,19 @@ class AttachmentThen(NamedTuple):
 
 @dataclass(frozen=True)
 class WorldThen:
-    """The world at that moment. `objects` are in the order they were added; `robot` is the first of type ROBOT."""
+    """The world at that moment.
+
+    Attributes:
+        objects: in the order they were added.
+        robot: the first of type ROBOT.
+        descriptions: the descriptions of the objects, by fingerprint.
+        meshes: contents of their mesh files, by SHA-256: those that are recorded, if the snapshot was asked for them.
+    """
 
     objects: tuple[ObjectThen, ...]
     robot: RobotThen | None
+    descriptions: Mapping[str, DescriptionDeclared] = field(default_factory=dict)
+    meshes: Mapping[str, bytes] = field(default_factory=dict, repr=False)
 
     def object(self, name: str) -> ObjectThen:
         """Return the object with this name. Raises `CallerError` if the world had none."""

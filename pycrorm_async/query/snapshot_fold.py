@@ -14,6 +14,7 @@ from typing import Any
 from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import (
+    DescriptionDeclared,
     EpisodeEnded,
     EpisodeStarted,
     Happening,
@@ -66,6 +67,8 @@ class _WorldObject:
     pose: PoseValue
     row: int
     joints: dict[str, float] = field(default_factory=dict)
+    description: str | None = None
+    color: tuple[float, float, float, float] | None = None
     attached_to: tuple[int, str | None] | None = None
 
 
@@ -139,8 +142,16 @@ class MomentFold:
     def _changed(self, sequence: int, happening: Happening) -> None:
         """Apply an event of the world. Events of a removed object have no effect."""
         match happening:
-            case ObjectAdded(name=name, object_type=kind, pose=pose, joints=joints):
-                self._objects[sequence] = _WorldObject(name, kind, pose, sequence, dict(joints))
+            case ObjectAdded(name=name):
+                self._objects[sequence] = _WorldObject(
+                    name,
+                    happening.object_type,
+                    happening.pose,
+                    sequence,
+                    dict(happening.joints),
+                    happening.description,
+                    happening.color,
+                )
                 self._names[sequence] = name
             case ObjectMoved():
                 if (moved := self._present(happening.object)) is not None:
@@ -165,8 +176,24 @@ class MomentFold:
 
     # --- the result -------------------------------------------------------------------------------------------
 
-    def moment(self, dtypes: Mapping[str, str]) -> Moment:
-        """Return the state as values. `dtypes`: the dtype of each declaration, by fingerprint. Raises `LogDamaged`."""
+    @property
+    def descriptions(self) -> set[str]:
+        """The fingerprints of the objects' descriptions."""
+        return {each.description for each in self._objects.values() if each.description is not None}
+
+    def moment(
+        self,
+        dtypes: Mapping[str, str],
+        descriptions: Mapping[str, DescriptionDeclared],
+        meshes: Mapping[str, bytes],
+    ) -> Moment:
+        """Return the state as values. Raises `LogDamaged`.
+
+        Args:
+            dtypes: the dtype of each declaration, by fingerprint.
+            descriptions: those of the objects, by fingerprint.
+            meshes: contents of their mesh files, by SHA-256.
+        """
         started, first, last = self._started, self.first, self._last
         assert started is not None
         assert first is not None
@@ -183,7 +210,7 @@ class MomentFold:
             at=_moment(last.wall_ns),
             status=self._status,
             tree=tuple(self._tree(dtypes, first.monotonic_ns)),
-            world=self._world(),
+            world=self._world(descriptions, meshes),
             observations={name: self._observation(*each) for name, each in self._observed.items()},
         )
 
@@ -236,10 +263,10 @@ class MomentFold:
             return {**value, "name": self._names.get(value["object"])}
         return value
 
-    def _world(self) -> WorldThen:
+    def _world(self, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]) -> WorldThen:
         objects = tuple(self._object(identity, each) for identity, each in self._objects.items())
         robot = next((each for each in objects if each.object_type == "ROBOT"), None)
-        return WorldThen(objects, _robot(robot) if robot is not None else None)
+        return WorldThen(objects, _robot(robot) if robot is not None else None, descriptions, meshes)
 
     def _object(self, identity: int, value: _WorldObject) -> ObjectThen:
         at = value.pose
@@ -258,6 +285,8 @@ class MomentFold:
             attached_to=(self._names[parent[0]], parent[1])
             if parent is not None and parent[0] in self._objects
             else None,
+            description_fingerprint=value.description,
+            color=value.color,
         )
 
 

@@ -2,7 +2,7 @@
 
     event(episode, sequence, type, version, wall_ns, monotonic_ns, payload)      one row an event, payload as JSON text
     episode(number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked)
-    pycrorm_declaration(ordinal, fingerprint, payload)                           designator types, in order of arrival
+    pycrorm_declaration(ordinal, fingerprint, payload)     designator types and descriptions, in order of arrival
     pycrorm_log(id, format, created_wall_ns)                                     one row: the log's identity
 
 An episode gets its `number` at its first append; the number belongs to this database and is never used again. `head` is

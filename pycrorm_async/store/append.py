@@ -28,7 +28,6 @@ from typing import Any, NamedTuple
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import LogDamaged, LogWentBack
-from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.store.append_rules import (
@@ -78,8 +77,8 @@ class Appending:
         """
         batch, dialect = self._batch, self._dialect
         if batch.declarations:
-            named = {fingerprint(payload): payload.decode() for payload in batch.declarations}
-            await dialect.insert_declarations(connection, list(named.items()))
+            named = [(name, payload.decode()) for name, payload in batch.declarations.items()]
+            await dialect.insert_declarations(connection, named)
         if not batch.episodes:
             await dialect.force_durable_commit(connection)  # all declarations may be repeats
             return Stored({}, {})

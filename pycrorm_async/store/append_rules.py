@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from pycrorm_async.errors import DamageError
+from pycrorm_async.events.codec import DECLARATION_TYPES, fingerprint
 from pycrorm_async.events.envelope import Record, is_computed_end
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -24,9 +25,9 @@ __all__ = ["SortedBatch", "EpisodeStep", "NumbersExhausted", "sort", "step", "ne
 
 @dataclass(frozen=True, slots=True)
 class SortedBatch:
-    """A batch split into declarations and episodes, each in the order of arrival."""
+    """A batch split into declarations, by fingerprint, and episodes, each in the order of arrival."""
 
-    declarations: list[bytes]
+    declarations: dict[str, bytes]
     episodes: dict[EpisodeId, list[Record]]
 
 
@@ -55,12 +56,13 @@ class NumbersExhausted(ValueError):
 
 def sort(records: Iterable[Record]) -> SortedBatch:
     """Split a batch by episode. Raises `DamageError` for a record without an episode that is not a declaration."""
-    declarations: list[bytes] = []
+    declarations: dict[str, bytes] = {}
     episodes: dict[EpisodeId, list[Record]] = {}
     for record in records:
         episode = record.episode
         if episode is None:
-            declarations.append(_declaration(record))
+            declared = _declaration(record)
+            declarations[fingerprint(declared, record.type)] = declared
         elif episode in episodes:
             episodes[episode].append(record)
         else:
@@ -157,7 +159,7 @@ def _is_text(payload: bytes) -> bool:
 
 
 def _declaration(record: Record) -> bytes:
-    if record.type != "DesignatorTypeDeclared":
+    if record.type not in DECLARATION_TYPES:
         raise DamageError(f"record {record.position} belongs to no episode and is a {record.type}, not a declaration")
     if not _is_text(record.payload):
         raise DamageError(f"record {record.position}: the declaration is not text that a database can hold")

@@ -194,7 +194,13 @@ class Dialect(Protocol):
         """Read the events of each span, in the order of the spans."""
         ...
 
-    async def declarations(self, connection: AsyncConnection) -> list[bytes]: ...
+    async def declarations(self, connection: AsyncConnection) -> list[bytes]:
+        """Read the designator types, in the order of arrival."""
+        ...
+
+    async def descriptions(self, connection: AsyncConnection, fingerprints: Sequence[str]) -> list[bytes]:
+        """Read those of these descriptions that are stored."""
+        ...
 
     async def begin_snapshot(self, connection: AsyncConnection) -> None:
         """Make the transaction that begins now a snapshot."""

@@ -12,7 +12,7 @@ import asyncio
 import logging
 import os
 import uuid
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
@@ -21,6 +21,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, PycrormError
+from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.settings import FileAccess
@@ -272,6 +273,14 @@ class EventLog:
         """Read the payloads of all DesignatorTypeDeclared, in the order of first arrival."""
         async with self.reading() as connection:
             return await self._dialect.declarations(connection)
+
+    async def descriptions(self, fingerprints: Collection[str]) -> dict[str, bytes]:
+        """Read the payloads of these DescriptionDeclared, by fingerprint; those that are not stored are left out."""
+        if not fingerprints:
+            return {}
+        async with self.reading() as connection:
+            payloads = await self._dialect.descriptions(connection, sorted(fingerprints))
+        return {fingerprint(payload, "DescriptionDeclared"): payload for payload in payloads}
 
     @asynccontextmanager
     async def writing(self) -> AsyncIterator[AsyncConnection]:

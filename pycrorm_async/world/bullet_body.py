@@ -109,6 +109,14 @@ class Body:
             frames[number] = self._link_frame(number, state)
         return box_around((frames[self._link_numbers[link]], self.solids[link]) for link in shaped)
 
+    def box_in_link(self, link: str) -> BoundingBox | None:
+        """Return the box along the axes of the link's own frame around its shapes; None if it has none."""
+        return box_around([(_AT_ORIGIN, self.solids[link])])
+
+    def label(self, text: str) -> None:
+        """Show a text above the origin of the root link, in a window only."""
+        engine().addUserDebugText(text, (0.0, 0.0, 0.03), parentObjectUniqueId=self.number, physicsClientId=self.client)
+
     def unload(self) -> None:
         """Remove the body from Bullet; pose and positions stay readable."""
         engine().removeBody(self.number, physicsClientId=self.client)

@@ -63,6 +63,7 @@ class Object:
     world: BulletWorld
     original_pose: Pose
     description_text: str
+    color: Color | None
     robot_description: RobotDescription | None
     body: Body
     """The body in Bullet, for this package only: moving it notifies no observer."""
@@ -98,6 +99,7 @@ class Object:
         if robot is None and object_type is ObjectType.ROBOT:
             robot = robot_description(name)
         self.robot_description = robot
+        self.color = color
         self.body = Body(name, self.description_text, client, self.original_pose, color)
         world.add(self)
 
@@ -159,6 +161,18 @@ class Object:
             position = self.link_pose(link).position
             return BoundingBox(position, position)
         return box
+
+    def box_in_link(self, link: str) -> BoundingBox | None:
+        """Return the box along the axes of the link's own frame around its collision shapes; None without any.
+
+        Raises `UnknownLink`.
+        """
+        return self.body.box_in_link(self._check_link(link))
+
+    def label(self, text: str) -> None:
+        """Show a text at the object, if the world has a window."""
+        self.check_present()
+        self.body.label(text)
 
     # --- joints -----------------------------------------------------------------------------------------------
 

@@ -106,7 +106,7 @@ async def test_of_a_damaged_log_what_comes_before_the_damage_is_printed(tmp_path
         (["7"], 2, "there is no episode '7' (`pycrorm episodes` lists the 2 there are)"),
         (["0000"], 2, "2 episodes have an id that begins with '0000': give more of it"),
         (["9" * 5000], 2, "there is no episode"),
-        (["1", "--type", "nodestarted"], 2, "unknown event type 'nodestarted'; known types: DesignatorTypeDeclared, "),
+        (["1", "--type", "nodestarted"], 2, "unknown event type 'nodestarted'; known types: DescriptionDeclared, "),
         (["1", "--url", "sqlite:///none.db"], 3, "does not exist"),
         (["1", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["1", "--url", "oracle://lab/memory"], 2, "oracle:// is not a supported database"),

@@ -1,5 +1,8 @@
 """The bytes of every released event shape are frozen: a log written today is read for ever."""
 
+import base64
+import json
+import zlib
 from pathlib import Path
 
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from pycrorm_async.events.codec import decode, encode
 from pycrorm_async.events.types import (
     EVENT_TYPES,
+    DescriptionDeclared,
     DesignatorTypeDeclared,
     EpisodeEnded,
     Happening,
@@ -16,8 +20,10 @@ from pycrorm_async.events.types import (
     ObjectDetected,
 )
 from pycrorm_async.events.values import (
+    BoxValue,
     FailureValue,
     FieldDeclared,
+    MeshValue,
     MissingValue,
     ObjectReference,
     PoseValue,
@@ -75,6 +81,25 @@ def test_the_golden_bytes_mean_what_they_say() -> None:
     for line, event in expected.items():
         kind, payload = GOLDEN[line]
         assert decode(kind, payload) == event, line
+
+
+def test_a_description_is_written_with_the_hashes_and_boxes_of_its_meshes() -> None:
+    kind, payload = GOLDEN[-1]
+    event = decode(kind, payload)
+    assert isinstance(event, DescriptionDeclared)
+    assert event.text == '<robot name="cup"><link name="cup"/></robot>'
+    assert event.meshes == (
+        MeshValue("cup.stl", "a" * 64, 684),
+        MeshValue("handle.stl", missing="No such file or directory"),
+    )
+    assert [each.reference for each in event.meshes] == [f"sha256:{'a' * 64}", "missing:handle.stl"]
+    assert event.boxes == {"cup": BoxValue((-0.04, -0.04, 0.0), (0.04, 0.04, 0.1))}
+
+
+def test_the_urdf_of_a_description_can_be_read_in_one_line_of_python() -> None:
+    payload = json.loads(GOLDEN[-1][1])
+    text = zlib.decompress(base64.b64decode(payload["urdf"])).decode()
+    assert text == '<robot name="cup"><link name="cup"/></robot>'
 
 
 def test_a_missing_value_is_written_as_its_reason() -> None:

@@ -214,22 +214,22 @@ def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designat
     own, number = _own(event)
     node = _node(event, added.node)
     joints = json_text(added.joints) if added.joints else None
+    color = json_text(added.color) if added.color is not None else None
     rows.inserts["pose"].append(pose_row(own, number, added.pose))
-    rows.inserts["object"].append(_object_row(event, added, own, own, node, joints))
+    rows.inserts["object"].append((*_object_row(event, added, own, own, node), joints, added.description, color))
 
 
 def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designators, rows: Rows) -> None:
     identity, node = row(event.number, moved.object), _node(event, moved.node)
     own, number = _own(event)
     rows.inserts["pose"].append(pose_row(own, number, moved.pose))
-    rows.inserts["object"].append(_object_row(event, moved, own, identity, node, None))
+    rows.inserts["object"].append((*_object_row(event, moved, own, identity, node), None, None, None))
 
 
-def _object_row(
-    event: StoredEvent, value: ObjectAdded | ObjectMoved, own: int, identity: int, node: int | None, joints: str | None
-) -> Row:
+def _object_row(event: StoredEvent, value: ObjectAdded | ObjectMoved, own: int, identity: int, node: int | None) -> Row:
+    """Return the columns of an object that change when it moves."""
     time = microseconds(event.wall_ns)
-    return own, event.number, "Object", value.name, value.object_type, own, None, identity, time, node, joints
+    return own, event.number, "Object", value.name, value.object_type, own, None, identity, time, node
 
 
 def _object_removed(event: StoredEvent, removed: ObjectRemoved, _designators: Designators, rows: Rows) -> None:

@@ -34,6 +34,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.sql.selectable import CompoundSelect
 
+from pycrorm_async.events.codec import DESCRIPTIONS_FROM
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.layout import Layout
@@ -141,6 +142,7 @@ def public_views(
         view = pick_ups_with_context(picked, node, object_, pose, layout.dtypes(_PICKED))
         views["PickUpWithContextView"] = shown(view, node)
     views["designator_type"] = _designator_type(layout)
+    views["object_description"] = select(_declaration).where(_declaration.c.fingerprint >= DESCRIPTIONS_FROM)
     return {**views, **concept_views()}
 
 
@@ -195,6 +197,7 @@ def _designator_type(layout: Layout) -> View:
         member("concept").label("concept"),
         func.coalesce(member("fields"), "[]").label("fields"),
     )
+    view = view.where(_declaration.c.fingerprint < DESCRIPTIONS_FROM)
     return view.where(~unreadable) if layout.unreadable else view
 
 

@@ -115,6 +115,8 @@ CORE: dict[str, dict[str, Storage]] = {
         "time": "time",
         "node_id": "row",
         "joints": "json",
+        "description_fingerprint": "text",
+        "color": "json",
     },
     "object_removal": {
         "id": "key",

@@ -12,6 +12,7 @@ from typing import Any
 from pycrorm_async.events.blobs import references_in
 from pycrorm_async.events.ids import row_id, row_key
 from pycrorm_async.events.order import OrderCheck
+from pycrorm_async.events.types import ObjectAdded
 from pycrorm_async.projections.fold.fold import CannotFold, UndecodablePayload, fold_happening, happening_of
 from pycrorm_async.projections.fold.node_row import STATUS
 from pycrorm_async.projections.fold.parameters import Designators
@@ -29,6 +30,7 @@ class EpisodeCheck:
     Attributes:
         compared: whether the rows are compared completely, because the tables ended before the last part did.
         carried: ids of the running nodes, which a later part compares.
+        descriptions: fingerprints of the stored descriptions.
     """
 
     def __init__(self, number: int, result: VerifyResult) -> None:
@@ -36,6 +38,7 @@ class EpisodeCheck:
         self._result = result
         self.compared = False
         self.carried: frozenset[int] = frozenset()
+        self.descriptions: frozenset[str] = frozenset()
         self._nodes: dict[int, list[Any]] = {}
         self._row: dict[str, Any] | None = None
         self._order: OrderCheck | None = OrderCheck()
@@ -102,6 +105,9 @@ class EpisodeCheck:
             self._result.blobs.setdefault(reference.hash, (self.number, event.sequence))
         try:
             happening = happening_of(event)
+            described = happening.description if isinstance(happening, ObjectAdded) else None
+            if described is not None and described not in self.descriptions:
+                self._damaged(event.sequence, f"the description {described} was never declared")
             if self._order is not None:
                 for finding in self._order.read(event.sequence, happening):
                     if finding.kind == "damage":

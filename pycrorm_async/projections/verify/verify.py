@@ -32,7 +32,10 @@ from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 
 __all__ = ["VerifyResult", "Damage", "StoppedEpisode", "verify"]
 
-_FINGERPRINTS = text("SELECT fingerprint FROM pycrorm_declaration ORDER BY ordinal")
+_FINGERPRINTS = text("SELECT fingerprint FROM pycrorm_declaration WHERE fingerprint < 'g' ORDER BY ordinal")
+_DESCRIPTIONS = text("SELECT fingerprint FROM pycrorm_declaration WHERE fingerprint >= 'g'")
+_DESCRIPTIONS_READ = 100
+"""Bounds the descriptions read at once: each takes up to `record_bytes_max`."""
 _TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number >= :first AND number < :end")
 # Jumps from one number to the next in the index, because reading every event would take minutes in a large log.
 _NUMBERS_WITHOUT_EPISODE = text("""
@@ -98,10 +101,19 @@ async def _check_database(log: EventLog, result: VerifyResult) -> None:
                 result.add_damage(None, None, reason)
             names = (await connection.execute(_FINGERPRINTS)).scalars()
             for name, payload in zip(names, await dialect.declarations(connection), strict=True):
-                for reference in references_in("DescriptionDeclared", payload):
-                    result.blobs.setdefault(reference.hash, (None, None))
                 if fingerprint(payload) != name:
                     result.add_damage(None, None, f"the declaration {name} does not match its fingerprint")
+            described = sorted((await connection.execute(_DESCRIPTIONS)).scalars())
+            for first in range(0, len(described), _DESCRIPTIONS_READ):
+                part = described[first : first + _DESCRIPTIONS_READ]
+                payloads = await dialect.descriptions(connection, part)
+                matching = {fingerprint(payload, "DescriptionDeclared") for payload in payloads}
+                for payload in payloads:
+                    for reference in references_in("DescriptionDeclared", payload):
+                        result.blobs.setdefault(reference.hash, (None, None))
+                for name in part:
+                    if name not in matching:
+                        result.add_damage(None, None, f"the description {name} does not match its fingerprint")
             for (number,) in await connection.execute(_NUMBERS_WITHOUT_EPISODE):
                 result.add_damage(None, None, f"there are events of an episode {number}, which is not in the log")
     except DamageError as fault:
@@ -170,6 +182,7 @@ class _TablesCheck:
         spans, place = _cut(episodes, at, limit)
         events = await self._events_of(connection, spans)
         designators = await _designators(connection, comparison.generation)
+        descriptions = frozenset((await connection.execute(_DESCRIPTIONS)).scalars())
         folded = {each.number: each.folded for each in episodes}
         rows = Rows()
         low, high = at, place or (None if within.end is None else Place(within.end))
@@ -185,6 +198,7 @@ class _TablesCheck:
                 self._unfinished = EpisodeCheck(span.number, self.result)
                 self.result.episodes += 1
             read[span.number] = self._unfinished
+            self._unfinished.descriptions = descriptions
             self._unfinished.read(span, events.get(span.number, {}), folded[span.number], designators, rows)
         carried: frozenset[int] = frozenset()
         if place is not None and place.after:

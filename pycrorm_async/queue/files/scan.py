@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign
+from pycrorm_async.events.codec import DECLARATION_TYPES
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.frame import (
@@ -74,7 +75,6 @@ __all__ = [
 
 _SALT_OFFSET = HEADER_BYTES - 8
 _EPISODE_ENDED = EPISODE_ENDED.encode()
-_DECLARES = "DesignatorTypeDeclared"
 
 
 class ValidPrefix(NamedTuple):
@@ -298,7 +298,7 @@ def check_record(path: Path, offset: int, frame: Frame) -> None:
 
 def _check_declaration(path: Path, offset: int, type_name: str, payload: bytes) -> None:
     """Check a record without an episode: dead-lettering cannot skip it, so a bad one would block the whole folder."""
-    if type_name != _DECLARES:
+    if type_name not in DECLARATION_TYPES:
         raise SpoolDamaged(path, offset, f"holds a {type_name} that belongs to no episode")
     try:
         is_text = "\0" not in payload.decode()

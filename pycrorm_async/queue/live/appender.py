@@ -117,7 +117,7 @@ class Appender:
         self._type_names: dict[str, bytes] = {}
 
         self.position = after
-        self.declarations = Declarations()
+        self.declarations = Declarations(capacity.descriptions_bytes_max)
         self.open: dict[EpisodeId, tuple[int, int, int]] = dict(opened)
         self.begun: list[SegmentStart] = []
         self._refusal: Callable[[], PycrormError] | None = None

@@ -64,6 +64,11 @@ class Capacity(NamedTuple):
         """The largest offset at which a segment's records may end."""
         return self.segment_bytes - _COMMITS_BYTES
 
+    @property
+    def descriptions_bytes_max(self) -> int:
+        """The bytes of the descriptions that a segment repeats at most: an eighth, so that they delay nothing much."""
+        return self.segment_bytes // 8
+
     def room_to_declare(self, *, episodes: int, declared: int) -> int:
         """Return the largest size of a further declaration that segments can repeat.
 

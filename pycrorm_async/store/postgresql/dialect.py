@@ -192,6 +192,10 @@ class PostgreSQL:
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
 
+    async def descriptions(self, connection: AsyncConnection, fingerprints: Sequence[str]) -> list[bytes]:
+        wanted = list(fingerprints)
+        return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DESCRIPTIONS, (wanted,))]
+
     async def begin_snapshot(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
 

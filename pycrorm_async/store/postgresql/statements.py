@@ -32,6 +32,7 @@ __all__ = [
     "SELECT_EVENTS",
     "SELECT_SPANS",
     "SELECT_DECLARATIONS",
+    "SELECT_DESCRIPTIONS",
     "ADVANCE_FOLDED",
     "PARK",
 ]
@@ -112,7 +113,11 @@ WITH ORDINALITY AS span (number, after, last, place) CROSS JOIN LATERAL (
     WHERE episode = span.number AND sequence > span.after AND sequence <= span.last ORDER BY sequence
 ) AS event ORDER BY span.place, event.sequence"""
 
-SELECT_DECLARATIONS = "SELECT pg_catalog.convert_to(payload, 'UTF8') FROM pycrorm.pycrorm_declaration ORDER BY ordinal"
+# The fingerprint of a description begins with a letter behind the hexadecimal digits, so the index on fingerprints
+# leads to the designator types alone, however many descriptions there are.
+_PAYLOADS = "SELECT pg_catalog.convert_to(payload, 'UTF8') FROM pycrorm.pycrorm_declaration"
+SELECT_DECLARATIONS = f"{_PAYLOADS} WHERE fingerprint < 'g' ORDER BY ordinal"
+SELECT_DESCRIPTIONS = f"{_PAYLOADS} WHERE fingerprint = ANY ($1::text[])"
 
 # Locks the rows by number first, as elsewhere. An UPDATE alone locks them in any order, so that two processes that fold
 # the same episodes would sometimes deadlock, for a second each time.

@@ -170,6 +170,10 @@ class SQLite:
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
 
+    async def descriptions(self, connection: AsyncConnection, fingerprints: Sequence[str]) -> list[bytes]:
+        wanted = _json(fingerprints)
+        return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DESCRIPTIONS, (wanted,))]
+
     async def begin_snapshot(self, connection: AsyncConnection) -> None:
         """Do nothing: a transaction is a snapshot."""
 

@@ -1,11 +1,11 @@
-"""Generate boxes, cylinders and stand-ins as URDF text (metres, around the object's origin)."""
+"""Generate boxes, cylinders and points as URDF text (metres, around the object's origin)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from xml.sax.saxutils import quoteattr
 
-__all__ = ["Range", "box_urdf", "cylinder_urdf", "stand_in_urdf", "shape", "numbers", "INERTIA"]
+__all__ = ["Range", "box_urdf", "cylinder_urdf", "point_urdf", "shape", "numbers", "INERTIA"]
 
 INERTIA = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 """The inertia of every link: Bullet warns about links without one. Its values do not matter because the simulation is
@@ -27,16 +27,16 @@ def cylinder_urdf(name: str, *, radius: float, z: Range, color: Sequence[float] 
     return _one_link(name, geometry, (0.0, 0.0, (z[0] + z[1]) / 2), color)
 
 
-def stand_in_urdf(name: str, *, joints: Iterable[str], links: Iterable[str]) -> str:
-    """Return a substitute for an object whose shape is unknown: a magenta box of 10 cm around its origin.
+def point_urdf(name: str, *, joints: Iterable[str], links: Iterable[str]) -> str:
+    """Return a substitute for an object whose shape is unknown: a magenta point of 2 cm that touches nothing.
 
     Its joints are continuous, so that they take every position, and move links without a shape. `links` are fixed.
     """
-    box = shape('<box size="0.1 0.1 0.1"/>', (0.0, 0.0, 0.0), (1.0, 0.0, 1.0, 1.0))
-    parts = [f"<link name={quoteattr(name)}>{INERTIA}{box}</link>"]
+    visual = '<visual><geometry><sphere radius="0.01"/></geometry><material name="1 0 1"><color rgba="1 0 1 1"/>'
+    parts = [f"<link name={quoteattr(name)}>{INERTIA}{visual}</material></visual></link>"]
     for kind, joint, link in (
-        *(("continuous", each, f"{each} of stand-in") for each in joints),
-        *(("fixed", f"{each} fixed in stand-in", each) for each in links if each != name),
+        *(("continuous", each, f"{each} of {name}") for each in joints),
+        *(("fixed", f"{each} fixed in {name}", each) for each in links if each != name),
     ):
         parts.append(
             f"<link name={quoteattr(link)}>{INERTIA}</link><joint name={quoteattr(joint)} type={quoteattr(kind)}>"

@@ -1,0 +1,72 @@
+"""Replace the mesh files of a URDF: by other names, or by the boxes around the collision shapes of their links.
+
+With the boxes an object keeps its links, joints and poses without any file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
+
+from pycrorm_async.world.models.primitives import numbers
+from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+
+__all__ = ["mesh_files", "meshed_links", "with_mesh_files", "with_boxes"]
+
+_EDGE_MIN = 1e-6
+"""The shortest edge of a box, m: Bullet needs one above zero."""
+
+
+def mesh_files(urdf: str) -> tuple[str, ...]:
+    """Return the file names of the meshes, each once."""
+    if "<mesh" not in urdf:  # spares the parsing of most descriptions
+        return ()
+    return tuple(dict.fromkeys(mesh.get("filename", "") for mesh in _parsed(urdf).iter("mesh")))
+
+
+def meshed_links(urdf: str) -> tuple[str, ...]:
+    """Return the names of the links that have a mesh."""
+    return tuple(link.get("name", "") for link in _parsed(urdf).iter("link") if link.find(".//mesh") is not None)
+
+
+def with_mesh_files(urdf: str, names: Mapping[str, str]) -> str:
+    """Return the URDF with these file names instead of the present ones, which are the keys."""
+    if not names:
+        return urdf
+    robot = _parsed(urdf)
+    for mesh in robot.iter("mesh"):
+        mesh.set("filename", names[mesh.get("filename", "")])
+    return tostring(robot, encoding="unicode")
+
+
+def with_boxes(urdf: str, boxes: Mapping[str, BoundingBox], *, kept: frozenset[str] = frozenset()) -> str:
+    """Return the URDF with the box of its link instead of each mesh, without one for a link that has no box.
+
+    Meshes with a file name in `kept` stay.
+    """
+    robot = _parsed(urdf)
+    for link in robot.iter("link"):
+        box = boxes.get(link.get("name", ""))
+        for kind in ("visual", "collision"):
+            replaced = [
+                each
+                for each in link.findall(kind)
+                if (mesh := each.find("geometry/mesh")) is not None and mesh.get("filename") not in kept
+            ]
+            for each in replaced:
+                link.remove(each)
+            if replaced and box is not None:
+                _add_box(SubElement(link, kind), box, replaced[0].find("material"))
+    return tostring(robot, encoding="unicode")
+
+
+def _add_box(shape: Element, box: BoundingBox, material: Element | None) -> None:
+    SubElement(shape, "origin", xyz=numbers(box.centre))
+    size = [max(edge, _EDGE_MIN) for edge in box.size]
+    SubElement(SubElement(shape, "geometry"), "box", size=numbers(size))
+    if material is not None:
+        shape.append(material)
+
+
+def _parsed(urdf: str) -> Element:
+    return fromstring(urdf)  # noqa: S314  `urdf_text` has checked it, or a memory has recorded it then
