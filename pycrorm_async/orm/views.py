@@ -34,6 +34,7 @@ class PickUpWithContextView(Base):
         height_over_torso: height of the object above the robot's torso, m: its z minus that of the robot's base minus
             `torso_height`. The reach of an arm depends on it. Loaded on request.
         robot: the name of the robot; None if a memory of version 0.1.0 recorded it. Loaded on request.
+        description, scene: of the episode: its description, and its world in one line. Loaded on request.
     """
 
     __tablename__ = "PickUpWithContextView"
@@ -61,6 +62,8 @@ class PickUpWithContextView(Base):
     _object_qw: Mapped[float] = mapped_column("object_qw", deferred=True)
     _height_over_torso: Mapped[float | None] = mapped_column("height_over_torso", deferred=True)
     _robot: Mapped[str | None] = mapped_column("robot", deferred=True)
+    _description: Mapped[str] = mapped_column("description", deferred=True)
+    _scene: Mapped[str | None] = mapped_column("scene", deferred=True)
 
     object_z: Mapped[float] = synonym("_object_z", descriptor=on_request("object_z"))
     object_qx: Mapped[float] = synonym("_object_qx", descriptor=on_request("object_qx"))
@@ -69,6 +72,8 @@ class PickUpWithContextView(Base):
     object_qw: Mapped[float] = synonym("_object_qw", descriptor=on_request("object_qw"))
     height_over_torso: Mapped[float | None] = synonym("_height_over_torso", descriptor=on_request("height_over_torso"))
     robot: Mapped[str | None] = synonym("_robot", descriptor=on_request("robot"))
+    description: Mapped[str] = synonym("_description", descriptor=on_request("description"))
+    scene: Mapped[str | None] = synonym("_scene", descriptor=on_request("scene"))
 
 
 class RootFailure(RowOfEvent, Base):

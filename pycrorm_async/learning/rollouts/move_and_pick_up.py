@@ -85,7 +85,8 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         """Select the successful pick-ups of all episodes, the input of `learn`.
 
         A data frame of it has the columns arm, grasp, object_x, object_y (the robot's position in the object's own
-        frame, m) and height (of the object over the lifted torso, m). Add a `where` to restrict the episodes.
+        frame, m) and height (of the object over the lifted torso, m). Add a `where` to cut it, by columns of
+        `PickUpWithContextView` such as `robot`, `description` and `scene` (of the episode) or `obj_type`.
         """
         view = PickUpWithContextView
         return select(

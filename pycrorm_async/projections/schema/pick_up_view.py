@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
-from sqlalchemy import Boolean, ColumnElement, FromClause, Select, Table, select
+from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, select
 from sqlalchemy.ext.compiler import compiles
 
 __all__ = ["pick_ups_with_context"]
@@ -46,11 +46,16 @@ def _fact(element: _PlannerHint, compiler: Any, **options: Any) -> str:
 
 
 def pick_ups_with_context(
-    picked: FromClause, node: Table, object_: Table, pose: Table, dtypes: Sequence[str]
+    picked: FromClause, node: Table, object_: Table, pose: Table, episode: Table, dtypes: Sequence[str]
 ) -> Select[*tuple[Any, ...]]:
     """Return the view's query. A node, its designator and its leaf row have the same id, so they join without a key
     column. `dtypes` are all dtypes that a node with a row in `picked` may have."""
     robot, place = pose.alias("robot"), pose.alias("there")
+
+    def of_episode(column: str) -> ScalarSelect[Any]:
+        # A subquery, which costs nothing where the column is not selected.
+        return select(episode.c[column]).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
+
     return (
         select(
             picked.c.id,
@@ -70,6 +75,8 @@ def pick_ups_with_context(
             *_seen_from(place.c, robot.c),
             (place.c.z - robot.c.z - node.c.torso_height).label("height_over_torso"),
             node.c.robot,
+            of_episode("description").label("description"),
+            of_episode("world").label("scene"),
         )
         .select_from(picked)
         .join(node, node.c.id == picked.c.id)

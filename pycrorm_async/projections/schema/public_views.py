@@ -55,6 +55,8 @@ _UNITED_MAX = 400
 """Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
 
 _PICKED = "pick_up_action"
+_OF_PICK_UPS = ("task_tree_node", "object", "pose", "process_metadata")
+"""The tables of `PickUpWithContextView`."""
 
 _event = table("event", column("episode"), column("sequence"), column("payload"))
 _episode = table("episode", column("number"), column("id"))
@@ -137,9 +139,9 @@ def public_views(
     }
     views |= {name: _leaf(name, layout, leaves, shown) for name in layout.leaves}
     if _PICKED in layout.leaves:
-        node, object_, pose = (core[name] for name in ("task_tree_node", "object", "pose"))
+        node, object_, pose, episode = (core[name] for name in _OF_PICK_UPS)
         picked = _leaf(_PICKED, layout, leaves, lambda view, _: view).subquery("picked")
-        view = pick_ups_with_context(picked, node, object_, pose, layout.dtypes(_PICKED))
+        view = pick_ups_with_context(picked, node, object_, pose, episode, layout.dtypes(_PICKED))
         views["PickUpWithContextView"] = shown(view, node)
     views["designator_type"] = _designator_type(layout)
     views["object_description"] = select(_declaration).where(_declaration.c.fingerprint >= DESCRIPTIONS_FROM)
